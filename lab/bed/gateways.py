@@ -183,7 +183,7 @@ class JoinedSites:
         place = f"{self.fleet.address}:{AUTHORITY_PORT}"
         invite = ("--no-wait", "--name", self.router.name, "--module", agent.name, "--address", place)
         token = next(word for word in command(self.router, "trust", "invite", *invite).split() if "rmpa1-" in word)
-        command(agent, "trust", "join", "--yes", "--name", agent.name, token)
+        command(agent, "trust", "join", "--name", agent.name, token)
 
     def second_gateway(self, site: Site, rank: int = 200) -> GatewayProcess:
         """One more gateway at a site; ready when this returns."""

@@ -15,11 +15,10 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.agent import Agent
-from rmpa.agent.trust import RENEW, read_refusal, trust_store
+from rmpa.agent.trust import RENEW, trust_store
 from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
-from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust import limits
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
@@ -44,10 +43,6 @@ async def until(condition: Callable[[], object]) -> None:
     async with asyncio.timeout(DEADLINE):
         while not condition():
             await asyncio.sleep(0.005)
-
-
-async def yes(_code: str) -> bool:
-    return True
 
 
 def peers_of(agent: Agent) -> set[str]:
@@ -91,12 +86,12 @@ class Fleet:
         return await self.agents[agent].operations.trust({"what": what, **args})
 
     async def token(self, **args: object) -> Token:
-        reply = await self.command("base", "invite", **{"unattended": True, **args})
+        reply = await self.command("base", "invite", **args)
         return Token.parse(reply.token)  # type: ignore[attr-defined]
 
     async def join(self, name: str, token: Token | None = None) -> MemberFiles:
         token = token or await self.token()
-        files = await join_mesh(token, name, SystemClock(), yes, read_refusal)
+        files = await join_mesh(token, name)
         store = trust_store(self.settings(name))
         assert store is not None
         store.save(files)
@@ -290,22 +285,17 @@ async def test_a_module_that_missed_changes_of_the_group_key_is_linked_again(
         await until(lambda: member.ring.newest.number == 4)
 
 
-async def test_two_users_compare_the_code_over_the_control_socket(tmp_path: Path) -> None:
+async def test_the_user_who_invites_is_told_what_came_of_the_token(tmp_path: Path) -> None:
     async with a_fleet(tmp_path) as fleet:
-        token = await fleet.token(unattended=False)
-        shown: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-
-        async def compare(code: str) -> bool:
-            shown.set_result(code)
-            return True
-
-        joining = asyncio.ensure_future(join_mesh(token, "arm", SystemClock(), compare, read_refusal))
-        step = await fleet.command("base", "step", id=token.token_id.hex(), after=0)
-        assert (step.state, step.code, step.module) == ("code", await shown, "arm")  # type: ignore[attr-defined]
-        await fleet.command("base", "answer", id=token.token_id.hex(), agree=True)
-        await joining
-        with pytest.raises(PeerRefused, match="no module is joining"):
-            await fleet.command("base", "answer", id=token.token_id.hex(), agree=True)
+        token = await fleet.token(name="arm")
+        asked = asyncio.ensure_future(fleet.command("base", "step", id=token.token_id.hex(), after=0))
+        with pytest.raises(PeerRefused, match=r"\(name\); join with the --name that it is for"):
+            await join_mesh(token, "leg")
+        step = await asked
+        assert (step.step, step.state, step.module, step.reason) == (1, "refused", "leg", "name")  # type: ignore[attr-defined]
+        await join_mesh(token, "arm")
+        step = await fleet.command("base", "step", id=token.token_id.hex(), after=1)
+        assert (step.step, step.state, step.module) == (2, "joined", "arm")  # type: ignore[attr-defined]
 
 
 async def test_a_module_without_trust_is_not_linked_and_told_why(tmp_path: Path) -> None:

@@ -112,7 +112,6 @@ INTERNAL: Final = {
     "JOIN_ANSWER_MAX",
     "JOIN_REQUEST_MAX",
     "KEYS_MAX",
-    "NONCES_MAX",
     "OLD_KEYS_MAX",
     "OPEN_RETRY_MAX",
     "RUNS_MAX",

@@ -1,7 +1,7 @@
 """An attacker in a network namespace of its own: sends to a secured mesh what docs/design/trust.md forbids.
 
 attacker.py MODE ARGUMENTS, where ARGUMENTS is a JSON object; the functions of ``MODES`` say what it has. Trailers,
-prefaces, tokens and messages of a join are written here byte by byte, from that page and not from the code under
+tokens and messages of a join are written here byte by byte, from that page and not from the code under
 test; hellos and beacons, which are the same in a plain mesh, are made by rmpa. Run it by rmpa's own interpreter.
 Each answer is an event: ``@ {"event": ...}``; the last one is ``done``.
 """
@@ -19,7 +19,7 @@ import ssl
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,6 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello, Refuse
 
-LINK, JOIN, RENEWAL = 1, 2, 3
 RNG = random.Random(14)
 TIMEOUT = 10.0
 Arguments = dict[str, Any]
@@ -58,20 +57,6 @@ def with_trailer(packet: bytes, key: bytes, number: int, *, key_number: int = 1,
     return body + hmac.digest(kind, body, hashlib.sha256)[:16]
 
 
-def preface(
-    key: bytes, purpose: int = LINK, key_number: int = 1, token_id: bytes = bytes(8), skew: float = 0
-) -> bytes:
-    """The 56 bytes in front of TLS. Args: ``key`` is the one for prefaces, or a token's."""
-    milliseconds = int((time.time() + skew) * 1000)
-    head = struct.pack(">4sBBH8sQ16s", b"RMPS", 1, purpose, key_number, token_id, milliseconds, os.urandom(16))
-    return head + hmac.digest(key, head, hashlib.sha256)[:16]
-
-
-def preface_key(group_key: bytes) -> bytes:
-    """The key for prefaces, of a group key."""
-    return hmac.digest(group_key, b"rmpa preface 1", hashlib.sha256)
-
-
 class StolenToken:
     """A token, taken apart."""
 
@@ -84,12 +69,12 @@ class StolenToken:
 
     @property
     def id(self) -> bytes:
-        """What the preface names it by."""
+        """What a question names it by."""
         return hashlib.sha256(b"rmpa token id 1" + self.secret).digest()[:8]
 
     @property
     def key(self) -> bytes:
-        """What signs the preface."""
+        """What proves a question."""
         return hmac.digest(self.secret, b"rmpa token key 1", hashlib.sha256)
 
     def changed(self, **parts: bytes) -> str:
@@ -206,8 +191,8 @@ def udp_socket() -> socket.socket:
 
 
 def record(given: Arguments) -> None:
-    """Listen on a wire: ``interface``, ``file``, ``beacons``, ``prefaces``: how many of each are wanted."""
-    found: dict[str, list[dict[str, Any]]] = {"beacons": [], "prefaces": []}
+    """Listen on a wire: ``interface``, ``file``, ``beacons``, ``hellos`` of TLS: how many of each are wanted."""
+    found: dict[str, list[dict[str, Any]]] = {"beacons": [], "hellos": []}
     tap = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003))
     tap.bind((given["interface"], 0))
     say("ready")
@@ -226,8 +211,8 @@ def record(given: Arguments) -> None:
                 found["beacons"].append({**place, "port": port, "data": data.hex()})
         elif ip[9] == 6:
             data = ip[begin + (ip[begin + 12] >> 4) * 4 : length]
-            if data.startswith(b"RMPS"):
-                found["prefaces"].append({**place, "port": port, "data": data.hex()})
+            if data.startswith(b"\x16\x03\x01"):  # only a ClientHello has this version
+                found["hellos"].append({**place, "port": port, "data": data.hex()})
     Path(given["file"]).write_text(json.dumps(found))
     say("done", **{kind: len(each) for kind, each in found.items()})
 
@@ -242,10 +227,14 @@ def replay(given: Arguments) -> None:
             udp.sendto(bytes.fromhex(each["data"]), (each["to"], each["port"]))
             sent += 1
     answers = []
-    for each in found["prefaces"]:
-        with connect(each["to"], each["port"]) as sock:  # with its ClientHello behind it, as it was
+    for each in found["hellos"]:
+        with connect(each["to"], each["port"]) as sock:
             sock.sendall(bytes.fromhex(each["data"]))
-            answers.append(told(sock))
+            data = b""
+            with contextlib.suppress(OSError):
+                while more := sock.recv(65536):
+                    data += more
+            answers.append(data[:1].hex())
     say("done", beacons=sent, answers=answers)
 
 
@@ -262,7 +251,7 @@ def plain(given: Arguments) -> None:
 def lure(given: Arguments) -> None:
     """Be an agent without trust that is dialled: ``listen`` (a port), ``seconds``; tells how each dial begins.
 
-    It answers a preface as such an agent does, by a refusal ``unsecured``, and hopes for a plain hello.
+    It answers TLS as such an agent does, by a refusal ``unsecured``, and hopes for a plain hello.
     """
     server = socket.create_server(("0.0.0.0", given["listen"]))
     say("ready")
@@ -283,13 +272,14 @@ def lure(given: Arguments) -> None:
 
 
 def flood(given: Arguments) -> None:
-    """Forge as much as is wanted: ``kind`` (beacons, prefaces, half), ``address``, ``port``, ``rate``, ``seconds``.
+    """Forge as much as is wanted: ``kind`` (beacons, garbage, half), ``address``, ``port``, ``rate``, ``seconds``.
 
-    ``beacons`` go to the group ``group``. ``half`` has the group's key ``key`` and begins TLS without going on.
+    ``beacons`` go to the group ``group``. ``half`` sends a whole ClientHello, and does not go on.
     """
     rate, end = given["rate"], time.monotonic() + given["seconds"]
     udp = udp_socket()
     false_key, held, sent = os.urandom(32), [], 0
+    greeting = client_hello()
     began = time.monotonic()
     while (now := time.monotonic()) < end:
         if sent > (now - began) * rate:
@@ -306,12 +296,19 @@ def flood(given: Arguments) -> None:
         sock.setblocking(False)
         sock.connect_ex((given["address"], given["port"]))
         selectable(sock)
-        key = bytes.fromhex(given["key"]) if given["kind"] == "half" else false_key
         with contextlib.suppress(OSError):
-            sock.send(preface(preface_key(key)) + (b"\x16\x03\x01\x02\x00\x01" if given["kind"] == "half" else b""))
+            sock.send(greeting if given["kind"] == "half" else b"GET / HTTP/1.1\r\n\r\n")
         while len(held) > 200:
             held.pop(0).close()
     say("done", sent=sent, rate=sent / (time.monotonic() - began))
+
+
+def client_hello() -> bytes:
+    """The first bytes of a TLS connection."""
+    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+    with contextlib.suppress(ssl.SSLWantReadError):
+        tls_context().wrap_bio(incoming, outgoing).do_handshake()
+    return outgoing.read()
 
 
 def selectable(sock: socket.socket) -> None:
@@ -322,9 +319,9 @@ def selectable(sock: socket.socket) -> None:
 
 
 def slow(given: Arguments) -> None:
-    """Be slow: ``address``, ``port``, ``count`` connections, one byte of a preface each 0.2 s; how long they live."""
+    """Be slow: ``address``, ``port``, ``count`` connections, one byte each 0.2 s; how long they live."""
     socks = [connect(given["address"], given["port"]) for _ in range(given["count"])]
-    began, lived, data = time.monotonic(), [], b"RMPS\x01\x01" + bytes(50)
+    began, lived, data = time.monotonic(), [], client_hello()
     at = 0
     while socks and time.monotonic() - began < 20:
         for sock in list(socks):
@@ -334,7 +331,7 @@ def slow(given: Arguments) -> None:
                     raise ConnectionResetError
             except BlockingIOError:
                 with contextlib.suppress(OSError):
-                    sock.send(data[at % 56 : at % 56 + 1])
+                    sock.send(data[at : at + 1])
             except OSError:
                 lived.append(round(time.monotonic() - began, 2))
                 socks.remove(sock)
@@ -347,15 +344,11 @@ def slow(given: Arguments) -> None:
 
 
 def insider(given: Arguments) -> None:
-    """Dial with the group's key: ``address``, ``port``, ``guid``, ``here``, ``key`` (hexadecimal), ``name``.
+    """Dial: ``address``, ``port``, ``guid``, ``here``, ``name``.
 
-    Optional: ``cert`` and ``private`` (files), ``old`` (TLS 1.2), ``alpn``, ``skew`` (seconds of the clock).
+    Optional: ``cert`` and ``private`` (files), ``old`` (TLS 1.2), ``alpn``.
     """
     with connect(given["address"], given["port"]) as sock:
-        sock.sendall(preface(preface_key(bytes.fromhex(given["key"])), skew=given.get("skew", 0)))
-        if given.get("skew"):
-            say("done", **told(sock))
-            return
         context = tls_context(
             given.get("cert", ""),
             given.get("private", ""),
@@ -380,7 +373,7 @@ def former(given: Arguments) -> None:
     """Be a member that was revoked: ``key`` (the group key before), ``cert``, ``private``, ``addresses`` (its own).
 
     For ``seconds`` it invents modules at ``here``, says goodbye in the names of the modules that it hears, and dials
-    ``address``, ``port`` from each of its addresses, with the key alone and with its certificate too.
+    ``address``, ``port`` from each of its addresses, with half a handshake and with its certificate too.
     """
     key, end = bytes.fromhex(given["key"]), time.monotonic() + given["seconds"]
     udp, ears = udp_socket(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -389,7 +382,7 @@ def former(given: Arguments) -> None:
     group = socket.inet_aton(given["group"]) + socket.inet_aton(given["here"])
     ears.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
     ears.setblocking(False)
-    context = tls_context(given["cert"], given["private"])
+    context, greeting = tls_context(given["cert"], given["private"]), client_hello()
     held: list[socket.socket] = []
     heard: dict[bytes, Beacon] = {}
     number = 0
@@ -412,9 +405,10 @@ def former(given: Arguments) -> None:
         with contextlib.suppress(OSError):
             sock.bind((given["addresses"][number % len(given["addresses"])], 0))
             sock.connect((given["address"], given["port"]))
-            sock.sendall(preface(preface_key(key)))
             if number % 4 == 0:  # and no hello behind the handshake
                 sock = context.wrap_socket(sock)
+            else:
+                sock.sendall(greeting)
         held.append(sock)
         while len(held) > 300:
             held.pop(0).close()
@@ -454,48 +448,15 @@ class Talk:
         return data
 
 
-def code_of(name: str, key_hash: bytes, ca: bytes, token_id: bytes, joining: bytes, inviting: bytes) -> str:
-    """The six digits."""
-    parts = (name.encode(), key_hash, hashlib.sha256(ca).digest(), token_id)
-    packed = b"".join(len(part).to_bytes(4, "big") + part for part in parts)
-    mac = hmac.digest(joining + inviting, b"rmpa code 1" + packed, hashlib.sha256)
-    return f"{int.from_bytes(mac[:8], 'big') % 10**6:06}"
-
-
-def join_as(token: StolenToken, name: str, address: str, port: int) -> Iterator[dict[str, Any]]:
-    """Join with a key of our own, message by message: yields what comes, and ``code`` once it is known."""
-    key, _ = new_key()
-    spki = key.public_key().public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
-    key_hash, nonce = hashlib.sha256(spki).digest(), os.urandom(32)
-    with connect(address, port) as raw:
-        raw.sendall(preface(token.key, JOIN, 0, token.id))
-        try:
-            sock = tls_context(alpn="rmpa-join/1").wrap_socket(raw)
-        except OSError:
-            with connect(address, port) as again:  # the refusal stands in front of TLS: read it as it is
-                again.sendall(preface(token.key, JOIN, 0, token.id))
-                yield {"op": "refused", **told(again)}
-            return
-        with sock:
-            talk = Talk(sock)
-            welcome = talk.receive()
-            yield welcome
-            ca = base64.b64decode(welcome["ca"])
-            commitment = hashlib.sha256(b"rmpa commit 1" + nonce + key_hash).digest()
-            request, server = request_of(key, name), sock.getpeercert(binary_form=True) or b""
-            signed = b"rmpa join hello 1" + request + commitment + hashlib.sha256(server).digest()
-            proof = hmac.digest(token.key, signed, hashlib.sha256)
-            talk.send(op="hello", request=request, commitment=commitment, proof=proof)
-            challenge = talk.receive()
-            yield challenge
-            if challenge["op"] != "challenge":
-                return
-            talk.send(op="reveal", nonce=nonce)
-            inviting = base64.b64decode(challenge["nonce"])
-            yield {"op": "code", "code": code_of(name, key_hash, ca, token.id, nonce, inviting)}
-            talk.send(op="agree")
-            with contextlib.suppress(EOFError, OSError):
-                yield talk.receive()
+def join_as(token: StolenToken, name: str) -> dict[str, Any]:
+    """Join with a key of our own; the answer."""
+    with connect(token.address, token.port) as raw, tls_context(alpn="rmpa-join/1").wrap_socket(raw) as sock:
+        server = sock.getpeercert(binary_form=True) or b""
+        request = request_of(new_key()[0], name)
+        signed = b"rmpa join 2" + hashlib.sha256(request).digest() + hashlib.sha256(server).digest()
+        talk = Talk(sock)
+        talk.send(op="join", token=token.id, request=request, proof=hmac.digest(token.key, signed, hashlib.sha256))
+        return talk.receive()
 
 
 def join(given: Arguments) -> None:
@@ -505,21 +466,18 @@ def join(given: Arguments) -> None:
         token = StolenToken(token.changed(secret=os.urandom(16)))
     if given.get("later"):
         token = StolenToken(token.changed(expires=b"\xff\xff\xff\xff"))
-    last: dict[str, Any] = {"op": "nothing"}
     try:
-        for last in join_as(token, given["name"], token.address, token.port):
-            if last["op"] == "code":
-                say("code", code=last["code"])
+        answer = join_as(token, given["name"])
     except (EOFError, OSError) as error:
-        last = {"op": "closed", "error": str(error)}
-    say("done", **{key: value for key, value in last.items() if key not in ("certificate", "keys", "deny", "ca")})
+        answer = {"op": "closed", "error": str(error)}
+    say("done", **{key: value for key, value in answer.items() if key not in ("certificate", "keys", "deny", "ca")})
 
 
 def middle(given: Arguments) -> None:
-    """Stand between a joining module and the authority, as a member that has the token: ``token``, ``listen``.
+    """Stand between a joining module and the authority, as a member: ``token``, ``listen``, ``here``.
 
-    ``cert``, ``private``: the member's; the joining module was given the token with our address. Each side is shown
-    another code, since both sides do not share the keys and nonces.
+    ``cert``, ``private``: the member's. The joining module was given the token with our address; what it asks is
+    passed on to the authority.
     """
     token = StolenToken(given["token"])
     server = socket.create_server(("0.0.0.0", given["listen"]))
@@ -528,26 +486,15 @@ def middle(given: Arguments) -> None:
     )
     raw, _ = server.accept()
     raw.settimeout(60.0)
-    assert len(raw.recv(56, socket.MSG_WAITALL)) == 56
     context = tls_context(given["cert"], given["private"], alpn="rmpa-join/1", server=True)
     victim = Talk(context.wrap_socket(raw, server_side=True))
-    # To the authority we are a module of the victim's name, with a key of ours.
-    ours = join_as(token, given["name"], token.address, token.port)
-    victim.send(op="welcome", ca=base64.b64decode(next(ours)["ca"]))
-    greeting = victim.receive()
-    next(ours)
-    nonce = os.urandom(32)
-    victim.send(op="challenge", nonce=nonce)
-    reveal = victim.receive()
-    code = next(ours)["code"]
-    say("codes", authority=code, revealed=reveal["op"], asked=greeting["op"])
-    answer: dict[str, Any] = {}
-    with contextlib.suppress(StopIteration, EOFError, OSError):
-        answer = next(ours)
-    said: dict[str, Any] = {}
-    with contextlib.suppress(EOFError, OSError):
-        said = victim.receive()
-    say("done", authority=answer.get("op", "closed"), victim=said.get("op", "closed"), reason=said.get("reason", ""))
+    asked = victim.receive()
+    with connect(token.address, token.port) as sock, tls_context(alpn="rmpa-join/1").wrap_socket(sock) as on:
+        authority = Talk(on)
+        authority.send(**asked)
+        answer = authority.receive()
+    victim.send(**answer)
+    say("done", authority=answer["op"], reason=answer.get("reason", ""))
 
 
 MODES: dict[str, Callable[[Arguments], None]] = {

@@ -61,9 +61,8 @@ class SecuredMesh:
         for name in names:
             key = new_key()
             request = certificates.make_request(private_key(key, name), name)
-            _, certificate = authority.issue(request)
-            secrets = authority.secrets
-            self.store(name).save(MemberFiles(key, certificate, secrets.ca, secrets.keys, secrets.deny))
+            made = authority.grant(request)
+            self.store(name).save(MemberFiles(key, made.certificate, made.ca, made.keys, made.deny))
 
     def expired(self, name: str) -> TrustStore:
         """Files whose certificate ended an hour ago; never used by an agent."""

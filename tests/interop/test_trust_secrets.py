@@ -113,9 +113,9 @@ def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: Ag
     outputs = {" ".join(words): run(each, *words) for each in (a, b) for words in COMMANDS}
 
     # Joins that succeed and fail, with what is printed and answered.
-    invited = control(a, "invite", unattended=True)
+    invited = control(a, "invite")
     token = Token.parse(invited["token"])
-    joined: list[str | Path] = [RMPA, "trust", "join", "-", "--name", "c", "--yes", "--json"]
+    joined: list[str | Path] = [RMPA, "trust", "join", "-", "--name", "c", "--json"]
     c_state = tmp_path / "state" / "eve"
     env = {**a.env, "RMPA_STATE_DIR": str(c_state), "RMPA_RUNTIME_DIR": str(tmp_path / "none")}
     for number in range(2):  # the second time it is used
@@ -124,7 +124,7 @@ def test_no_key_and_no_token_leaves_its_file(tmp_path: Path, lab: Lab, agent: Ag
             process.wait(60.0)
             outputs[f"join {number}"] = process.output.encode()
     attack(hosts[2], "join", token=invited["token"], name="d", invented=True)
-    attack(hosts[2], "insider", **place(a), key=mesh.group_key, here=hosts[2].address, name="b")
+    attack(hosts[2], "insider", **place(a), here=hosts[2].address, name="b")
     outputs["revoke"] = json.dumps(control(a, "revoke", name="c", force=True)).encode()
 
     secrets = _secrets([mesh.store("a"), mesh.store("b")], token)

@@ -106,7 +106,7 @@ class NetworkEndpoint:
             lanes=settings.lanes,
             clock=clock,
             security=trust.membership if trust is not None else None,
-            on_join=trust.on_join if trust is not None else None,
+            on_join=trust.joins.serve if trust is not None and trust.joins is not None else None,
         )
         self.discovery = Discovery(
             self.identity,

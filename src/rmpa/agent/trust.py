@@ -17,16 +17,12 @@ from rmpa.core.backoff import Backoff
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.core.token_bucket import TokenBucket
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Refuse
 from rmpa.trust import limits
 from rmpa.trust.io.open_start import check_open
 from rmpa.trust.io.store import AuthorityPlace, TrustStore
-from rmpa.trust.reasons import TrustReason
 from rmpa.trust.spreading import DocumentSpreading, Notice, have_args, read_document, read_have
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable
 
     from rmpa.bridge.io.bridge import Bridge
@@ -37,7 +33,6 @@ if TYPE_CHECKING:
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.join_server import JoinServer
     from rmpa.trust.io.membership import Membership
-    from rmpa.trust.preface import Preface
     from rmpa.trust.status import TrustStatus
 
 _log = logging.getLogger(__name__)
@@ -75,21 +70,6 @@ def open_membership(settings: Settings, clock: Clock) -> Membership | None:
         remedy = f"start it with --name {membership.name}, or let it join: rmpa trust leave, rmpa trust join TOKEN"
         raise StartError(str(store.path("module.crt")), text, remedy)
     return membership
-
-
-def read_refusal(data: bytes) -> tuple[str, str] | None:
-    """The word and the text of a plain refusal; ``None`` if the bytes are none."""
-    try:
-        parsed = Frame.parse(data)
-        if parsed is None or parsed[0].kind is not FrameKind.REFUSE:
-            return None
-        refuse = Refuse.parse(parsed[0].payload)
-    except RemoteProtocolError:
-        return None
-    try:
-        return TrustReason(refuse.code).label, refuse.text
-    except ValueError:
-        return refuse.label, refuse.text
 
 
 class AgentTrust(Part):
@@ -133,7 +113,7 @@ class AgentTrust(Part):
         """The joins at the authority."""
         if membership.store.is_authority:
             self.authority = MeshAuthority.load(membership.store, membership)
-            self.joins = JoinServer(self.authority, membership, clock, self._is_linked, bridge.counters)
+            self.joins = JoinServer(self.authority, membership, clock, self.is_linked, bridge.counters)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, rng)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}
@@ -155,21 +135,11 @@ class AgentTrust(Part):
         self._renewing = asyncio.create_task(self._look_after(), name="renew the certificate")
 
     async def close(self) -> None:
-        """End joins and renewals."""
+        """End the renewal of the certificate."""
         if self._renewing is not None:
             self._renewing.cancel()
             await asyncio.gather(self._renewing, return_exceptions=True)
             self._renewing = None
-        if self.joins is not None:
-            await self.joins.close()
-
-    def on_join(self, sock: socket.socket, preface: Preface) -> None:
-        """Take a connection of a module that joins, or that renews a certificate that has ended."""
-        if self.joins is None:
-            _log.warning("! %s is refused: %s", preface, NOT_AUTHORITY)
-            sock.close()
-        else:
-            self.joins.accept(sock, preface)
 
     def notes(self) -> tuple[str, ...]:
         """What the user should do something about."""
@@ -339,7 +309,7 @@ class AgentTrust(Part):
         place = self.membership.store.load_authority()
         if place is None:
             raise UnreachableError("authority", "any link", "start its agent; rmpa peer list shows the links")
-        grant = await renew_at_authority(self.membership, place.address, place.port, read_refusal)
+        grant = await renew_at_authority(self.membership, place.address, place.port)
         self.membership.renewed(grant.certificate)
         for kind, data in ((Notice.DENY, grant.deny), (Notice.KEYS, grant.keys)):
             if data:
@@ -369,7 +339,8 @@ class AgentTrust(Part):
             return self.membership.name
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
-    def _is_linked(self, name: str) -> bool:
+    def is_linked(self, name: str) -> bool:
+        """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
         names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.reachable()))
         return name.casefold() in {each.casefold() for each in names}
 

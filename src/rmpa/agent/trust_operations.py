@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import inspect
 import logging
 from ipaddress import IPv4Address
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.agent.trust import NOT_AUTHORITY, trust_store
-from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.core.errors import ConfigError, PeerRefused, UnreachableError
 from rmpa.trust import limits
 from rmpa.trust.status import InviteReply, JoinStep, TrustReply, TrustStatus
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.trust.io.authority import MeshAuthority
-    from rmpa.trust.io.join_server import JoinServer
 
 _log = logging.getLogger(__name__)
 _STEP_WAIT: Final = 5.0
@@ -76,7 +76,6 @@ class TrustOperations:
             "status": self.status,
             "invite": self.invite,
             "step": self.step,
-            "answer": self.answer,
             "withdraw": self.withdraw,
             "renew": self.renew,
             "rotate": self.rotate,
@@ -102,20 +101,14 @@ class TrustOperations:
         return self._trust.status()
 
     def invite(self, args: Args) -> InviteReply:
-        """Make a token: ``name``, ``lifetime``, ``address`` and ``port``, each with a default; ``unattended``."""
+        """Make a token: ``name``, ``lifetime``, ``address`` and ``port``, each with a default."""
         authority = self._authority()
         lifetime = args.get("lifetime") or limits.TOKEN_LIFETIME
         if not isinstance(lifetime, int | float) or not 0 < lifetime <= limits.TOKEN_LIFETIME_MAX:
             raise ConfigError("--for", f"a token is valid for at most {limits.TOKEN_LIFETIME_MAX / 86_400:.0f} d")
         address, port = self._place(args)
         try:
-            token = authority.invite(
-                IPv4Address(address),
-                port,
-                float(lifetime),
-                str(args.get("name") or ""),
-                unattended=args.get("unattended") is True,
-            )
+            token = authority.invite(IPv4Address(address), port, float(lifetime), str(args.get("name") or ""))
         except ValueError as error:
             remedy = "give --address as the other machine reaches this one, and --name as modules have it"
             raise ConfigError("rmpa trust invite", str(error), remedy) from None
@@ -129,31 +122,15 @@ class TrustOperations:
         return str(address or identity.guid.address), port if isinstance(port, int) else identity.guid.port
 
     async def step(self, args: Args) -> JoinStep:
-        """How far the join with a token is: ``id``; ``after``: the last step that is known, the next is awaited."""
-        progress, after = self._joins().progress(_token_id(args)), args.get("after")
-        if isinstance(after, int) and progress.step <= after:
-            try:
-                async with asyncio.timeout(_STEP_WAIT):
-                    await progress.changed.wait()
-            except TimeoutError:
-                pass
-        return JoinStep(
-            step=progress.step,
-            state=progress.state.value,
-            code=progress.code,
-            module=progress.module,
-            reason=progress.reason,
-            text=progress.text,
-        )
-
-    def answer(self, args: Args) -> TrustReply:
-        """The user has compared the codes: ``id``, ``agree``."""
-        token_id = _token_id(args)
-        try:
-            self._joins().answer(token_id, agree=args.get("agree") is True)
-        except LocalProtocolError as error:
-            raise PeerRefused("the authority", str(error), "begin again with a new token") from None
-        return TrustReply(module=self._joins().progress(token_id).module, done=True)
+        """What came of a token: ``id``; ``after``: the last step that is known, the next one is awaited."""
+        self._authority()
+        joins, token_id, after = self._trust.joins, _token_id(args), args.get("after")
+        assert joins is not None  # noqa: S101 - the authority has one
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_STEP_WAIT):
+                while isinstance(after, int) and joins.step(token_id).step <= after:
+                    await joins.changed.wait()
+        return joins.step(token_id)
 
     def withdraw(self, args: Args) -> TrustReply:
         """Make a token void: ``id``."""
@@ -191,9 +168,8 @@ class TrustOperations:
             request = base64.b64decode(str(args.get("request", "")), validate=True)
         except ValueError:
             raise ConfigError("request", "is not in base64") from None
-        joins, again = self._trust.joins, str(args.get("module") or "")
-        is_in_use = (lambda _: False) if joins is None else joins.is_in_use
-        asked, answer = self._authority().join_file(request, again, is_in_use)
+        again = str(args.get("module") or "")
+        asked, answer = self._authority().join_file(request, again, self._trust.is_linked)
         return {
             "module": asked.name,
             "key": asked.key_hash[: limits.FINGERPRINT_BYTES].hex(),
@@ -207,11 +183,6 @@ class TrustOperations:
             remedy = f"do it at {name}" if name else "do it at the authority"
             raise PeerRefused(f"agent {trust.membership.name}", NOT_AUTHORITY, remedy)
         return trust.authority
-
-    def _joins(self) -> JoinServer:
-        self._authority()
-        assert self._trust.joins is not None  # noqa: S101 - the authority has one
-        return self._trust.joins
 
 
 def _token_id(args: Args) -> bytes:

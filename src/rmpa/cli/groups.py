@@ -173,7 +173,7 @@ trust: Final = _group(
             "leave": "Remove this module's keys and certificate.",
         },
         "trust_join": {
-            "invite": "Invite a module, at the authority: print a token, compare the code.",
+            "invite": "Invite a module, at the authority: print a token, and wait.",
             "join": "Join a secured mesh with a token, or by files.",
         },
         "trust": {

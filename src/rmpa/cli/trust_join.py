@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import re
 import sys
@@ -16,7 +15,6 @@ from rmpa.cli.options import json_option
 from rmpa.cli.output import print_json, print_line, warn
 from rmpa.cli.trust_mesh import EXIT_CODES
 from rmpa.cli.trust_place import (
-    asked,
     check_library,
     config_option,
     confirm,
@@ -46,10 +44,10 @@ _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
 @click.command(
     epilog=f"{EXIT_CODES}\n"
     "\b\nExamples:\n"
-    "  rmpa trust invite                          print a token, wait, compare the code\n"
+    "  rmpa trust invite                          print the line for the new module, and wait\n"
     "  rmpa trust invite --module arm2 --for 2d   for one module, valid for two days\n"
-    "  rmpa trust invite --no-wait | ssh arm2 rmpa trust join --yes -\n"
-    "                                             by a script; the token alone decides\n"
+    "  rmpa trust invite --no-wait | ssh arm2 rmpa trust join -\n"
+    "                                             by a script\n"
     "  rmpa trust invite --sign arm2.csr          answer a join by files\n"
 )
 @click.option(
@@ -63,8 +61,8 @@ _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
 @click.option(
     "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
 )
-@click.option("--yes", is_flag=True, help="Compare no code: the token alone decides.")
-@click.option("--no-wait", is_flag=True, help="Print the token and end; compare no code.")
+@click.option("--yes", is_flag=True, help="With --sign: do not ask.")
+@click.option("--no-wait", is_flag=True, help="Print the token and end.")
 @click.option("--sign", metavar="FILE", help="Answer the request of rmpa trust join --request; no token is made.")
 @click.option("--out", metavar="FILE", help="Where --sign writes the answer, a secret. [default: FILE.answer]")
 @name_option
@@ -82,9 +80,10 @@ def invite(
     file: str | None,
     as_json: bool,
 ) -> None:
-    """Invite a module, at the authority: print a token that is valid once, and compare the code that both sides show.
+    """Invite a module, at the authority: print a token that is valid once, and wait until it has joined.
 
-    The token goes to standard output, all else to standard error. It lets its holder join: pass it on as a secret.
+    On a terminal the token stands in the line to be run on the new module; else it goes to standard output alone. It
+    lets its holder join: pass it on as a secret.
     """
     if module and (problem := peer_name_problem(module)):
         raise ConfigError("--module", problem)
@@ -101,20 +100,11 @@ def invite(
         problem = "runs without trust" if place.socket is not None else "does not run"
         remedy = "start it again" if place.socket is not None else "start it: rmpa up"
         raise StartError(f"the agent {place.name}", f"{problem}, so no module can join", remedy)
-    unattended = yes or no_wait
-    invited = place.call(
-        "invite",
-        InviteReply,
-        name=module or "",
-        lifetime=seconds,
-        address=host,
-        port=port,
-        unattended=unattended,
-    )
+    invited = place.call("invite", InviteReply, name=module or "", lifetime=seconds, address=host, port=port)
     try:
         _print_token(invited, module, as_json=as_json)
         if not no_wait:
-            _await_join(place, invited, yes=yes, as_json=as_json)
+            _await_join(place, invited, as_json=as_json)
     except (KeyboardInterrupt, click.Abort):
         with contextlib.suppress(RmpaError):
             if place.call("withdraw", TrustReply, id=invited.id).done:
@@ -126,23 +116,24 @@ def _print_token(invited: InviteReply, module: str | None, *, as_json: bool) -> 
     if as_json:
         print_json(invited)
     else:
-        click.echo(invited.token)
         whom = module or "one module"
-        click.echo(f"for {whom}, until {date_of(invited.expires)}; there: rmpa trust join TOKEN", err=True)
+        click.echo(f"for {whom}, valid once, until {date_of(invited.expires)}; run there:", err=True)
+        named = f" --name {module}" if module else ""
+        click.echo(f"rmpa trust join{named} {invited.token}" if sys.stdout.isatty() else invited.token)
     sys.stdout.flush()
 
 
-def _await_join(place: TrustPlace, invited: InviteReply, *, yes: bool, as_json: bool) -> None:
-    """Wait until a module has joined with the token, or was refused."""
+def _await_join(place: TrustPlace, invited: InviteReply, *, as_json: bool) -> None:
+    """Wait until a module has joined with the token; one that was refused may try again."""
     import time
 
     step = JoinStep(step=0, state="waiting")
     if not as_json:
         click.echo("waiting for the module; Ctrl-C withdraws the token", err=True)
-    while step.state in ("waiting", "code"):
+    while step.state != "joined":
         following = place.call("step", JoinStep, id=invited.id, after=step.step)
         if following.step == step.step:
-            if step.state == "waiting" and time.time() > invited.expires:
+            if time.time() > invited.expires:
                 raise PeerRefused(
                     "the authority", "the token has ended, and no module came", "rmpa trust invite again"
                 )
@@ -150,18 +141,10 @@ def _await_join(place: TrustPlace, invited: InviteReply, *, yes: bool, as_json: 
         step = following
         if as_json:
             print_json(step)
-        if step.state == "code":
-            click.echo(f"{step.module} joins; its code must be: {grouped(step.code)}", err=True)
-            if not yes:
-                agree = confirm(f"Does {step.module} show this code?")
-                with contextlib.suppress(PeerRefused):  # it has ended meanwhile: the next step says how
-                    place.call("answer", TrustReply, id=invited.id, agree=agree)
-    if step.state == "refused":
-        raise PeerRefused(
-            "the authority", f"the join failed: {step.text} ({step.reason})", "begin again with a new token"
-        )
-    if not as_json:
-        click.echo(f"{step.module} has joined", err=True)
+        elif step.state == "refused":
+            warn(f"{step.module} was refused: {step.text} ({step.reason}); the token is still valid")
+        else:
+            click.echo(f"{step.module} has joined", err=True)
 
 
 def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool, as_json: bool) -> None:
@@ -260,7 +243,6 @@ def _address(text: str | None) -> tuple[str, int | None]:
     "  rmpa trust join --accept arm2.csr.answer --ca 4f2a...   ... and its answer back\n"
 )
 @click.argument("token", required=False)
-@click.option("--yes", is_flag=True, help="Compare no code: the token alone decides.")
 @click.option("--request", metavar="FILE", help="Join by files: write the request.")
 @click.option("--accept", metavar="FILE", help="Join by files: read the answer.")
 @click.option("--ca", metavar="FINGERPRINT", help="With --accept: of the CA, as rmpa trust invite --sign shows it.")
@@ -269,7 +251,6 @@ def _address(text: str | None) -> tuple[str, int | None]:
 @json_option
 def join(
     token: str | None,
-    yes: bool,
     request: str | None,
     accept: str | None,
     ca: str | None,
@@ -279,8 +260,7 @@ def join(
 ) -> None:
     """Join a secured mesh with a TOKEN of rmpa trust invite; - reads it from standard input.
 
-    Both sides show a code of six digits, and both users say that it is the same: so nothing between the machines has
-    taken part.
+    The token proves both sides to each other: nothing between the machines can take part without it.
     """
     if sum(each is not None for each in (token, request, accept)) != 1:
         raise ConfigError("rmpa trust join", "needs a TOKEN, --request or --accept", "see rmpa trust join --help")
@@ -292,7 +272,7 @@ def join(
     if request is not None:
         _write_request(place, Path(request), as_json=as_json)
         return
-    files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "", yes=yes)
+    files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "")
     place.store.save(files)
     place.store.forget("request.key")
     start = keep_member_name(place, file)
@@ -324,9 +304,9 @@ def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
     return f"{here}: links are refused while they differ by more than {limits.CLOCK_TOLERANCE:.0f} s; set it"
 
 
-def _join_by_token(place: TrustPlace, text: str, *, yes: bool) -> MemberFiles:
-    from rmpa.agent.trust import read_refusal
-    from rmpa.runtime.system_clock import SystemClock
+def _join_by_token(place: TrustPlace, text: str) -> MemberFiles:
+    import asyncio
+
     from rmpa.trust.io.joining import join_mesh
     from rmpa.trust.io.store import AuthorityPlace
     from rmpa.trust.tokens import Token, TokenError
@@ -336,15 +316,7 @@ def _join_by_token(place: TrustPlace, text: str, *, yes: bool) -> MemberFiles:
     except TokenError as error:
         raise ConfigError("TOKEN", str(error)) from None
     place.store.check_writable()  # before the token is used up
-
-    async def compare(code: str) -> bool:
-        click.echo(f"{place.name} joins; the code is: {grouped(code)}", err=True)
-        if yes:
-            click.echo("it is not compared (--yes): the token alone decides", err=True)
-            return True
-        return await asked(asyncio.get_running_loop(), lambda: confirm("Does the authority show this code?"))
-
-    files = asyncio.run(join_mesh(token, place.name, SystemClock(), compare, read_refusal))
+    files = asyncio.run(join_mesh(token, place.name))
     place.store.save_authority(AuthorityPlace("", str(token.address), token.port))
     return files
 
@@ -379,11 +351,11 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
     import msgspec
 
     from rmpa.trust import certificates
-    from rmpa.trust.documents import read_deny_list, read_key_list
     from rmpa.trust.io import store as files_of
-    from rmpa.trust.io.authority import JoinFile
+    from rmpa.trust.io.joining import check_grant
     from rmpa.trust.io.private_keys import private_key
     from rmpa.trust.io.store import MemberFiles
+    from rmpa.trust.join import CertificateGrant
 
     digits = re.sub(r"[\s:]", "", ca or "").lower()
     if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):
@@ -392,13 +364,9 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
     own = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
     try:
         with path.open("rb") as stream:
-            answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=JoinFile)
+            answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=CertificateGrant)
         certificates.check_ca(answer.ca, bytes.fromhex(digits))
-        found = certificates.verify(answer.certificate, answer.ca, None, name=place.name)
-        key = certificates.ca_public_key(answer.ca)
-        read_key_list(answer.keys, key)
-        if answer.deny:
-            read_deny_list(answer.deny, key)
+        check_grant(answer, place.name, own)
     except OSError as error:
         raise ConfigError(str(path), f"cannot be read: {error.strerror}") from None
     except (msgspec.MsgspecError, UnicodeError) as error:
@@ -406,7 +374,4 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
     except certificates.CertificateError as error:
         text = str(error).replace("of the token", "of --ca")
         raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
-    if found.public_key != certificates.read_request(own).public_key:
-        remedy = "begin again: rmpa trust join --request FILE"
-        raise ConfigError(str(path), "is the answer to another request than the last one", remedy)
     return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)

@@ -181,7 +181,6 @@ def _renew_files(place: TrustPlace) -> TrustReply:
     else:
         import asyncio
 
-        from rmpa.agent.trust import read_refusal
         from rmpa.trust.documents import DocumentKind
         from rmpa.trust.io.joining import renew_at_authority
 
@@ -189,7 +188,7 @@ def _renew_files(place: TrustPlace) -> TrustReply:
         if known is None:
             remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
             raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
-        grant = asyncio.run(renew_at_authority(membership, known.address, known.port, read_refusal))
+        grant = asyncio.run(renew_at_authority(membership, known.address, known.port))
         membership.renewed(grant.certificate)
         for kind, data in ((DocumentKind.DENY, grant.deny), (DocumentKind.KEYS, grant.keys)):
             if data:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,6 @@ from rmpa.trust.io.store import TrustStore
 from rmpa.trust.status import TrustStatus
 
 if TYPE_CHECKING:
-    import asyncio
-    from collections.abc import Callable
-
     from rmpa.config.module_name import ModuleName
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.membership import Membership
@@ -172,30 +168,6 @@ def confirm(question: str) -> bool:
             click.echo(err=True)
             raise ConfigError("the question", "has no answer: there is no terminal", "add --yes") from None
     return line.strip().lower() in {"y", "yes"}
-
-
-def asked(loop: asyncio.AbstractEventLoop, ask: Callable[[], bool]) -> asyncio.Future[bool]:
-    """The answer to a question, asked in a thread that does not keep the program from ending."""
-    answer: asyncio.Future[bool] = loop.create_future()
-
-    def finish(value: bool | BaseException) -> None:
-        if answer.done():
-            return
-        if isinstance(value, BaseException):
-            answer.set_exception(value)
-        else:
-            answer.set_result(value)
-
-    def run() -> None:
-        try:
-            found: bool | BaseException = ask()
-        except BaseException as error:  # noqa: BLE001 - handed to the loop
-            found = error
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(finish, found)
-
-    threading.Thread(target=run, name="question", daemon=True).start()
-    return answer
 
 
 def date_of(wall: float) -> str:

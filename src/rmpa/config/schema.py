@@ -205,5 +205,6 @@ REMOVED: Final = {
         ("gateway.store", "RMPA_GATEWAY_STORE", "gateway.rule.keep"),
         "no gateway keeps values: record the topic with rosbag, or keep its key by a storage of Zenoh",
     ),
+    "--yes": "leave it out: nothing is asked",
 }
 """What to use in place of a key, variable or option that is gone."""

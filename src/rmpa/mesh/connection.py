@@ -44,7 +44,6 @@ from rmpa.mesh.keepalive import Keepalive, RestPace
 from rmpa.mesh.parting import Parting, PartingStep
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
-from rmpa.trust.preface import is_preface
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
@@ -57,6 +56,8 @@ _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(FrameKind.DATA)
 _WHOLE: Final = frames.WHOLE
 _FIRST_PART: Final = 4
+_TLS_HANDSHAKE: Final = 0x16
+"""The first byte of a TLS connection; a frame begins with 0, as it is shorter than 16 MiB."""
 """Bytes that the first part of a message must have, because they contain the message's length."""
 
 
@@ -264,7 +265,7 @@ class ConnectionProtocol:
                 else:
                     self.on_part(route, sequence, stamp_ns, flags, view[start:end])
         except RemoteProtocolError as error:
-            if self.role is ConnectionRole.ACCEPTOR and self.remote is None and is_preface(view):
+            if self.role is ConnectionRole.ACCEPTOR and self.remote is None and view[0] == _TLS_HANDSHAKE:
                 text = f"{self._ours.name} is not secured, but the dialler is; {TrustReason.UNSECURED.remedy}"
                 self._refuse(Refuse(TrustReason.UNSECURED, text), now)
                 return size, 0

@@ -31,8 +31,8 @@ SELDOM_MENDED: Final = frozenset(
     }
 )
 """Refusals for reasons that seldom pass by themselves."""
-UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.KEY, TrustReason.CLOCK})
-"""Refusals that a secured agent receives without proof of the sender: they are shown, and change no pause."""
+UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.CLOCK})
+"""Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause."""
 OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 """Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 

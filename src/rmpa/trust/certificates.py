@@ -70,7 +70,7 @@ class CertificateRequest:
 
     @property
     def key_hash(self) -> bytes:
-        """SHA-256 of the key, which the six-digit code is bound to."""
+        """SHA-256 of the key, which users compare in a join by files."""
         return hashlib.sha256(self.public_key).digest()
 
 

@@ -29,7 +29,6 @@ class KeyPurpose(StrEnum):
 
     BEACON = "rmpa beacon 1"
     SWIM = "rmpa swim 1"
-    PREFACE = "rmpa preface 1"
 
 
 @dataclass(frozen=True, slots=True)

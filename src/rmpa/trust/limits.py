@@ -42,29 +42,11 @@ revocation made signs at once."""
 KEY_OVERLAP: Final = 3600.0
 """The group key before verifies for this long after the next one began to sign, unless a revocation made that one."""
 OLD_KEYS_MAX: Final = 256
-"""Addresses, and runs, of modules with an older group key that are remembered; beyond it they are forgotten, and
+"""Runs of modules with an older group key that are remembered; beyond it they are forgotten, and
 heard again."""
 OLD_KEY_PACKETS_RATE: Final = 50.0
 """Packets a second with an older group key that are read, over all senders: each leads to one packet as an answer,
 0.2 ms in all."""
-
-# --- connections ------------------------------------------------------------------------------------------------
-PREFACE_NONCE_BYTES: Final = 16
-"""Random bytes of a preface: 128 bits, so that two never have the same."""
-NONCE_KEPT: Final = 2 * CLOCK_TOLERANCE
-"""The nonce of a preface is remembered this long: from a clock that is as far ahead as is allowed to one that is as
-far behind."""
-NONCES_MAX: Final = 4096
-"""Nonces that are remembered of members, of modules with an older group key, and of holders of tokens, each: 68
-handshakes a second for a minute, 512 members that dial twice and again. Beyond it prefaces of that kind are
-refused."""
-NONCES_PER_ADDRESS: Final = 512
-"""Nonces of one address that are remembered, an eighth of all: one member cannot keep the others from linking. A
-machine with 128 modules, each of which dials both lanes twice in a minute, needs as many."""
-OLD_KEY_DIALS_RATE: Final = 50.0
-"""Connections a second with an older group key that may begin TLS, over all addresses: 15 % of a core."""
-OLD_KEY_DIALS_PER_ADDRESS: Final = 5.0
-"""Such connections a second of one address: both lanes of a module that was away, twice."""
 
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16
@@ -79,23 +61,13 @@ TOKENS_MAX: Final = 256
 """Tokens of one authority that are remembered, used ones too; the one that ended first is forgotten first."""
 TOKEN_TEXT_MAX: Final = 256
 """Characters of a token that are read; one has 91."""
-NONCE_BYTES: Final = 32
-"""Random bytes of each side's part of the six-digit code, as many as the hash has."""
-CODE_TIMEOUT: Final = 300.0
-"""Time in which both users compare the code: one of them walks to the other machine."""
-
 JOIN_REQUEST_MAX: Final = 16 * KIB
 """Bytes of one message of a joining module: a request for a certificate in base64 is 6 KiB at most."""
 JOIN_ANSWER_MAX: Final = 1 * MIB
 """Bytes of one message of the authority: two signed documents in base64."""
 
-JOINS_AT_ONCE: Final = 16
-"""Joins that the authority serves at a time, each may wait for a user; and as many renewals of modules that were
-away."""
-JOINS_PER_ADDRESS: Final = 4
-"""Of these, those of one address, joins and renewals apart: a user compares one code at a time."""
 JOIN_STEP_TIMEOUT: Final = 10.0
-"""For each step of a join or renewal that waits for no user: connecting, the TLS handshake, one answer."""
+"""For each step of a join or renewal: connecting with the TLS handshake, and question with answer."""
 ISSUED_MAX: Final = 1024
 """Modules whose last certificate the authority remembers, two for each member of a full roster."""
 

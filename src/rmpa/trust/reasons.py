@@ -16,9 +16,9 @@ class TrustReason(IntEnum):
     UNSECURED = 12
     """The acceptor has not joined a secured mesh, and the dialler has."""
     KEY = 13
-    """The group key is unknown, or the proof of it is wrong."""
+    """The group key of its packets is unknown."""
     CLOCK = 14
-    """The clocks are too far apart, or a certificate begins in the future."""
+    """A certificate begins in the future."""
     FOREIGN = 15
     """The certificate is of another CA."""
     EXPIRED = 16
@@ -29,8 +29,6 @@ class TrustReason(IntEnum):
     """The certificate is of another module than the hello says."""
     DOWNGRADE = 19
     """The connection does not use TLS 1.3 with this protocol."""
-    FLOOD = 20
-    """Too many handshakes come from there, or the same one came twice."""
 
     @property
     def label(self) -> str:
@@ -53,7 +51,6 @@ _REMEDIES: Final = {
     TrustReason.REVOKED: "it can come back by rmpa trust invite at the authority, and rmpa trust join there",
     TrustReason.NAME: "start the module with the name that it joined with, or let it join again",
     TrustReason.DOWNGRADE: "install the same release of rmpa on both",
-    TrustReason.FLOOD: "it is tried again; is something else connecting to this port?",
 }
 
 

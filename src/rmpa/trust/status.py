@@ -100,12 +100,11 @@ class InviteReply(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class JoinStep(msgspec.Struct, kw_only=True, frozen=True):
-    """How far a join is at the authority.
+    """What came of a token at the authority.
 
     Attributes:
         step: Counts the changes.
-        state: ``waiting``, ``code``, ``joined`` or ``refused``.
-        code: Six digits, once they are shown.
+        state: ``waiting``, ``joined`` or ``refused``; a token that was refused may still be used.
         module: The module that joins.
         reason: Why it was refused, one word.
         text: What happened.
@@ -113,7 +112,6 @@ class JoinStep(msgspec.Struct, kw_only=True, frozen=True):
 
     step: int
     state: str
-    code: str = ""
     module: str = ""
     reason: str = ""
     text: str = ""

@@ -151,7 +151,7 @@ class Token:
 
     @property
     def key(self) -> bytes:
-        """The key that signs the preface of a join (``trust.preface``)."""
+        """The key that proves a join (``trust.join.proof_of``)."""
         return hmac.digest(self.secret, b"rmpa token key 1", hashlib.sha256)
 
     def __str__(self) -> str:
@@ -182,7 +182,6 @@ class Invitation:
         expires: Seconds since 1970.
         name: The module that it is for; empty for any.
         used_by: The module that joined with it.
-        unattended: Whether no user compares the code at the authority: the token alone decides there.
     """
 
     token_id: bytes
@@ -190,7 +189,6 @@ class Invitation:
     expires: int
     name: str = ""
     used_by: str = ""
-    unattended: bool = False
 
 
 class TokenBook:
@@ -211,13 +209,12 @@ class TokenBook:
         """All that are remembered, for the file and ``rmpa trust status``."""
         return tuple(self._all.values())
 
-    def invite(self, token: Token, name: str = "", *, unattended: bool = False) -> None:
+    def invite(self, token: Token, name: str = "") -> None:
         """Remember a new token.
 
         Args:
             token: The token.
             name: The module that it is for; empty for any.
-            unattended: Whether no user compares the code at the authority.
 
         Raises:
             ValueError: No module can have that name.
@@ -226,19 +223,11 @@ class TokenBook:
             raise ValueError(problem)
         while len(self._all) >= limits.TOKENS_MAX:
             del self._all[min(self._all, key=lambda each: (not self._all[each].used_by, self._all[each].expires))]
-        self._all[token.token_id] = Invitation(token.token_id, token.key, token.expires, name, unattended=unattended)
+        self._all[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)
 
     def find(self, token_id: bytes) -> Invitation | None:
         """A token by its id; ``None`` if it is unknown."""
         return self._all.get(token_id)
-
-    def key_of(self, token_id: bytes) -> bytes | None:
-        """The key of a token that may still be used; ``None``: it is unknown or used.
-
-        A token whose time is over keeps its key, so that its holder is told so and not that it is unknown.
-        """
-        invitation = self._all.get(token_id)
-        return invitation.key if invitation is not None and invitation.key else None
 
     def judge(self, token_id: bytes, name: str, wall: float) -> TokenProblem | None:
         """Why a module may not join with a token; ``None``: it may.

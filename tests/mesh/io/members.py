@@ -3,87 +3,63 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import shutil
 import socket
 import ssl
 import tempfile
 import time
+import weakref
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cryptography.hazmat.primitives import serialization
-
-from rmpa.trust import limits
-from rmpa.trust.io.contexts import link_context
-from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
-from rmpa.trust.preface import Preface, PrefaceGuard, Purpose
-from rmpa.trust.reasons import TrustError, TrustReason
+from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust.documents import DocumentKind, sign
+from rmpa.trust.io.membership import Membership
+from rmpa.trust.io.store import CERTIFICATE, KEY, MemberFiles, TrustStore
 from tests.mesh.io.meshes import Peer, introduce
 from tests.trust.authority import Authority, new_key
+from tests.trust.io.member_files import KEYS, pem_of
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
-    from typing import Any
-
-GROUP_KEY = GroupKey(1, b"k" * limits.GROUP_KEY_BYTES)
+    from collections.abc import AsyncIterator
 
 
-@dataclass
-class Member:
-    """A ``MeshSecurity``.
+class _Store(TrustStore):
+    """Two files for OpenSSL; nothing else is read or written, as tests of this room may not block."""
+
+    is_authority = False
+
+    def write(self, name: str, data: bytes) -> None:
+        """Keep nothing."""
+
+
+class Member(Membership):
+    """A membership with files of its own.
 
     Args:
         ca: Whose certificate it has, and whose it accepts.
         name: The module.
         issued: When its certificate was issued, seconds before now.
-        group_key: Of its mesh.
-        ahead: Seconds that its clock is ahead.
     """
 
-    ca: Authority
-    name: str
-    issued: float = 0.0
-    group_key: GroupKey = GROUP_KEY
-    ahead: float = 0.0
-    denied: set[str] = field(default_factory=set)
-    on_denied: list[Callable[[], None]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._ring = KeyRing([self.group_key], 0.0)
-        self.guard = PrefaceGuard(self._ring)
+    def __init__(self, ca: Authority, name: str, issued: float = 0.0) -> None:
+        folder = tempfile.mkdtemp(prefix="rmpa-test-")
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self._ca = ca
         key = new_key()
-        pem = key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-        certificate = ssl.DER_cert_to_PEM_cert(self.ca.module(self.name, time.time() - self.issued, key)).encode()
-        with tempfile.TemporaryDirectory() as folder:
-            paths = Path(folder, "crt"), Path(folder, "key")
-            for path, data in zip(paths, (certificate, pem), strict=True):
-                path.write_bytes(data)
-            self.server_context = link_context(*paths, self.ca.certificate, server_side=True)
-            self.client_context = link_context(*paths, self.ca.certificate, server_side=False)
+        certificate = ca.module(name, time.time() - issued, key)
+        store = _Store(Path(folder), name)
+        files = MemberFiles(pem_of(key), certificate, ca.certificate, sign(KEYS, ca.key))
+        store.folder.mkdir(parents=True)
+        store.path(CERTIFICATE).write_text(ssl.DER_cert_to_PEM_cert(certificate))
+        store.path(KEY).write_bytes(files.key)
+        super().__init__(store, files, SystemClock(), time.time)
 
-    def wall(self) -> float | None:
-        return time.time() + self.ahead
-
-    def preface(self, purpose: Purpose) -> bytes:
-        preface = Preface(purpose, self.group_key.short, int((time.time() + self.ahead) * 1000), os.urandom(16))
-        return preface.serialize(self.group_key.key_for(KeyPurpose.PREFACE))
-
-    def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
-        assert not isinstance(certificate, bytes)
-        (name,) = [value.removeprefix("urn:rmpa:") for kind, value in certificate["subjectAltName"] if kind == "URI"]
-        if claimed is not None and claimed != name:
-            raise TrustError(TrustReason.NAME, f"the certificate is of {name}, not of {claimed}")
-        if name in self.denied:
-            raise TrustError(TrustReason.REVOKED, f"{name} was revoked")
-
-    def deny(self, *names: str) -> None:
-        self.denied.update(names)
-        for call in self.on_denied:
-            call()
+    def revoke(self, name: str) -> None:
+        """Let a newer deny list hold here."""
+        deny = sign(self.deny.with_name(name, time.time()), self._ca.key)
+        assert self.accept_document(DocumentKind.DENY, deny)
 
 
 @asynccontextmanager

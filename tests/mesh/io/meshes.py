@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import LaneSettings
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.io.securing import MeshSecurity, OnJoin
+    from rmpa.mesh.io.securing import OnJoin
+    from rmpa.trust.io.membership import Membership
 
 DEADLINE = 20.0
 
@@ -46,7 +47,7 @@ class Peer:
         lanes: LaneSettings | None = None,
         host: str = "127.0.0.1",
         name: str | None = None,
-        security: MeshSecurity | None = None,
+        security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)

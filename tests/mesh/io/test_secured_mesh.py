@@ -7,7 +7,6 @@ import contextlib
 import logging
 import socket
 import ssl
-import time
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -25,21 +24,16 @@ from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
+from rmpa.runtime.record_layer import TlsHandshake
 from rmpa.runtime.system_clock import SystemClock
-from rmpa.trust.keyring import GroupKey
-from rmpa.trust.preface import PREFACE_BYTES, Purpose
+from rmpa.trust.io.contexts import ALPN_LINK, join_context
 from rmpa.trust.reasons import TrustReason
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
-from tests.trust.io.member_files import HandClock, SecuredMesh
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rmpa.mesh.io.securing import MeshSecurity
     from rmpa.mesh.peering_events import PeerStatus
-    from rmpa.trust.preface import Preface
 
 DAY = 86_400.0
 
@@ -96,18 +90,16 @@ def _bad(lab: Authority, what: str) -> Member:
     """A module that is no member, for one reason."""
     if what == "foreign":
         return Member(Authority(), "arm")
-    if what == "key":
-        return Member(lab, "arm", group_key=GroupKey(1, b"x" * 32))
-    return Member(lab, "arm", issued=8 * DAY if what == "expired" else 0.0, ahead=3600.0 if what == "clock" else 0.0)
+    return Member(lab, "arm", issued={"expired": 8 * DAY, "clock": -DAY}.get(what, 0.0))
 
 
-@pytest.mark.parametrize("other", ["foreign", "expired", "clock", "key", "name", "revoked"])
+@pytest.mark.parametrize("other", ["foreign", "expired", "clock", "name", "revoked"])
 @pytest.mark.parametrize("dials", [True, False])
 async def test_refusals_have_their_reason_at_both_ends(lab: Authority, other: str, dials: bool) -> None:
     good = Member(lab, "base")
     bad, name = _bad(lab, other), "crane" if other == "name" else "arm"
     if other == "revoked":
-        good.deny("arm")
+        good.revoke("arm")
     securities, names = ((bad, good), (name, "base")) if dials else ((good, bad), ("base", name))
     async with meshes(*securities, names=names) as (low, high):
         await until(
@@ -117,13 +109,12 @@ async def test_refusals_have_their_reason_at_both_ends(lab: Authority, other: st
         await until(lambda: high.mesh.counters[f"link.refused.{other}"] > 0, "the acceptor counts it")
         assert low.mesh.counters[f"link.refused.{other}"] > 0
         assert not low.ups or not low.linked(high)
-        if other not in {"clock", "key"}:  # those are refused before the acceptor knows more than an address
-            await until(lambda: other in status(high, low).last_error, "the acceptor shows it")
+        await until(lambda: other in status(high, low).last_error, "the acceptor shows it")
 
 
 @pytest.mark.parametrize("bad", ["foreign", "expired"])
 async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, bad: str) -> None:
-    """By the acceptor's alert, which comes when the dialler's own handshake is done; nobody dials the other way."""
+    """What comes when the dialler's own handshake is done; nobody dials the other way."""
     mine = _bad(lab, bad)
     judge = Member(lab, "base")
     mine.client_context.verify_mode = ssl.CERT_NONE  # so that only the acceptor finds something wrong
@@ -136,6 +127,20 @@ async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, b
             low.mesh.peer_gone(high.identity.guid)
             await until(lambda: not low.mesh.peers(), "forgotten")
             low.mesh.peer_found(high.identity)
+
+
+async def test_a_module_without_a_certificate_is_refused(lab: Authority) -> None:
+    async with meshes(Member(lab, "base")) as (base,):
+        context = join_context()
+        context.set_alpn_protocols([ALPN_LINK])
+        reader, writer = await asyncio.open_connection("127.0.0.1", base.port, ssl=context)
+        frame = Frame.parse(await asyncio.wait_for(reader.read(), DEADLINE))
+        assert frame is not None
+        refuse = Refuse.parse(frame[0].payload)
+        assert (refuse.code, "it has no certificate" in refuse.text) == (TrustReason.FOREIGN, True)
+        assert base.mesh.counters["link.refused.foreign"] == 1
+        assert not base.mesh.connections()
+        writer.close()
 
 
 async def test_a_plain_module_learns_that_the_mesh_is_secured(lab: Authority) -> None:
@@ -156,7 +161,7 @@ async def test_a_member_never_falls_back_to_plain(lab: Authority) -> None:
         assert not plain.ups
 
 
-@pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.PLAIN, None])
+@pytest.mark.parametrize("answer", [Refusal.DUPLICATE, TrustReason.REVOKED, TrustReason.UNSECURED, None])
 async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
 ) -> None:
@@ -168,7 +173,7 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
     async def refused(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         nonlocal dials
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            await reader.readexactly(PREFACE_BYTES)
+            assert await reader.readexactly(1) == b"\x16"
             dials += 1
             writer.write(b"HTTP/1.1 400 Bad Request" if answer is None else refuse)
             await writer.drain()
@@ -180,7 +185,7 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
         arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
         await until(lambda: dials >= 3, "dialled again")
         await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
-        shown = "plain" if answer == TrustReason.PLAIN else "downgrade"
+        shown = "unsecured" if answer == TrustReason.UNSECURED else "downgrade"
         assert arm.mesh.peers()[0].last_error.startswith(shown)
         assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
 
@@ -191,7 +196,7 @@ async def test_a_revoked_module_is_gone_at_once_at_both_ends(lab: Authority, dia
     async with meshes(*members) as (arm, base):
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         judge, other = (arm, base) if dialler else (base, arm)
-        members[not dialler].deny(other.mesh.identity.name)
+        members[not dialler].revoke(other.mesh.identity.name)
         assert not judge.linked(other), "without waiting for the other side"
         assert judge.downs[0][1].startswith("revoked:")
         await until(lambda: bool(other.downs), "the other side sees it")
@@ -264,14 +269,14 @@ async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:
         for _ in range(50):
             (await _dial(base)).close()
         sock = await _dial(base)
-        sock.send(b"RM")
+        sock.send(b"\x16\x03")
         sock.close()
         await until(lambda: not unproven(base), "all are over")
-        assert base.mesh.counters["link.refused.plain"] == base.mesh.counters["link.unfinished"] == 0
+        assert base.mesh.counters["link.refused.plain"] == 0
 
 
 def unproven(peer: Peer) -> int:
-    """Connections whose preface is awaited."""
+    """Connections without a finished handshake."""
     assert peer.mesh._securing is not None
     return len(peer.mesh._securing._unproven)
 
@@ -284,62 +289,60 @@ async def _dial(peer: Peer, source: str = "127.0.0.1") -> socket.socket:
     return sock
 
 
-async def test_a_preface_one_byte_at_a_time_is_read(lab: Authority) -> None:
-    joined: list[tuple[socket.socket, Preface]] = []
-    peer = Peer(0, security=Member(lab, "base"), on_join=lambda sock, preface: joined.append((sock, preface)))
-    try:
-        await peer.mesh.start()
-        sock = await _dial(peer)
-        for byte in Member(lab, "arm").preface(Purpose.RENEWAL):
-            sock.send(bytes([byte]))
-            await asyncio.sleep(0)
-        sock.send(b"behind it")
-        await until(lambda: bool(joined), "handed on")
-        taken, preface = joined[0]
-        assert preface.purpose is Purpose.RENEWAL
-        assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(taken, 100), DEADLINE) == b"behind it"
-        taken.close()
+async def test_a_handshake_one_byte_at_a_time_is_done(lab: Authority) -> None:
+    member = Member(lab, "arm")
+    async with meshes(Member(lab, "base")) as (base,):
+        loop, sock = asyncio.get_running_loop(), await _dial(base)
+        handshake = TlsHandshake(member.client_context, server_side=False)
+        handshake.receive(b"")
+        async with asyncio.timeout(DEADLINE):
+            while not handshake.done:
+                for byte in handshake.take_output():
+                    sock.send(bytes([byte]))
+                    await asyncio.sleep(0)
+                handshake.receive(await loop.sock_recv(sock, 65536))
+        await loop.sock_sendall(sock, handshake.take_output())
+        await until(lambda: len(base.mesh.connections()) == 1, "it is a connection of the mesh")
         sock.close()
-    finally:
-        await peer.mesh.close()
 
 
-async def test_a_flood_of_forged_prefaces_costs_no_message_and_members_still_link(
-    lab: Authority, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("what", [b"", b"GET / HTTP/1.1\r\n" * 20, b"\x16\x03\x01\x02\x00\x01"])
+async def test_a_flood_of_strangers_costs_no_message_and_members_still_link(
+    lab: Authority, monkeypatch: pytest.MonkeyPatch, what: bytes
 ) -> None:
-    monkeypatch.setattr(limits, "UNPROVEN_BURST", 20)
-    monkeypatch.setattr(limits, "UNPROVEN_RATE", 100.0)
+    """200 connections that say nothing, garbage, or the begin of a ClientHello, from the members' own address."""
+    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 1000.0)
     members = Member(lab, "arm"), Member(lab, "base"), Member(lab, "crane")
     async with meshes(*members, found=False) as (arm, base, crane):
         introduce([arm, base])
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
-        forged = Member(lab, "arm", group_key=GroupKey(1, b"x" * 32)).preface(Purpose.LINK)
-        sent = 0
-        paused = False
-        while base.mesh.counters["link.paused"] < 3 or not paused:
-            paused = paused or base.mesh._acceptor.paused
-            for _ in range(3):
-                sock = socket.socket()
-                sock.setblocking(False)
-                base.hand_made.append(sock)
-                with contextlib.suppress(OSError):
-                    sock.connect(("127.0.0.1", base.port))
-                    # a connection is there at once on loopback, unless the queue is full
-                with contextlib.suppress(OSError):
-                    sock.send(forged + b"x" * 300)
+        for sent in range(200):
+            base.hand_made.append(sock := await _dial(base))
+            with contextlib.suppress(OSError):
+                sock.send(what)
             arm.link(base).express.send(1, sent, 0, b"x")
-            sent += 1
-            await asyncio.sleep(0)
-        assert base.mesh.counters["link.refused.key"] > 20
         introduce([base, crane])
         await until(lambda: base.linked(crane), "a new member")
-        await until(lambda: len(base.data) == sent, "all messages")
+        await until(lambda: len(base.data) == 200, "all messages")
+        counters = base.mesh.counters
+        assert counters["link.pending_full"] + counters["link.refused.plain"] > 100
         assert not base.downs
+
+
+async def test_accepting_pauses_for_a_flood(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "UNPROVEN_BURST", 20)
+    monkeypatch.setattr(limits, "UNPROVEN_RATE", 0.1)
+    async with meshes(Member(lab, "arm"), Member(lab, "base"), found=False) as (arm, base):
+        for _ in range(22):
+            (await _dial(base)).close()
+        await until(lambda: base.mesh.counters["link.paused"] > 0, "paused")
+        introduce([arm, base])
+        await until(lambda: base.linked(arm), "and goes on")
 
 
 async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
-    monkeypatch.setattr(limits, "PREFACE_TIMEOUT", 1000.0)
+    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 1000.0)
     monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
     members = Member(lab, "arm"), Member(lab, "base")
     async with meshes(*members, found=False) as (arm, base):
@@ -357,59 +360,19 @@ async def test_silent_connections_leave_room_for_members(lab: Authority, monkeyp
             sock.close()
 
 
-@pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01\x02\x00\x01", b"garbage" * 20])
+@pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01\x02\x00\x01", b"\x16garbage" * 20])
 async def test_a_handshake_that_stands_still_or_is_none_is_given_up(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, rest: bytes
 ) -> None:
     monkeypatch.setattr(limits, "SECURING_TIMEOUT", 0.3)
     async with meshes(Member(lab, "base")) as (base,):
         sock = await _dial(base)
-        sock.send(Member(lab, "arm").preface(Purpose.LINK) + rest)
+        sock.send(rest)
         counters = base.mesh.counters
         await until(lambda: counters["link.unfinished"] + counters["link.refused.downgrade"] == 1, "given up")
-        assert counters["link.refused.downgrade"] == (rest[:1] == b"g")
+        assert counters["link.refused.downgrade"] == (b"garbage" in rest)
         assert not base.mesh.connections()
         sock.close()
-
-
-async def test_a_replayed_preface_is_refused(lab: Authority) -> None:
-    async with meshes(Member(lab, "base")) as (base,):
-        preface = Member(lab, "arm").preface(Purpose.LINK)
-        socks = [await _dial(base) for _ in range(2)]
-        for sock in socks:
-            sock.send(preface)
-        await until(lambda: base.mesh.counters["link.refused.flood"] == 1, "the second one")
-        for sock in socks:
-            sock.close()
-
-
-@pytest.fixture
-def memberships(tmp_path: Path) -> list[MeshSecurity]:
-    """Of modules with real files."""
-    mesh = SecuredMesh(tmp_path, clock=SystemHandClock())
-    return [mesh.member(name, time.time()) for name in ("arm", "base")]
-
-
-async def test_memberships_are_what_a_mesh_needs(memberships: list[MeshSecurity]) -> None:
-    made = [Peer(number, name=name, security=memberships[number]) for number, name in enumerate(("arm", "base"))]
-    try:
-        for peer in made:
-            await peer.mesh.start()
-        introduce(made)
-        await until(lambda: made[0].both_lanes(made[1]) and made[1].both_lanes(made[0]), "both lanes")
-    finally:
-        await asyncio.gather(*(peer.mesh.close() for peer in made))
-    assert not any(security.on_denied for security in memberships)
-
-
-class SystemHandClock(HandClock):
-    """The machine's clock, for handshakes that OpenSSL judges."""
-
-    def now(self) -> float:
-        return time.monotonic()
-
-    def wall(self) -> float:
-        return time.time()
 
 
 async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_ends(lab: Authority) -> None:
@@ -426,7 +389,6 @@ async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_end
             on_join=None,
             pause=lambda _: None,
         )
-        theirs.sendall(Member(lab, "base").preface(Purpose.LINK))
         securing.accept(ours, ("127.0.0.1", 1))
         (task,) = securing.close()
         await asyncio.wait([task])

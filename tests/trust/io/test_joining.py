@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -13,33 +14,36 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import (
     ConfigError,
-    LocalProtocolError,
     PeerRefused,
     RemoteProtocolError,
     StartError,
     UnreachableError,
 )
-from rmpa.trust import certificates, limits
+from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.io.securing import Securing
+from rmpa.runtime.acceptor import Acceptor
+from rmpa.runtime.descriptors import Use
+from rmpa.runtime.system_clock import SystemClock
+from rmpa.trust import certificates
 from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
-from rmpa.trust.io.join_connection import JoinConnection, join_client_context, renewal_context
-from rmpa.trust.io.join_server import JoinServer, JoinState
+from rmpa.trust.io.contexts import ALPN_JOIN, join_context, member_context
+from rmpa.trust.io.join_server import JoinServer
 from rmpa.trust.io.joining import join_mesh, renew_at_authority
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.join import JoiningSide, JoinRefused
-from rmpa.trust.preface import PREFACE_BYTES, Preface, PrefaceError, Purpose
-from rmpa.trust.renewal import RenewalRefused
+from rmpa.trust.join import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from rmpa.trust.tokens import Token
@@ -62,65 +66,42 @@ class Lab:
         found_mesh(self.store, "base", "lab", WALL)
         self.base = Membership.load(self.store, self.clock, self.clock.wall)
         self.authority = MeshAuthority.load(self.store, self.base)
-        self.server = JoinServer(self.authority, self.base, self.clock, self.taken.__contains__)
+        self.server = JoinServer(self.authority, self.base, self.clock, self.taken.__contains__, Counters())
 
-    def invite(self, name: str = "", *, unattended: bool = False, lifetime: float = 900.0) -> Token:
-        address = IPv4Address("127.0.0.1")
-        return self.authority.invite(address, self.port, lifetime, name, unattended=unattended)
+    def invite(self, name: str = "", *, lifetime: float = 900.0) -> Token:
+        return self.authority.invite(IPv4Address("127.0.0.1"), self.port, lifetime, name)
 
-    async def join(
-        self,
-        token: Token,
-        name: str = "arm",
-        *,
-        agree: bool = True,
-        compare: Callable[[str], Awaitable[bool]] | None = None,
-    ) -> MemberFiles:
-        async def say(_code: str) -> bool:
-            return agree
-
-        def read_refusal(answer: bytes) -> tuple[str, str] | None:
-            return ("key", answer[6:].decode()) if answer.startswith(b"plain ") else None
-
-        return await join_mesh(token, name, self.clock, compare or say, read_refusal)
+    async def join(self, token: Token, name: str = "arm") -> MemberFiles:
+        return await join_mesh(token, name)
 
     def member(self, files: MemberFiles, name: str = "arm") -> Membership:
         store = TrustStore(self.folder, name)
         store.save(files)
         return Membership.load(store, self.clock, self.clock.wall)
 
-    async def accept(self, sock: socket.socket) -> None:
-        """As the mesh does: read the preface, judge it, and hand the socket on."""
-        preface = b""
-        while len(preface) < PREFACE_BYTES:
-            preface += await asyncio.get_running_loop().sock_recv(sock, PREFACE_BYTES - len(preface))
-        try:
-            found, _ = self.base.guard.admit(preface, self.clock.now(), self.base.wall())
-        except PrefaceError as error:
-            sock.sendall(b"plain " + str(error).encode())
-            sock.close()
-            return
-        self.server.accept(sock, found)
-
-    async def serve(self, listener: socket.socket) -> None:
-        while True:
-            sock, _ = await asyncio.get_running_loop().sock_accept(listener)
-            await self.accept(sock)
-
 
 @asynccontextmanager
 async def running(lab: Lab) -> AsyncIterator[Lab]:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        lab.port = listener.getsockname()[1]
-        listener.setblocking(False)
-        serving = asyncio.ensure_future(lab.serve(listener))
-        try:
-            async with asyncio.timeout(DEADLINE):
-                yield lab
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            await lab.server.close()
+    """The authority's port, as its mesh has it."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    lab.port = listener.getsockname()[1]
+    securing = Securing(
+        lab.base,
+        clock=SystemClock(),
+        refusals=RefusalLog(logging.getLogger(__name__), Counters()),
+        on_secured=lambda sock, *_: sock.close(),
+        on_refused=lambda *_: None,
+        on_join=lab.server.serve,
+        pause=lambda _: None,
+    )
+    acceptor = Acceptor(listener, securing.accept, name="joins", use=Use.LINK)
+    acceptor.start()
+    try:
+        async with asyncio.timeout(DEADLINE):
+            yield lab
+    finally:
+        acceptor.close()
+        await asyncio.gather(*securing.close(), return_exceptions=True)
 
 
 @pytest.fixture
@@ -128,123 +109,79 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path)
 
 
-async def code_shown(lab: Lab, token: Token) -> str:
-    progress = lab.server.progress(token.token_id)
-    while progress.state is JoinState.WAITING:
-        await progress.changed.wait()
-    return progress.code
-
-
-async def test_a_module_joins_when_both_users_see_one_code(lab: Lab) -> None:
+async def test_a_module_joins_with_its_token(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()
-        shown: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-
-        async def compare(code: str) -> bool:
-            shown.set_result(code)
-            return True
-
-        joining = asyncio.ensure_future(lab.join(token, compare=compare))
-        there, here = await shown, await code_shown(lab, token)
-        assert there == here
-        assert len(here) == 6
-        assert not joining.done()
-        lab.server.answer(token.token_id, agree=True)
-        arm = lab.member(await joining)
+        assert lab.server.step(token.token_id).state == "waiting"
+        arm = lab.member(await lab.join(token))
     assert arm.name == "arm"
     lab.base.judge_member(arm.files.certificate, "arm")
     arm.judge_member(lab.base.files.certificate, "base")
-    assert lab.server.progress(token.token_id).state is JoinState.JOINED
+    step = lab.server.step(token.token_id)
+    assert (step.step, step.state, step.module) == (1, "joined", "arm")
     assert [each.name for each in lab.authority.issued] == ["arm", "base"]
     assert arm.ring.newest == lab.base.ring.newest
 
 
 async def test_a_token_lets_one_module_join_also_after_a_restart(lab: Lab) -> None:
     async with running(lab):
-        token = lab.invite(unattended=True)
+        token = lab.invite()
         await lab.join(token)
-        with pytest.raises(PeerRefused, match=r"was used, or has ended \(token\); ask for a new one"):
+        with pytest.raises(PeerRefused, match=r"\(used\); each token lets one module join; ask for a new one"):
             await lab.join(token, "gripper")
-    assert lab.store.load_tokens().key_of(token.token_id) is None
+    [kept] = lab.store.load_tokens().invitations
+    assert (kept.used_by, kept.key) == ("arm", b"")
 
 
-async def test_a_used_token_stays_used_if_the_join_fails_afterwards(lab: Lab) -> None:
+async def test_a_token_is_used_before_a_certificate_is_issued(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the certificate cannot be written: a crash in between lets none join twice."""
+
+    def full(_: object) -> None:
+        raise StartError("issued.json", "cannot be written: No space left on device")
+
+    monkeypatch.setattr(lab.store, "save_issued", full)
     async with running(lab):
-        token = lab.invite(unattended=True)
-        with pytest.raises(PeerRefused, match="a user says that the codes differ"):
-            await lab.join(token, agree=False)
-        assert [each.name for each in lab.authority.issued] == ["base"]
-        with pytest.raises(PeerRefused):
+        token = lab.invite()
+        with pytest.raises(PeerRefused, match=r"No space left on device \(authority\)"):
             await lab.join(token)
+        with pytest.raises(PeerRefused, match=r"\(used\)"):
+            await lab.join(token)
+    assert lab.store.load_tokens().invitations[0].used_by == "arm"
 
 
-async def test_a_preface_that_was_held_back_lets_nothing_else_join(lab: Lab) -> None:
+async def test_a_request_that_is_not_of_the_tokens_holder_lets_nothing_join(lab: Lab) -> None:
+    """It knows the token's id, or has overheard a whole question, which is for the server's certificate alone."""
+    thief = make_request(private_key(new_key(), files_of.KEY), "thief")
     async with running(lab):
-        token = lab.invite(unattended=True)
-        stolen = Preface(Purpose.JOIN, 0, lab.clock.wall_ns() // 1_000_000, b"n" * 16, token.token_id)
-        with socket.create_connection(("127.0.0.1", lab.port)) as sock:
-            sock.setblocking(False)
-            await asyncio.get_running_loop().sock_sendall(sock, stolen.serialize(token.key))
-            connection = JoinConnection(sock, join_client_context(), server_side=False)
-            await connection.handshake()
-            request = make_request(private_key(new_key(), files_of.KEY), "thief")
-            guessed = replace(token, secret=b"x" * 16)
-            side = JoiningSide("thief", request, guessed, connection.certificate(), b"j" * 32, lab.clock.now())
-            while not side.over:
-                side.receive(await connection.receive(), None)
-                await connection.send(side.take_output())
-        end = side.events()[-1]
-        assert isinstance(end, JoinRefused)
-        assert end.reason == "token"
+        token = lab.invite()
+        for key, server in ((b"x" * 32, lab.base.files.certificate), (token.key, b"another")):
+            answer = lab.server.answer(Join(token.token_id, thief, proof_of(key, thief, server)), None, "10.0.0.9")
+            assert answer == JoinRefused("token", "the request is not signed with the token's key")
+        assert lab.server.step(token.token_id).state == "refused"
         assert [each.name for each in lab.authority.issued] == ["base"]
         await lab.join(token)  # its holder still can
 
 
-async def test_a_preface_that_was_recorded_does_not_keep_the_tokens_holder_out(lab: Lab) -> None:
-    """It has no time, so it can be sent again once its nonce is forgotten; a join that has begun goes on."""
+async def test_of_two_modules_with_one_token_or_one_name_one_becomes_a_member(lab: Lab) -> None:
     async with running(lab):
         token = lab.invite()
-        recorded = Preface(Purpose.JOIN, 0, 0, b"n" * 16, token.token_id).serialize(token.key)
-        loop = asyncio.get_running_loop()
-        with socket.create_connection(("127.0.0.1", lab.port)) as sock:
-            sock.setblocking(False)
-            await loop.sock_sendall(sock, recorded)
-            connection = JoinConnection(sock, join_client_context(), server_side=False)
-            await connection.handshake()  # and nothing behind it
-            joining = asyncio.ensure_future(lab.join(token))
-            await code_shown(lab, token)
-        lab.clock.seconds += limits.NONCE_KEPT + 1
-        with socket.create_connection(("127.0.0.1", lab.port)) as sock:
-            sock.setblocking(False)
-            await loop.sock_sendall(sock, recorded)
-            assert not (await loop.sock_recv(sock, 100)).startswith(b"\x16"), "no TLS: the join goes on"
-        ours, theirs = socket.socketpair()
-        lab.server.accept(ours, Preface(Purpose.RENEWAL, 1, 0, b"m" * 16, token.token_id))  # a member's
-        theirs.close()
-        lab.server.answer(token.token_id, agree=True)
-        assert lab.member(await joining).name == "arm"
-
-
-async def test_the_authoritys_user_may_refuse(lab: Lab) -> None:
-    async with running(lab):
-        token = lab.invite()
-        joining = asyncio.ensure_future(lab.join(token))
-        await code_shown(lab, token)
-        lab.server.answer(token.token_id, agree=False)
-        with pytest.raises(PeerRefused, match=r"codes differ.* \(code\); begin again with a new token"):
-            await joining
-        with pytest.raises(LocalProtocolError, match="no module is joining"):
-            lab.server.answer(token.token_id, agree=True)
+        found = await asyncio.gather(*(lab.join(token, name) for name in ("arm", "leg")), return_exceptions=True)
+        assert sum(isinstance(each, MemberFiles) for each in found) == 1
+        found = await asyncio.gather(
+            *(lab.join(lab.invite(), name) for name in ("crane", "Crane")), return_exceptions=True
+        )
+        assert sum(isinstance(each, MemberFiles) for each in found) == 1
+        assert len(lab.authority.issued) == 3
 
 
 async def test_who_cannot_join_is_told_why(lab: Lab) -> None:
     async with running(lab):
         lab.taken.add("gripper")
         with pytest.raises(PeerRefused, match="a module named gripper is a member"):
-            await lab.join(lab.invite(unattended=True), "gripper")
+            await lab.join(lab.invite(), "gripper")
         with pytest.raises(PeerRefused, match=r"\(name\); join with the --name that it is for"):
-            await lab.join(lab.invite("wrist", unattended=True))
-        late = lab.invite(unattended=True, lifetime=60.0)
+            await lab.join(lab.invite("wrist"))
+        late = lab.invite(lifetime=60.0)
         lab.clock.wall_seconds += 61
         with pytest.raises(PeerRefused, match=r"\(late\)"):
             await lab.join(late)
@@ -258,19 +195,16 @@ async def test_who_cannot_join_is_told_why(lab: Lab) -> None:
 async def test_another_authority_at_the_address_is_not_joined(lab: Lab, tmp_path: Path) -> None:
     other = Lab(tmp_path / "other")
     async with running(lab), running(other):
-        token = lab.invite(unattended=True)
-        # It has the token's key, as something in the middle that has stolen the token would.
-        stolen = other.invite(unattended=True)
-        other.authority.book.find(stolen.token_id)
-        forged = replace(token, port=other.port)
-        other.authority.book.invite(forged, unattended=True)
+        token = lab.invite()
+        forged = replace(token, port=other.port)  # as something in the middle that has stolen the token has it
+        other.authority.book.invite(forged)
         with pytest.raises(PeerRefused, match="does not have the fingerprint of the token"):
             await lab.join(forged)
 
 
 async def test_what_is_no_authority_is_named(lab: Lab) -> None:
     async with running(lab):
-        token = lab.invite(unattended=True)
+        token = lab.invite()
     with pytest.raises(UnreachableError, match=r"no authority answers at 127\.0\.0\.1"):
         await lab.join(token)
 
@@ -286,7 +220,7 @@ async def test_what_is_no_authority_is_named(lab: Lab) -> None:
 
 async def test_a_module_that_was_in_a_drawer_asks_again_with_its_key(lab: Lab) -> None:
     async with running(lab):
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        arm = lab.member(await lab.join(lab.invite()))
         lab.clock.wall_seconds += 30 * DAY
         lab.authority.renew_own()
         lab.authority.rotate()
@@ -299,33 +233,36 @@ async def test_a_module_that_was_in_a_drawer_asks_again_with_its_key(lab: Lab) -
 
 async def test_a_member_cannot_renew_in_the_authoritys_place(lab: Lab) -> None:
     async with running(lab):
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
-        thief = lab.member(await lab.join(lab.invite(unattended=True), "thief"), "thief")
+        arm = lab.member(await lab.join(lab.invite()))
+        thief = lab.member(await lab.join(lab.invite(), "thief"), "thief")
     received: list[bytes] = []
 
-    async def pretend(listener: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        sock, _ = await loop.sock_accept(listener)
-        await loop.sock_recv(sock, PREFACE_BYTES)
-        files = thief.store.path(files_of.CERTIFICATE), thief.store.path(files_of.KEY)
-        connection = JoinConnection(sock, renewal_context(*files, thief.files.ca, server_side=True), server_side=True)
-        await connection.handshake()
-        received.append(await connection.receive())
-        connection.close()
+    async def pretend(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        received.append(await reader.read())
+        writer.close()
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.setblocking(False)
-        pretending = asyncio.ensure_future(pretend(listener))
-        async with asyncio.timeout(DEADLINE):
-            with pytest.raises(RemoteProtocolError, match="is thief, not the authority"):
-                await renew_at_authority(arm, "127.0.0.1", listener.getsockname()[1])
-            await pretending
+    files = thief.store.path(files_of.CERTIFICATE), thief.store.path(files_of.KEY)
+    context = member_context(*files, thief.files.ca, ALPN_JOIN, server_side=True)
+    async with asyncio.timeout(DEADLINE), await asyncio.start_server(pretend, "127.0.0.1", 0, ssl=context) as server:
+        with pytest.raises(RemoteProtocolError, match="is thief, not the authority"):
+            await renew_at_authority(arm, "127.0.0.1", server.sockets[0].getsockname()[1])
+        while not received:
+            await asyncio.sleep(0)
     assert received == [b""]  # it was not even asked
+
+
+async def test_a_member_that_is_not_the_authority_says_so(lab: Lab) -> None:
+    async with running(lab):
+        arm = lab.member(await lab.join(lab.invite()))
+    lab.base = arm
+    async with running(lab):
+        with pytest.raises(RemoteProtocolError, match="is not the authority of its mesh"):
+            await lab.join(lab.invite(), "leg")
 
 
 async def test_a_revoked_module_and_one_away_too_long_get_nothing(lab: Lab) -> None:
     async with running(lab):
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        arm = lab.member(await lab.join(lab.invite()))
         lab.clock.wall_seconds += 400 * DAY
         with pytest.raises(PeerRefused, match=r"ended .* \(expired\); join again with a new token"):
             await renew_at_authority(arm, "127.0.0.1", lab.port)
@@ -337,11 +274,11 @@ async def test_a_revoked_module_and_one_away_too_long_get_nothing(lab: Lab) -> N
 
 async def test_a_revoked_name_can_be_invited_again_at_once(lab: Lab) -> None:
     async with running(lab):
-        before = lab.member(await lab.join(lab.invite(unattended=True)))
+        before = lab.member(await lab.join(lab.invite()))
         lab.authority.revoke("arm")
         with pytest.raises(CertificateError, match="arm was revoked"):
             lab.base.judge_member(before.files.certificate, "arm")
-        again = lab.member(await lab.join(lab.invite(unattended=True)))
+        again = lab.member(await lab.join(lab.invite()))
         lab.base.judge_member(again.files.certificate, "arm")
 
 
@@ -350,9 +287,9 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
     async with running(lab):
         lab.clock.wall_seconds += DAY
         if again:
-            await lab.join(lab.invite(unattended=True))
+            await lab.join(lab.invite())
             lab.authority.revoke("arm")
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
+        arm = lab.member(await lab.join(lab.invite()))
         lab.clock.wall_seconds -= DAY / 2
         lab.authority.revoke("arm")
         lab.clock.wall_seconds += DAY / 2
@@ -360,14 +297,10 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
             lab.base.judge_member(arm.files.certificate, "arm")
 
 
-async def test_revoking_ends_invitations_and_joins_of_that_name(lab: Lab) -> None:
+async def test_revoking_ends_invitations_of_that_name(lab: Lab) -> None:
     async with running(lab):
-        named, other, used = lab.invite("arm"), lab.invite("leg"), lab.invite()
-        joining = asyncio.ensure_future(lab.join(used))
-        await code_shown(lab, used)
+        named, other = lab.invite("arm"), lab.invite("leg")
         lab.authority.revoke("arm")
-        with pytest.raises(PeerRefused, match=r"\(revoked\)"):
-            await joining
         with pytest.raises(PeerRefused, match=r"\(token\)"):
             await lab.join(named)
         assert lab.authority.book.find(other.token_id) is not None
@@ -387,13 +320,13 @@ def test_a_full_disk_does_not_stop_a_revocation_half_way(lab: Lab, monkeypatch: 
 
 async def test_the_name_of_an_absent_member_is_not_given_to_another(lab: Lab) -> None:
     async with running(lab):
-        await lab.join(lab.invite(unattended=True))
+        await lab.join(lab.invite())
         for token, name in ((lab.invite(), "arm"), (lab.invite(), "ARM"), (lab.invite("ARM"), "ARM")):
             with pytest.raises(PeerRefused, match=r"is a member.*\(taken\); .*rmpa trust invite --module NAME"):
                 await lab.join(token, name)
-        await lab.join(lab.invite("arm", unattended=True))  # the user means this one
+        await lab.join(lab.invite("arm"))  # the user means this one
         lab.clock.wall_seconds += 8 * DAY
-        await lab.join(lab.invite(unattended=True))  # its certificate has ended
+        await lab.join(lab.invite())  # its certificate has ended
 
 
 @pytest.mark.parametrize("away", [0, 8 * DAY])
@@ -402,46 +335,28 @@ async def test_a_module_whose_name_another_one_has_by_now_renews_no_certificate(
 ) -> None:
     """Else two modules would have one name: its successor, and one that was in a drawer, or stolen."""
     async with running(lab):
-        old = lab.member(await lab.join(lab.invite(unattended=True)))
+        old = lab.member(await lab.join(lab.invite()))
         lab.clock.wall_seconds += away
         lab.authority.renew_own()
-        new = lab.member(await lab.join(lab.invite("arm", unattended=True)), "successor")
+        new = lab.member(await lab.join(lab.invite("arm")), "successor")
         for _ in range(4):
             with pytest.raises(PeerRefused, match=r"another module has joined as arm.*\(revoked\); join again"):
                 await renew_at_authority(old, "127.0.0.1", lab.port)
-        assert sum("a renewal by" in text for text in caplog.messages) == 1, "it does not fill the log"
+        assert sum("refused a renewal by" in text for text in caplog.messages) == 1, "it does not fill the log"
         again = MeshAuthority.load(lab.store, lab.base)
         with pytest.raises(CertificateError, match="another module has joined as arm"):
             again.issue(old.request(), "arm")
         new.renewed((await renew_at_authority(new, "127.0.0.1", lab.port)).certificate)
 
 
-async def test_of_two_modules_that_join_under_one_name_at_a_time_one_becomes_a_member(lab: Lab) -> None:
+async def test_the_name_of_a_linked_module_is_not_given_to_another(lab: Lab) -> None:
     async with running(lab):
-        first, second = lab.invite(), lab.invite("arm")
-        joining = asyncio.ensure_future(lab.join(first))
-        await code_shown(lab, first)
-        with pytest.raises(PeerRefused, match=r"joins just now.*\(taken\)"):
-            await lab.join(second, "arm")
-        key = private_key(lab.base.files.key, "module.key")
-        for name in ("arm", "ARM"):
-            with pytest.raises(ConfigError, match="joins just now"):
-                lab.authority.join_file(make_request(key, name), "arm", lab.server.is_in_use)
-        lab.server.answer(first.token_id, agree=True)
-        await joining
-        await lab.join(lab.invite("arm", unattended=True))  # away, and invited by its name
-
-
-async def test_a_name_that_was_taken_while_the_code_was_compared_is_not_granted(lab: Lab) -> None:
-    async with running(lab):
-        token = lab.invite("arm")
-        joining = asyncio.ensure_future(lab.join(token))
-        await code_shown(lab, token)
-        lab.taken.add("arm")  # the member of that name is back
-        lab.server.answer(token.token_id, agree=True)
+        lab.taken.add("arm")
         with pytest.raises(PeerRefused, match=r"a module named arm is a member.*\(taken\)"):
-            await joining
-        assert [each.name for each in lab.authority.issued] == ["base"]
+            await lab.join(lab.invite("arm"))
+        key = private_key(lab.base.files.key, "module.key")
+        with pytest.raises(ConfigError, match="a module named arm is a member"):
+            lab.authority.join_file(make_request(key, "arm"), "arm", lab.taken.__contains__)
 
 
 @pytest.mark.parametrize("wall", [0.0, WALL - 3 * DAY, WALL + 3 * DAY])
@@ -449,72 +364,54 @@ async def test_a_module_joins_whatever_its_clock_shows(lab: Lab, wall: float) ->
     """A robot without a battery for its clock has the time of its last shutdown, or 1970."""
     async with running(lab):
         clock = HandClock(wall_seconds=wall)
-        files = await join_mesh(lab.invite(unattended=True), "arm", clock, lambda _code: asyncio.sleep(0, True))
+        files = await lab.join(lab.invite())
     store = TrustStore(lab.folder, "arm")
     store.save(files)
     arm = Membership.load(store, clock, clock.wall)
     assert (arm.wall() is None) == (wall < WALL)
     if arm.wall() is None:
         arm.judge_member(lab.base.files.certificate, "base")
-        assert Preface.parse(arm.preface(Purpose.LINK)).time_ms == 0
-
-
-async def test_two_connections_with_one_token_at_once_are_one_join(
-    lab: Lab, caplog: pytest.LogCaptureFixture
-) -> None:
-    lab.port = 1
-    token = lab.invite()
-    preface = Preface(Purpose.JOIN, 0, 0, b"n" * 16, token.token_id)
-    pairs = [socket.socketpair() for _ in range(2)]
-    for ours, _ in pairs:
-        lab.server.accept(ours, preface)
-    await lab.server.close()
-    await asyncio.sleep(0)
-    assert [ours.fileno() for ours, _ in pairs] == [-1, -1]
-    for _, theirs in pairs:
-        theirs.close()
-    assert "KeyError" not in caplog.text
 
 
 async def test_the_text_of_a_refused_renewal_is_safe_to_show(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     async with running(lab):
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
-        refusal = RenewalRefused("a\nb", "\x1b[2Jgone\nnext")
-        monkeypatch.setattr(lab.server, "_renewed", lambda *_: refusal)
+        arm = lab.member(await lab.join(lab.invite()))
+        refusal = JoinRefused("a\nb", "\x1b[2Jgone\nnext")
+        monkeypatch.setattr(lab.server, "answer", lambda *_: refusal)
         with pytest.raises(PeerRefused) as caught:
             await renew_at_authority(arm, "127.0.0.1", lab.port)
         assert str(caught.value).isprintable()
 
 
-async def test_a_flood_of_joins_is_bounded_and_ends_with_the_server(lab: Lab) -> None:
+async def test_idle_connections_leave_room_for_joins(lab: Lab) -> None:
+    """They do the handshake of a join, and ask nothing."""
     async with running(lab):
-        token = lab.invite()
-        first = asyncio.ensure_future(lab.join(token))
-        await code_shown(lab, token)
-        await lab.server.close()
-        with pytest.raises(PeerRefused, match="the connection ended"):
-            await first
-
-
-async def test_idle_renewals_leave_places_to_joins_and_to_other_addresses(lab: Lab) -> None:
-    """A member opens connections for a renewal, and sends nothing behind the prefaces."""
-    async with running(lab):
-        arm = lab.member(await lab.join(lab.invite(unattended=True)))
-        lab.clock.wall_seconds += 30 * DAY
-        lab.authority.renew_own()
-        loop = asyncio.get_running_loop()
-        idle = []
-        for _ in range(limits.JOINS_AT_ONCE + 4):
-            idle.append(sock := socket.socket())
-            sock.setblocking(False)
-            sock.bind(("127.0.0.2", 0))
-            await loop.sock_connect(sock, ("127.0.0.1", lab.port))
-            await loop.sock_sendall(sock, arm.preface(Purpose.RENEWAL))
-        assert await loop.sock_recv(idle[-1], 1) == b"", "it is closed"
-        await lab.join(lab.invite(unattended=True), "gripper")
+        idle = [
+            await asyncio.open_connection("127.0.0.1", lab.port, ssl=join_context())
+            for _ in range(mesh_limits.PENDING_PER_ADDRESS + 4)
+        ]
+        assert await idle[0][0].read() == b"", "the oldest one is closed"
+        arm = lab.member(await lab.join(lab.invite()))
         await renew_at_authority(arm, "127.0.0.1", lab.port)
-        for sock in idle:
-            sock.close()
+        for _, writer in idle:
+            writer.close()
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        b"\xff\xff\xff\xff",
+        b"\0\0\0\x02{}",
+        encode_message(Renew(b"csr")),
+        encode_message(CertificateGrant(b"", b"", b"")),
+    ],
+)
+async def test_what_is_no_question_is_closed_without_an_answer(lab: Lab, question: bytes) -> None:
+    async with running(lab):
+        reader, writer = await asyncio.open_connection("127.0.0.1", lab.port, ssl=join_context())
+        writer.write(question)
+        assert await reader.read() == b""
+        writer.close()
 
 
 def test_a_join_by_files(lab: Lab) -> None:

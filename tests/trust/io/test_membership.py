@@ -17,7 +17,6 @@ from rmpa.trust.io import store as files_of
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.keyring import GroupKey, KeyPurpose
 from rmpa.trust.packets import Verdict
-from rmpa.trust.preface import PrefaceError, Purpose
 from rmpa.trust.reasons import TrustError, TrustReason
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
@@ -87,7 +86,7 @@ def test_certificates_are_judged_in_both_forms(mesh: SecuredMesh, tmp_path: Path
     base.judge_member(certificate, None)
     assert reason_of(base, certificate, "joystick") is TrustReason.NAME
     assert reason_of(base, SecuredMesh(tmp_path).authority.module("arm"), "arm") is TrustReason.FOREIGN
-    assert reason_of(base, {"notBefore": "x"}, None) is TrustReason.FOREIGN
+    assert reason_of(base, {"notBefore": "x"}, None) is reason_of(base, {}, None) is TrustReason.FOREIGN
     mesh.clock.wall_seconds = WALL + 8 * DAY
     assert reason_of(base, certificate, "arm") is TrustReason.EXPIRED
     late = mesh.authority.module("arm", WALL + 9 * DAY)
@@ -100,12 +99,9 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     mesh.clock.wall_seconds = begin - 1
     assert base.wall() is None
     base.judge_member(mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
-    assert Purpose.LINK is base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)[0].purpose
     mesh.clock.wall_seconds = begin + 1
     assert base.wall() == begin + 1
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
-    with pytest.raises(PrefaceError, match="behind the acceptor's"):
-        base.guard.admit(base.preface(Purpose.LINK), 1.0, WALL + DAY)
 
 
 def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) -> None:
@@ -184,7 +180,6 @@ def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart
             packet = revoked.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, WALL)
             heard = member.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, WALL)
             assert heard.verdict is Verdict.OLD_KEY
-            assert member.guard.admit(revoked.preface(Purpose.LINK), now, WALL)[1]
             assert member.ring.signing(now).number == 2, "a key of a revocation signs at once"
 
 

@@ -158,7 +158,7 @@ def test_tokens_survive_and_stay_used(trust: TrustStore) -> None:
     book.invite(token, "arm")
     trust.save_tokens(book)
     again = trust.load_tokens()
-    assert again.key_of(token.token_id) == token.key
+    assert [each.key for each in again.invitations] == [token.key]
     assert again.use(token.token_id, "arm", 0.0) is None
     trust.save_tokens(again)
     assert trust.load_tokens().use(token.token_id, "arm", 0.0) is TokenProblem.USED

@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello
-    from rmpa.mesh.io.securing import MeshSecurity, OnJoin, SecuredSocket
+    from rmpa.mesh.io.securing import OnJoin, SecuredSocket
     from rmpa.mesh.peering_events import SocketAddress
+    from rmpa.trust.io.membership import Membership
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ class Mesh:
         rng: Uniform numbers in [0, 1), for jitter.
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
-        on_join: Takes accepted connections for a join or a renewal, with their prefaces.
+        on_join: Serves accepted connections for a join or a renewal; ``None``: this module is not the authority.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Mesh:
         counters: Counters | None = None,
         rng: Callable[[], float] = random.random,
         dialler: Dialler | None = None,
-        security: MeshSecurity | None = None,
+        security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
         self.identity = identity

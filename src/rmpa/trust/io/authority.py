@@ -7,8 +7,6 @@ import os
 import ssl
 from typing import TYPE_CHECKING, Final
 
-import msgspec
-
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.trust import certificates, limits
@@ -17,7 +15,7 @@ from rmpa.trust.documents import DenyList, DocumentKind, KeyList, sign
 from rmpa.trust.io import store as files_of
 from rmpa.trust.io.private_keys import new_key, private_key
 from rmpa.trust.io.store import Issued, MemberFiles
-from rmpa.trust.join import MeshSecrets
+from rmpa.trust.join import CertificateGrant
 from rmpa.trust.keyring import GroupKey
 from rmpa.trust.page_names import server_names
 from rmpa.trust.reasons import TrustReason
@@ -36,26 +34,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _SERIAL_BITS: Final = 159
 _CLOCK: Final = "set it first (date, timedatectl): certificates with a wrong time are of no use elsewhere"
-
-
-class JoinFile(msgspec.Struct, frozen=True):
-    """The answer of the authority in a join by files. It is secret: it has the group keys.
-
-    Args:
-        certificate: The module's (DER).
-        ca: The CA's (DER).
-        keys: The signed list of group keys.
-        deny: The signed deny list; empty if nothing was revoked.
-    """
-
-    certificate: bytes
-    ca: bytes
-    keys: bytes
-    deny: bytes = b""
-
-    def __repr__(self) -> str:
-        """Without the keys."""
-        return f"JoinFile({len(self.certificate)} bytes of a certificate)"
 
 
 def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
@@ -101,22 +79,13 @@ class MeshAuthority:
         if ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
             raise StartError(str(store.path(files_of.CA_KEY)), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
-        self.book = membership.tokens = store.load_tokens()
+        self.book = store.load_tokens()
         """The tokens."""
-        self.on_revoked: list[Callable[[str], None]] = []
-        """Called with the name of a module that was revoked: its joins under way end."""
 
     @classmethod
     def load(cls, store: TrustStore, membership: Membership) -> MeshAuthority:
         """Read the files of the authority; errors as for the class."""
         return cls(store, membership, private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY))))
-
-    @property
-    def secrets(self) -> MeshSecrets:
-        """What a joining module gets, and what signs it."""
-        member = self._membership
-        keys, deny = member.document(DocumentKind.KEYS), member.document(DocumentKind.DENY)
-        return MeshSecrets(member.files.ca, self._ca_key, keys, deny)
 
     @property
     def issued(self) -> tuple[Issued, ...]:
@@ -125,9 +94,7 @@ class MeshAuthority:
 
     # --- invitations ------------------------------------------------------------------------------------------
 
-    def invite(
-        self, address: IPv4Address, port: int, lifetime: float, name: str = "", *, unattended: bool = False
-    ) -> Token:
+    def invite(self, address: IPv4Address, port: int, lifetime: float, name: str = "") -> Token:
         """A new token.
 
         Args:
@@ -135,7 +102,6 @@ class MeshAuthority:
             port: The mesh port.
             lifetime: Seconds of its validity.
             name: The module that it is for; empty for any.
-            unattended: Whether no user compares the code here.
 
         Raises:
             StartError: The clock is not set, or the file cannot be written.
@@ -143,7 +109,7 @@ class MeshAuthority:
         """
         secret = os.urandom(limits.TOKEN_SECRET_BYTES)
         token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self._membership.files.ca), secret)
-        self.book.invite(token, name, unattended=unattended)
+        self.book.invite(token, name)
         self.save_tokens()
         return token
 
@@ -171,21 +137,10 @@ class MeshAuthority:
             raise StartError("the clock of this machine", "is not set", _CLOCK)
         return wall
 
-    def wall_for(self, name: str) -> float:
+    def _wall_for(self, name: str) -> float:
         """The time at which a certificate of a module is issued: behind its revocation, also in the same second."""
         entry = next((entry for entry in self._membership.deny.entries if entry.name == name), None)
         return self.wall() if entry is None else max(self.wall(), entry.before + 1.0)
-
-    def new_serial(self) -> int:
-        """A random number for a certificate."""
-        return _serial()
-
-    def was_issued(self, name: str, key: bytes, hosts: tuple[str, ...] = ()) -> None:
-        """Remember that a module has a new certificate, of this public key (DER) and with these hosts of its page."""
-        self._issued[name] = _issued(name, self.wall_for(name), key, hosts)
-        while len(self._issued) > limits.ISSUED_MAX:
-            del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
-        self._store.save_issued(self.issued)
 
     def issue(self, request: bytes, name: str = "") -> tuple[CertificateRequest, bytes]:
         """A certificate (DER) for a request (DER), which it returns too.
@@ -205,11 +160,21 @@ class MeshAuthority:
         last = self._issued.get(asked.name)
         if name and last is not None and last.key not in (b"", asked.public_key):
             raise CertificateError(TrustReason.REVOKED, f"another module has joined as {name} since")
-        secrets = self.secrets
-        hosts, wall = self._granted(asked), self.wall_for(asked.name)
-        certificate = certificates.issue(asked, secrets.ca, self._ca_key, _serial(), wall, hosts=hosts)
-        self.was_issued(asked.name, asked.public_key, hosts)
+        ca = self._membership.files.ca
+        hosts, wall = self._granted(asked), self._wall_for(asked.name)
+        certificate = certificates.issue(asked, ca, self._ca_key, _serial(), wall, hosts=hosts)
+        self._issued[asked.name] = _issued(asked.name, wall, asked.public_key, hosts)
+        while len(self._issued) > limits.ISSUED_MAX:
+            del self._issued[min(self._issued, key=lambda each: self._issued[each].expires)]
+        self._store.save_issued(self.issued)
         return asked, certificate
+
+    def grant(self, request: bytes, name: str = "") -> CertificateGrant:
+        """A certificate, and what else a member has; arguments and errors as for ``issue``."""
+        _, certificate = self.issue(request, name)
+        member = self._membership
+        keys, deny = member.document(DocumentKind.KEYS), member.document(DocumentKind.DENY)
+        return CertificateGrant(certificate, member.files.ca, keys, deny)
 
     def _granted(self, asked: CertificateRequest) -> tuple[str, ...]:
         """Of the hosts that a module asks for those that are of no other module: the first one that asks has them."""
@@ -252,27 +217,26 @@ class MeshAuthority:
         return any(each.casefold() == folded and each != again for each in issued)
 
     def join_file(
-        self, request: bytes, again: str = "", is_in_use: Callable[[str], bool] = lambda _: False
-    ) -> tuple[CertificateRequest, JoinFile]:
+        self, request: bytes, again: str = "", is_linked: Callable[[str], bool] = lambda _: False
+    ) -> tuple[CertificateRequest, CertificateGrant]:
         """The answer to a request (DER) in a join by files.
 
         Args:
             request: PKCS #10.
             again: The name of a member that may join again, as of an invitation for it.
-            is_in_use: Whether a module that is linked, or joins just now, has a name.
+            is_linked: Whether a module that is linked has a name.
 
         Raises:
-            ConfigError: Another member has the name, or a join under way.
+            ConfigError: Another member has the name.
             RmpaError: As ``issue``.
         """
-        name = certificates.read_request(request).name
-        if is_in_use(name) or self.has_issued(name, again):
-            text = f"a module named {name} is a member, or joins just now"
+        asked = certificates.read_request(request)
+        name = asked.name
+        if is_linked(name) or self.has_issued(name, again):
+            text = f"a module named {name} is a member"
             remedy = f"if it is that one, and away: --module {name}; else rmpa trust revoke {name}, or another name"
             raise ConfigError("the request", text, remedy)
-        asked, certificate = self.issue(request)
-        secrets = self.secrets
-        return asked, JoinFile(certificate, secrets.ca, secrets.keys, secrets.deny)
+        return asked, self.grant(request)
 
     # --- documents --------------------------------------------------------------------------------------------
 
@@ -315,8 +279,6 @@ class MeshAuthority:
         self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
-        for call in tuple(self.on_revoked):
-            call(name)
         unused = [each for each in self.book.invitations if not each.used_by]
         for invitation in unused:
             if invitation.name == name:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import ssl
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
@@ -13,13 +12,11 @@ from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust.documents import DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
 from rmpa.trust.io import store as files_of
-from rmpa.trust.io.contexts import link_context
+from rmpa.trust.io.contexts import ALPN_JOIN, ALPN_LINK, member_context
 from rmpa.trust.io.private_keys import private_key
-from rmpa.trust.keyring import KeyPurpose, KeyRing
+from rmpa.trust.keyring import KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
-from rmpa.trust.preface import Preface, PrefaceGuard, Purpose
 from rmpa.trust.reasons import TrustError, TrustReason
-from rmpa.trust.tokens import TokenBook
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -62,16 +59,12 @@ class Membership:
             self._deny = read_deny_list(files.deny, self._ca_key) if files.deny else DenyList()
         proves_from, age = self._keys.proves_from, self._age(self._keys, limits.KEY_SPREAD)
         self.ring = KeyRing(self._keys.group_keys, clock.now(), proves_from=proves_from, age=age)
-        self.tokens = TokenBook()
-        """The open tokens; the authority puts its own here."""
-        self.guard = PrefaceGuard(self.ring, self._token_key)
         self.packets = PacketTrust(PacketSigner(self.ring), PacketVerifier(self.ring), self.wall)
         self.on_denied: list[Callable[[], None]] = []
         """Called after a newer deny list holds: links that match end at once."""
         self.save: Callable[[str, bytes], None] = store.write
         """Writes one file of the store."""
-        self._contexts: dict[tuple[bool, bool], ssl.SSLContext] = {}
-        self._context(server_side=True)  # a key of another certificate is an error of the start
+        self._make_contexts()
 
     @classmethod
     def load(cls, store: TrustStore, clock: Clock, wall: Callable[[], float]) -> Membership:
@@ -119,24 +112,6 @@ class Membership:
         return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
 
     # --- connections ------------------------------------------------------------------------------------------
-
-    @property
-    def server_context(self) -> ssl.SSLContext:
-        """For links that are accepted."""
-        return self._context(server_side=True)
-
-    @property
-    def client_context(self) -> ssl.SSLContext:
-        """For links that are dialled."""
-        return self._context(server_side=False)
-
-    def preface(self, purpose: Purpose) -> bytes:
-        """The first bytes of a connection that is dialled, signed by the group key that signs now."""
-        key = self.ring.signing(self._clock.now())
-        wall = self.wall()
-        nonce = os.urandom(limits.PREFACE_NONCE_BYTES)
-        preface = Preface(purpose, key.short, 0 if wall is None else int(wall * 1000), nonce)
-        return preface.serialize(key.key_for(KeyPurpose.PREFACE))
 
     def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
         """Check the other end's certificate behind a TLS handshake, which has checked the chain.
@@ -210,10 +185,7 @@ class Membership:
             raise certificates.CertificateError(TrustReason.FOREIGN, "the certificate is of another key")
         self.store.write(files_of.CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
         self.certificate, self.files = found, replace(self.files, certificate=certificate)
-        self._contexts = {}
-
-    def _token_key(self, token_id: bytes) -> bytes | None:
-        return self.tokens.key_of(token_id)
+        self._make_contexts()
 
     def _take_keys(self, keys: KeyList, data: bytes) -> None:
         age = self._age(keys, 0.0)
@@ -232,18 +204,12 @@ class Membership:
         except StartError as error:
             _log.error("! %s", error)
 
-    def _context(self, *, server_side: bool) -> ssl.SSLContext:
-        kind = (server_side, self.wall() is not None)
-        context = self._contexts.get(kind)
-        if context is None:
-            context = self._contexts[kind] = link_context(
-                self.store.path(files_of.CERTIFICATE),
-                self.store.path(files_of.KEY),
-                self.files.ca,
-                server_side=server_side,
-                check_times=kind[1],
-            )
-        return context
+    def _make_contexts(self) -> None:
+        """Make the contexts for connections that are accepted, joins at the authority too, and for dialled ones."""
+        files, ca = (self.store.path(files_of.CERTIFICATE), self.store.path(files_of.KEY)), self.files.ca
+        joins = [ALPN_JOIN] if self.store.is_authority else []
+        self.server_context = member_context(*files, ca, ALPN_LINK, *joins, server_side=True)
+        self.client_context = member_context(*files, ca, ALPN_LINK, server_side=False)
 
 
 def member_name(certificate: Mapping[str, Any]) -> str:
@@ -255,6 +221,8 @@ def member_name(certificate: Mapping[str, Any]) -> str:
     Raises:
         TrustError: It is not one of a module.
     """
+    if not certificate:
+        raise TrustError(TrustReason.FOREIGN, "it has no certificate")
     uris = [value for kind, value in certificate.get("subjectAltName", ()) if kind == "URI"]
     if len(uris) != 1 or not uris[0].startswith(certificates.URN):
         raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a module")
