@@ -81,11 +81,10 @@ async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) ->
     bench.resource.task(rate=100)(plain if kind == "thread" else coroutine)
     bench.tasks.activate()
     await count.wait()
-    report = next(iter(bench.tasks.reports(time.monotonic()).values()))
+    report = next(iter(bench.tasks.reports().values()))
     assert report.runs + report.missed >= 29
     # No lateness adds up: the 29 periods took no less than they should, however late each was.
     assert count.times[29] - count.times[0] > 0.2
-    assert report.lateness is not None
     await bench.tasks.deactivate()
     ran = len(count.times)
     await asyncio.sleep(0.05)
@@ -285,7 +284,7 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: s
     assert await asyncio.to_thread(last.wait, 30)
     # Ten wait; the oldest four gave way.
     assert got == ["m0", *(f"m{n}" for n in range(5, 15))]
-    assert bench.tasks.reports(time.monotonic())["t"].dropped == 4
+    assert bench.tasks.reports()["t"].dropped == 4
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])

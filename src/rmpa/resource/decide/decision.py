@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 EPSILON: Final = 1e-3
 """What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall."""
-_FEW: Final = 3
-"""If fewer than one in so many profiles is feasible, distances are computed one by one, else all at once."""
 _MISSING: Final = 1.0
 """Shortfall of a profile that does not offer the attribute, or that offers another word: the whole range."""
 
@@ -104,41 +102,8 @@ class ProfileDecision:
     best_effort: bool = False
 
 
-class _Column:
-    """The shortfalls of all profiles in one attribute.
-
-    Args:
-        bound: The requested bound.
-        deltas: The shortfall of each profile, in order of declaration.
-    """
-
-    __slots__ = ("_squares", "bound", "deltas")
-
-    def __init__(self, bound: Bound, deltas: list[float]) -> None:
-        self.bound = bound
-        self.deltas = deltas
-        self._squares: list[float] | None = None
-
-    @property
-    def weighted(self) -> list[float]:
-        """Each shortfall times the bound's weight."""
-        weight = self.bound.weight
-        return self.deltas if weight == 1 else [weight * delta for delta in self.deltas]
-
-    @property
-    def squares(self) -> list[float]:
-        """Each squared shortfall times the bound's weight; computed when first needed, because few decisions do."""
-        if self._squares is None:
-            weight = self.bound.weight
-            if weight == 1:
-                self._squares = [delta * delta for delta in self.deltas]
-            else:
-                self._squares = [weight * delta * delta for delta in self.deltas]
-        return self._squares
-
-
 class Decider:
-    """Decides among one resource's profiles; values that all decisions share are computed once.
+    """Decides among one resource's profiles.
 
     Args:
         resource: Name of the resource, for errors.
@@ -154,22 +119,13 @@ class Decider:
         self._resource = resource
         self._attributes = attributes
         self._profiles = {profile.name: profile for profile in profiles}
-        self._costs = [EPSILON * profile.cost for profile in profiles]
-        self._places: dict[str, list[float | None]] = {}
         self._spans: dict[str, float] = {}
-        self._known: dict[str, list[float]] = {}
-        """The profiles' positions on the scale of each attribute that all profiles offer, by attribute."""
-        self._columns: dict[str, _Column] = {}
-        for name, attribute in attributes.items():
-            places = [attribute.position(p.offers[name]) if name in p.offers else None for p in profiles]
-            known = [place for place in places if place is not None]
-            self._places[name] = places
-            if len(known) == len(places):
-                self._known[name] = known
+        """What a shortfall of 1 is on the scale of each attribute that a profile offers."""
+        for name in {name for profile in profiles for name in profile.offers}:
+            attribute = attributes[name]
+            places = [attribute.position(profile.offers[name]) for profile in profiles if name in profile.offers]
             span = attribute.tolerated_distance
-            self._spans[name] = span if span is not None else (max(known) - min(known) if known else 0.0)
-        self._offered = {name for profile in profiles for name in profile.offers}
-        self._best_effort = next((profile.name for profile in profiles if profile.best_effort), "")
+            self._spans[name] = span if span is not None else max(places) - min(places)
 
     @property
     def profiles(self) -> Sequence[str]:
@@ -196,127 +152,51 @@ class Decider:
             bounds: The merged requirements by attribute; an undeclared attribute raises ``KeyError``.
             excluded: Profiles that may not be chosen, with the reasons.
         """
-        columns = [self._column(name, bound) for name, bound in bounds.items()]
-        reasons = excluded or {}
-        allowed = [index for index, name in enumerate(self._profiles) if name not in reasons]
-        names = self.profiles
-        hard_deltas = [column.deltas for column in columns if column.bound.hard]
-        fails = [*map(any, zip(*hard_deltas, strict=True))]  # a shortfall is above 0
-        feasible = [index for index in allowed if not fails[index]] if fails else allowed
-        if len(feasible) == 1 or (feasible and len(feasible) * _FEW < len(names)):
-            near = {index: self._distance(index, columns) for index in feasible}
-            best = min(feasible, key=near.__getitem__)
-            return ProfileDecision(names[best], near[best], feasible=True)
-        if feasible:
-            distances = self._distances(columns)
-            best = min(feasible, key=distances.__getitem__)
-            return ProfileDecision(names[best], distances[best], feasible=True)
-        if self._best_effort and self._best_effort not in reasons:
-            best = names.index(self._best_effort)
-            return ProfileDecision(names[best], self._distance(best, columns), feasible=False, best_effort=True)
-        if not allowed:
+        scores = {score.profile: score for score in self.explain(bounds, excluded) if not score.excluded}
+        if not scores:
             return ProfileDecision("", math.inf, feasible=False)
-        distances, hard = self._judge(bounds)
-        best = min(allowed, key=lambda index: (hard[index], distances[index], self._costs[index]))
-        return ProfileDecision(names[best], distances[best], feasible=False)
+        if feasible := [score for score in scores.values() if score.feasible]:
+            best = min(feasible, key=lambda score: score.distance)
+            return ProfileDecision(best.profile, best.distance, feasible=True)
+        if effort := next((score for name, score in scores.items() if self._profiles[name].best_effort), None):
+            return ProfileDecision(effort.profile, effort.distance, feasible=False, best_effort=True)
+        costs = {name: self._profiles[name].cost for name in scores}
+        best = min(scores.values(), key=lambda one: (one.hard_shortfall, one.distance, costs[one.profile]))
+        return ProfileDecision(best.profile, best.distance, feasible=False)
 
     def explain(
         self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None
     ) -> tuple[ProfileScore, ...]:
         """The score of every profile with all its terms, in order of declaration; arguments as for ``decide``."""
-        distances, hard = self._judge(bounds)
         reasons = excluded or {}
         texts = {name: describe_bound(self._attributes[name], bound) for name, bound in bounds.items()}
-        return tuple(
-            ProfileScore(
-                name,
-                distances[index],
-                hard[index],
-                reasons.get(name, ""),
-                self._terms(index, profile, texts, bounds),
+        scale = sum(bound.weight for bound in bounds.values())
+        found = []
+        for name, profile in self._profiles.items():
+            terms = tuple(
+                Term(key, texts[key], offer, self._delta(key, bound, offer), bound.weight, bound.hard)
+                for key, bound in bounds.items()
+                for offer in (profile.offers.get(key),)
             )
-            for index, (name, profile) in enumerate(self._profiles.items())
-        )
+            total = sum(term.weight * term.delta * term.delta for term in terms)
+            distance = (math.sqrt(total / scale) if terms else 0.0) + EPSILON * profile.cost
+            hard = max((term.weight * term.delta for term in terms if term.hard), default=0.0)
+            found.append(ProfileScore(name, distance, hard, reasons.get(name, ""), terms))
+        return tuple(found)
 
-    def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
-        """The distance ``D`` of one profile."""
-        columns = [self._column(asked, bound) for asked, bound in bounds.items()]
-        return self._distance(self.profiles.index(name), columns)
-
-    def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
-        """The distance and the largest weighted hard shortfall of every profile, as two lists."""
-        columns = [self._column(name, bound) for name, bound in bounds.items()]
-        distances = self._distances(columns)
-        hard = [column.weighted for column in columns if column.bound.hard]
-        if not hard:
-            return distances, [0.0] * len(self._profiles)
-        return distances, [*map(max, zip(*hard, strict=True))] if len(hard) > 1 else hard[0]
-
-    def _distances(self, columns: Sequence[_Column]) -> list[float]:
-        """The distance ``D`` of every profile."""
-        if not columns:
-            return list(self._costs)
-        scale = sum(column.bound.weight for column in columns)
-        sums = map(sum, zip(*(column.squares for column in columns), strict=True))
-        return [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
-
-    def _distance(self, index: int, columns: Sequence[_Column]) -> float:
-        """The distance ``D`` of one profile, bit for bit equal to its value in ``_distances``."""
-        if not columns:
-            return self._costs[index]
-        scale = sum(column.bound.weight for column in columns)
-        total = sum(column.bound.weight * column.deltas[index] * column.deltas[index] for column in columns)
-        return math.sqrt(total / scale) + self._costs[index]
-
-    def _column(self, name: str, bound: Bound) -> _Column:
-        """The column of an attribute; cached, because most bounds stay the same from one decision to the next."""
-        known = self._columns.get(name)
-        if known is not None and known.bound == bound:
-            return known
-        made = self._columns[name] = _Column(bound, self._deltas(name, bound))
-        return made
-
-    def _deltas(self, name: str, bound: Bound) -> list[float]:
-        places, span = self._places[name], self._spans[name]
-        if name not in self._offered:
-            return [0.0] * len(places)  # no profile offers the attribute, so only measurements are judged
+    def _delta(self, name: str, bound: Bound, offered: Value | None) -> float:
+        """The shortfall of a profile in one attribute."""
+        if name not in self._spans:
+            return 0.0  # no profile offers the attribute, so only measurements are judged
+        if offered is None:
+            return _MISSING
         if bound.words:
-            words = self._attributes[name].words
-            wanted = {float(words.index(word)) for word in bound.words}
-            return [0.0 if place in wanted else _MISSING for place in places]
-        low, high = bound.low, bound.high
-        if span > 0:
-            if (known := self._known.get(name)) is not None:  # a fast path for the usual case: half of the time
-                if high == math.inf:
-                    return [(low - place) / span if place < low else 0.0 for place in known]
-                if low == -math.inf:
-                    return [(place - high) / span if place > high else 0.0 for place in known]
-            return [
-                _MISSING
-                if place is None
-                else (low - place) / span
-                if place < low
-                else (place - high) / span
-                if place > high
-                else 0.0
-                for place in places
-            ]
-        return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
-
-    def _terms(
-        self, index: int, profile: Profile, texts: Mapping[str, str], bounds: Mapping[str, Bound]
-    ) -> tuple[Term, ...]:
-        return tuple(
-            Term(
-                name,
-                texts[name],
-                profile.offers.get(name),
-                self._column(name, bound).deltas[index],
-                bound.weight,
-                bound.hard,
-            )
-            for name, bound in bounds.items()
-        )
+            return 0.0 if offered in bound.words else _MISSING
+        place, span = self._attributes[name].position(offered), self._spans[name]
+        beyond = max(bound.low - place, place - bound.high)
+        if beyond <= 0:
+            return 0.0
+        return beyond / span if span > 0 else _MISSING
 
 
 def describe_bound(attribute: Attribute, bound: Bound) -> str:

@@ -3,8 +3,8 @@
 ::
 
     unconfigured ──configure──► inactive ──activate──► active
-         ▲                       │  ▲                   │
-         └───────cleanup─────────┘  └────deactivate─────┘
+                                    ▲                    │
+                                    └─────deactivate─────┘
     any of them ──finalize──► finalized
 """
 
@@ -36,7 +36,6 @@ class Transition(StrEnum):
     """Transition between two states of the life cycle."""
 
     CONFIGURE = "configure"
-    CLEANUP = "cleanup"
     ACTIVATE = "activate"
     DEACTIVATE = "deactivate"
     FINALIZE = "finalize"
@@ -45,7 +44,6 @@ class Transition(StrEnum):
 _S, _T = LifecycleState, Transition
 TRANSITIONS: Final[Mapping[tuple[LifecycleState, Transition], LifecycleState]] = {
     (_S.UNCONFIGURED, _T.CONFIGURE): _S.INACTIVE,
-    (_S.INACTIVE, _T.CLEANUP): _S.UNCONFIGURED,
     (_S.INACTIVE, _T.ACTIVATE): _S.ACTIVE,
     (_S.ACTIVE, _T.DEACTIVATE): _S.INACTIVE,
     (_S.UNCONFIGURED, _T.FINALIZE): _S.FINALIZED,
@@ -61,8 +59,6 @@ class LifeCycle:
     def __init__(self) -> None:
         self._state = LifecycleState.UNCONFIGURED
         self._under_way: Transition | None = None
-        self.problem = ""
-        """Why the last transition failed; empty: it did not."""
 
     @property
     def state(self) -> LifecycleState:
@@ -96,19 +92,14 @@ class LifeCycle:
             raise LocalProtocolError("no transition is under way")
         self._state = TRANSITIONS[self._state, self._under_way]
         self._under_way = None
-        self.problem = ""
         return self._state
 
-    def failed(self, why: str) -> LifecycleState:
+    def failed(self) -> LifecycleState:
         """End the transition after its callback has raised, and return the resulting state.
 
         The state stays the same, except after ``finalize`` and ``deactivate``: an error must not prevent these.
         """
-        transition = self._under_way
-        if transition in (Transition.FINALIZE, Transition.DEACTIVATE):
-            state = self.succeeded()
-        else:
-            self._under_way = None
-            state = self._state
-        self.problem = f"{transition}: {why}"
-        return state
+        if self._under_way in (Transition.FINALIZE, Transition.DEACTIVATE):
+            return self.succeeded()
+        self._under_way = None
+        return self._state

@@ -12,7 +12,7 @@ topic is the topic, as for rostopic; ``/battery.charging`` is explicit. A topic 
 (``std_msgs/Bool``). A value that is unknown (no message yet, no publisher) makes a comparison neither true nor false.
 A rule holds only if it is true whatever the unknown values are (Kleene's logic).
 
-Pure: a rule is parsed into a tree once, and the tree is evaluated with the values; nothing is evaluated as Python.
+Pure: a rule is parsed once, into a function of the values; nothing is evaluated as Python.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from __future__ import annotations
 import math
 import operator
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator
 
 Scalar = bool | int | float | str
 """A value that rules can compare."""
@@ -40,7 +41,9 @@ _TOKEN: Final = re.compile(
     r"|(?P<word>[A-Za-z_]\w*)"
     r"|(?P<sign>==|!=|<=|>=|<|>|\(|\)))"
 )
-_ORDERS: Final[Mapping[str, Callable[[float, float], bool]]] = {
+_SIGNS: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -72,32 +75,10 @@ class Reference:
             yield "/" + "/".join(parts[:count]), tuple(parts[count:])
 
 
-@dataclass(frozen=True, slots=True)
-class _Constant:
-    value: Scalar
-
-
-@dataclass(frozen=True, slots=True)
-class _Compare:
-    sign: str
-    left: Reference | _Constant
-    right: Reference | _Constant
-
-
-@dataclass(frozen=True, slots=True)
-class _Not:
-    inner: _Node
-
-
-@dataclass(frozen=True, slots=True)
-class _BooleanOperation:
-    """``and`` of all parts if ``conjunction`` is true, else ``or``."""
-
-    conjunction: bool
-    parts: tuple[_Node, ...]
-
-
-_Node = _Compare | _Not | _BooleanOperation
+_Values = Mapping[str, Scalar]
+_Holds = Callable[[_Values], bool | None]
+"""Whether a part of a rule is true; ``None`` if that depends on unknown values."""
+_Value = Callable[[_Values], Scalar | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +86,9 @@ class ContextRule:
     """A parsed rule; ``references`` has each variable of the rule once."""
 
     text: str
-    root: _Node
+    holds: _Holds
+    """Whether the rule is true by the known values, which are by reference, as written in the rule."""
     references: tuple[Reference, ...]
-
-    def holds(self, values: Mapping[str, Scalar]) -> bool | None:
-        """Whether the rule is true; ``None`` if that depends on unknown values.
-
-        Args:
-            values: The known values by reference, as written in the rule.
-        """
-        return _holds(self.root, values)
 
 
 def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> ContextRule:
@@ -131,7 +105,7 @@ def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> C
     if len(text) > limits.CONTEXT_RULE_MAX:
         raise ConfigError(where, f"{len(text)} characters", f"at most {limits.CONTEXT_RULE_MAX}")
     parser = _Parser(text, where)
-    root = parser.rule(0)
+    holds = parser.rule(0)
     parser.end()
     references = tuple(dict.fromkeys(parser.references))
     for reference in references:
@@ -140,7 +114,7 @@ def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> C
             near = did_you_mean(name, parameters)
             remedy = f"did you mean ~{near}?" if near else "declare it before the context"
             raise ConfigError(where, f"there is no parameter {name}", remedy)
-    return ContextRule(text, root, references)
+    return ContextRule(text, holds, references)
 
 
 class _Parser:
@@ -155,26 +129,35 @@ class _Parser:
         self.references: list[Reference] = []
         self._next()
 
-    def rule(self, depth: int) -> _Node:
+    def rule(self, depth: int) -> _Holds:
         return self._chain("or", lambda: self._chain("and", lambda: self._negation(depth)))
 
     def end(self) -> None:
         if self._kind:
             raise self._error(f"{self._lexeme!r} stands where the rule must end, or go on with and/or")
 
-    def _chain(self, word: str, part: Callable[[], _Node]) -> _Node:
+    def _chain(self, word: str, part: Callable[[], _Holds]) -> _Holds:
         parts = [part()]
         while self._lexeme == word:
             self._next()
             parts.append(part())
-        return parts[0] if len(parts) == 1 else _BooleanOperation(word == "and", tuple(parts))
+        decisive = word == "or"  # one true decides an "or", one false an "and"
 
-    def _negation(self, depth: int) -> _Node:
+        def holds(values: _Values) -> bool | None:
+            found = [each(values) for each in parts]
+            if decisive in found:
+                return decisive
+            return None if None in found else not decisive
+
+        return parts[0] if len(parts) == 1 else holds
+
+    def _negation(self, depth: int) -> _Holds:
         if depth > limits.CONTEXT_RULE_DEPTH:
             raise self._error(f"deeper than {limits.CONTEXT_RULE_DEPTH} brackets")
         if self._lexeme == "not":
             self._next()
-            return _Not(self._negation(depth + 1))
+            inner = self._negation(depth + 1)
+            return lambda values: None if (found := inner(values)) is None else not found
         if self._lexeme == "(":
             self._next()
             inner = self.rule(depth + 1)
@@ -182,14 +165,14 @@ class _Parser:
                 raise self._error("a bracket is not closed")
             self._next()
             return inner
-        left = self._value()
-        if self._lexeme in ("==", "!=", *_ORDERS):
-            sign = self._lexeme
+        left, right, compare = self._value(), _constant(True), operator.eq
+        if self._lexeme in _SIGNS:
+            compare = _SIGNS[self._lexeme]
             self._next()
-            return _Compare(sign, left, self._value())
-        return _Compare("==", left, _Constant(True))
+            right = self._value()
+        return lambda values: _compare(compare, left(values), right(values))
 
-    def _value(self) -> Reference | _Constant:
+    def _value(self) -> _Value:
         kind, piece = self._kind, self._lexeme
         if kind == "word" and piece not in ("true", "false"):
             near = did_you_mean(piece, _KEYWORDS) if piece not in _KEYWORDS else None
@@ -198,13 +181,13 @@ class _Parser:
             raise self._error(f"a value is missing in front of {piece!r}" if piece else "a value is missing")
         self._next()
         if kind == "word":
-            return _Constant(piece == "true")
+            return _constant(piece == "true")
         if kind == "text":
-            return _Constant(piece[1:-1])
+            return _constant(piece[1:-1])
         if kind == "number":
-            return _Constant(float(piece))
+            return _constant(float(piece))
         self.references.append(Reference(piece))
-        return self.references[-1]
+        return lambda values: values.get(piece)
 
     def _next(self) -> None:
         if not self._text[self._at :].strip():
@@ -221,35 +204,19 @@ class _Parser:
         return ConfigError(self._where, f"{self._text!r}: {problem}", remedy)
 
 
-def _holds(node: _Node, values: Mapping[str, Scalar]) -> bool | None:
-    match node:
-        case _Not():
-            inner = _holds(node.inner, values)
-            return None if inner is None else not inner
-        case _BooleanOperation():
-            found = [_holds(part, values) for part in node.parts]
-            decisive = not node.conjunction  # one true decides an "or", one false an "and"
-            if decisive in found:
-                return decisive
-            return None if None in found else node.conjunction
-    left, right = _look_up(node.left, values), _look_up(node.right, values)
-    if left is None or right is None:
+def _constant(value: Scalar) -> _Value:
+    return lambda _values: value
+
+
+def _compare(compare: Callable[[Any, Any], bool], left: Scalar | None, right: Scalar | None) -> bool | None:
+    """Compare two values; numbers and booleans as Python does, since a ROS ``bool`` may be 0 or 1."""
+    if left is None or right is None or left != left or right != right:  # noqa: PLR0124 - NaN
         return None
-    if node.sign in ("==", "!="):
-        return _equal(left, right) == (node.sign == "==")
-    if isinstance(left, str) or isinstance(right, str):
+    if isinstance(left, str) != isinstance(right, str):
+        return compare is operator.ne  # a text equals only texts
+    if isinstance(left, str) and compare not in (operator.eq, operator.ne):
         return False  # texts have no order
-    return _ORDERS[node.sign](left, right)
-
-
-def _look_up(value: Reference | _Constant, values: Mapping[str, Scalar]) -> Scalar | None:
-    found = value.value if isinstance(value, _Constant) else values.get(value.text)
-    return None if isinstance(found, float) and math.isnan(found) else found
-
-
-def _equal(left: Scalar, right: Scalar) -> bool:
-    """Compare numbers and booleans as Python does (a ROS ``bool`` may be 0 or 1); a text equals only texts."""
-    return isinstance(left, str) == isinstance(right, str) and left == right
+    return compare(left, right)
 
 
 @dataclass(slots=True)

@@ -211,7 +211,7 @@ class ResourceNode:
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
             _log.warning("! %s: %s: %s", self.runtime.node.name, transition, why)
-        state = self.life.failed(why) if why else self.life.succeeded()
+        state = self.life.failed() if why else self.life.succeeded()
         if state is not LifecycleState.ACTIVE:
             self.runtime.close_outputs()
         if transition is Transition.ACTIVATE and not why:

@@ -64,7 +64,7 @@ class TaskRunner:
         self.stopped = False
         self.stuck_after = stuck_after(period, task.stuck_after)
         """Seconds after which a run counts as stuck."""
-        self.figures = TaskFigures(period, time.monotonic())
+        self.figures = TaskFigures(period)
         self.period = period
         """The period in seconds; ``None`` if the task runs on messages."""
         self._gate = gate
@@ -105,14 +105,14 @@ class TaskRunner:
         """Change the rate, in Hz: the next run is due one new period after the last one."""
         self.period = 1 / rate
         self.stuck_after = stuck_after(self.period, self.task.stuck_after)
-        self.figures.retimed(self.period)
+        self.figures.period = self.period
         self.wake()
 
     def enqueue(self, message: Received) -> None:
         """Queue a message for a run; a full queue (``limits.TASK_QUEUE_MESSAGES``) drops its oldest."""
         if len(self._messages) >= limits.TASK_QUEUE_MESSAGES:
             self._messages.popleft()
-            self.figures.dropped()
+            self.figures.dropped += 1
         self._messages.append(message)
         self.wake()
 
@@ -125,7 +125,7 @@ class TaskRunner:
             schedule = Schedule(self.period, max(last + self.period, time.monotonic()))
         missed = schedule.missed
         due = schedule.next_due(time.monotonic())
-        self.figures.missed(schedule.missed - missed)
+        self.figures.missed += schedule.missed - missed
         return schedule, due
 
     def _call(self, message: Received | None) -> Awaitable[None] | None:
@@ -186,21 +186,20 @@ class AsyncTaskRunner(TaskRunner):
             if not over:
                 continue  # the period has changed meanwhile
             last = due
-            if not await self._once(due, None):
+            if not await self._once(None):
                 schedule = Schedule(schedule.period, time.monotonic())
 
     async def _on_messages(self) -> None:
         while True:
             while self._messages:
-                message = self._messages.popleft()
-                await self._once(message.stamp_ns / 1e9 - time.time() + time.monotonic(), message)
+                await self._once(self._messages.popleft())
             self._wake.clear()
             await self._wake.wait()
 
-    async def _once(self, due: float, message: Received | None) -> bool:
+    async def _once(self, message: Received | None) -> bool:
         """Run once; returns false after a failure and its back-off."""
         await self._gate.enter_async(self)
-        self.figures.begun(due, time.monotonic())
+        self.figures.running_since = time.monotonic()
         try:
             try:
                 outcome = self._call(message)
@@ -216,11 +215,10 @@ class AsyncTaskRunner(TaskRunner):
         else:
             self._succeeded()
             return True
-        self.figures.ended(time.monotonic(), text)
+        self.figures.ended(time.monotonic(), failed=True)
         self.waiting = True
         self._on_failed(text)
         await asyncio.sleep(restart_delay(self.figures.in_a_row))
-        self.figures.interrupted()
         return False
 
 
@@ -283,7 +281,7 @@ class ThreadTaskRunner(TaskRunner):
             last = due
             timer.set(due)
             timer.wait()
-            if not self._once(due, None):
+            if not self._once(None):
                 schedule = Schedule(schedule.period, time.monotonic())
 
     def _on_messages(self) -> None:
@@ -292,14 +290,13 @@ class ThreadTaskRunner(TaskRunner):
             if self._end.is_set():
                 return
             with contextlib.suppress(IndexError):  # woken without a message, or the message was dropped
-                message = self._messages.popleft()
-                self._once(message.stamp_ns / 1e9 - time.time() + time.monotonic(), message)
+                self._once(self._messages.popleft())
 
-    def _once(self, due: float, message: Received | None) -> bool:
+    def _once(self, message: Received | None) -> bool:
         """Run once; returns false after a failure and its back-off, or if the task has to end."""
         if not self._gate.enter(self, self._end.is_set):
             return False
-        self.figures.begun(due, time.monotonic())
+        self.figures.running_since = time.monotonic()
         try:
             try:
                 self._call(message)
@@ -310,12 +307,11 @@ class ThreadTaskRunner(TaskRunner):
         else:
             self._succeeded()
             return True
-        self.figures.ended(time.monotonic(), text)
+        self.figures.ended(time.monotonic(), failed=True)
         if self._end.is_set():
             return False
         self.waiting = True
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_failed, text)
         self._end.wait(restart_delay(self.figures.in_a_row))
-        self.figures.interrupted()
         return False

@@ -89,7 +89,7 @@ class Tasks(RuntimePart):
 
     def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:  # noqa: ARG002
         """Find the tasks that were too slow in the window."""
-        for name, report in self.reports(time.monotonic()).items():
+        for name, report in self.reports().items():
             if not report.runs and not report.dropped:
                 continue  # no run to judge
             runner, known = self._runners[name], self._slow.pop(name, None)
@@ -139,9 +139,9 @@ class Tasks(RuntimePart):
         """End all tasks, because the resource ends."""
         await self.deactivate()
 
-    def reports(self, now: float) -> dict[str, TaskReport]:
-        """Measurements of each task since the last call; ``now`` in monotonic seconds."""
-        return {name: runner.figures.window(now) for name, runner in self._runners.items()}
+    def reports(self) -> dict[str, TaskReport]:
+        """Measurements of each task since the last call."""
+        return {name: runner.figures.window() for name, runner in self._runners.items()}
 
     def received(self, item: Input, message: Received) -> None:
         """Queue a message for the tasks that run on its input."""
