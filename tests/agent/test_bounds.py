@@ -58,9 +58,7 @@ def stands(agent: Agent, *topics: int) -> bool:
     return {f"/t{n}" for n in topics} == {topic for topic in agent.core.state().publishers if topic.startswith("/t")}
 
 
-async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_hidden_nodes_are_told_and_come_with_a_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridge_limits, "RECONCILE_INTERVAL", 0.2)
     monkeypatch.setattr(ros_limits, "NODE_CHECK_INTERVAL", 1e6)  # the nodes are made up
     few = replace(settings("near", tmp_path), limits=LimitSettings(nodes=2))
@@ -73,11 +71,7 @@ async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
         level, text, _ = statuses.found["rmpa: far"]
         assert (level, "2 nodes with 2 topics of far stay hidden here" in text) == (1, True)
         (here,) = await beyond("near", tmp_path)
-        assert (here.kind, here.limit, here.hidden, here.here) == ("nodes", 2, 2, True)
-        while not (there := await beyond("far", tmp_path)):
-            await asyncio.sleep(0.05)
-        assert (there[0].kind, there[0].limit, there[0].hidden, there[0].here) == ("nodes", 2, 2, False)
-        assert "of this module stay hidden at near" in there[0].text
+        assert (here.kind, here.limit, here.hidden) == ("nodes", 2, 2)
         for name in ("near", "far"):  # asked at either end
             found = await why(name, tmp_path, "/t3")
             assert found.failed is not None
@@ -86,8 +80,6 @@ async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
         near.apply_settings(replace(few, limits=LimitSettings(nodes=4)))
         await until(lambda: stands(near, 0, 1, 2, 3))
         assert await beyond("near", tmp_path) == ()
-        while await beyond("far", tmp_path):
-            await asyncio.sleep(0.05)
 
 
 async def test_topics_beyond_the_limit_of_either_side_are_told(
@@ -102,8 +94,6 @@ async def test_topics_beyond_the_limit_of_either_side_are_told(
         await until(lambda: stands(near, 0, 1))
         (here,) = await beyond("near", tmp_path)
         assert (here.kind, here.hidden) == ("topics", 1)
-        topics = {topic.name: topic.routes for topic in (await snapshot("near", tmp_path)).topics}
-        assert (topics["/t2"][0].state, topics["/t2"][0].limit) == ("hidden", "topics")
         (note,) = [note for note in (await snapshot("far", tmp_path)).notes if "limits.topics" in note]
         assert note.startswith("2 topics of this module are offered to no peer: more than limits.topics = 3")
         one_there, none_told = await why("near", tmp_path, "/t2"), await why("near", tmp_path, "/t4")

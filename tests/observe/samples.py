@@ -82,7 +82,7 @@ SNAPSHOT = Snapshot(
             last_error="connection refused",
             next_attempt=1.5,
             conflicts=("shares its name with 10.0.0.9:40003#4; give one of them another --name",),
-            beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, here=True, text="1 node of laptop stays hidden"),),
+            beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, text="1 node of laptop stays hidden"),),
         ),
     ),
     topics=(

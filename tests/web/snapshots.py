@@ -80,7 +80,7 @@ def route(peer: str = "arm", node: str = "/camera", direction: str = "in") -> Ro
     )
 
 
-BOUND = BoundInfo(kind="topics", limit=10, hidden=8, here=True, text="too many")
+BOUND = BoundInfo(kind="topics", limit=10, hidden=8, text="too many")
 SERVICE = ServiceInfo(
     name="/set_bool", node="/server", direction="in", peer="arm", calls=9, failed=1, active=1, latency=SPREAD
 )

@@ -64,7 +64,7 @@ def value(name: str, labels: dict[str, str], snapshot: Snapshot | None = FULL) -
         ("rmpa_peer_linked", {"peer": "hand"}, 0),
         ("rmpa_peer_link_missing", {"peer": "hand"}, 1),
         ("rmpa_peer_link_missing", {"peer": "arm"}, 0),
-        ("rmpa_peer_hidden", {"peer": "arm", "kind": "topics", "at": "here"}, 8),
+        ("rmpa_peer_hidden", {"peer": "arm", "kind": "topics"}, 8),
         ("rmpa_link_clock_offset_seconds", {"peer": "arm"}, -0.25),
         ("rmpa_link_start_time_seconds", {"peer": "arm"}, 1_000_050.0),
         ("rmpa_link_receive_bytes_total", {"peer": "arm"}, 1000),

@@ -20,7 +20,6 @@ from rmpa.agent.trust import AgentTrust, open_membership
 from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
 from rmpa.bridge.io.bridge import Bridge
-from rmpa.bridge.io.limit_reports import LimitReports
 from rmpa.bridge.io.node_presence import NodePresence
 from rmpa.bridge.io.node_requests import NodeRequests
 from rmpa.bridge.io.twin_watch import TwinWatch
@@ -120,9 +119,6 @@ class Agent:
             self.bridge.counters,
             self.bridge.gate,
         )
-        reports = LimitReports(
-            self.bridge.sessions, self.bridge.rpc, self.bridge.topics, self.services, settings.limits
-        )
         self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
         presence = NodePresence(
             self.core,
@@ -134,7 +130,7 @@ class Agent:
             self._nodes.visible,
         )
         twins = TwinWatch(self.core, self.bridge, settings.peers)
-        for part in (self.params, self.services, reports, presence, twins):
+        for part in (self.params, self.services, presence, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
@@ -157,7 +153,6 @@ class Agent:
             bridge=self.bridge,
             clocks=self._clocks,
             services=self.services,
-            limit_reports=reports,
             twins=twins,
             endpoint=lambda: self.network.endpoint,
             counters=(counters,),

@@ -33,9 +33,9 @@ APPLIED_AT_ONCE: Final = 16
 microseconds; then data goes first."""
 RESCANNED_AT_ONCE: Final = 16
 """Names of the local graph that are examined in one turn of the event loop, after a change or to reconcile."""
-SURPLUS_MAX: Final = 32_768
-"""Topics, and likewise services, of one peer beyond ``[limits]`` that are remembered, some 400 B each; they are shown
-as soon as there is room. Further ones are only counted, and can be shown after the peer's next link-up."""
+REFUSED_MAX: Final = 32_768
+"""Topics, and likewise services, of one peer beyond ``[limits]`` that are remembered, some 400 B each; they are taken
+when there is room. Further ones come with the peer's next link."""
 ADVERTISED_MAX: Final = 16_384
 """Topics or services in one advertisement of a peer, else it is refused; this module's have at most
 ``ADVERTISED_AT_ONCE``."""

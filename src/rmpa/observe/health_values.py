@@ -61,8 +61,7 @@ def link_values(info: PeerInfo) -> dict[str, str]:
             "topics out": str(info.topics_out),
         }
     for bound in info.beyond:
-        where = "here" if bound.here else "there"
-        known[f"{bound.kind} hidden {where} (limit {bound.limit})"] = str(bound.hidden)
+        known[f"{bound.kind} hidden here (limit {bound.limit})"] = str(bound.hidden)
     return _known(known)
 
 

@@ -73,20 +73,18 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What one module hides of another one because a limit of its ``[limits]`` is exceeded.
+    """What this module hides of a peer because a limit of its ``[limits]`` is exceeded.
 
     Attributes:
         kind: The limit: ``nodes``, ``topics`` or ``services``.
         limit: Its value.
         hidden: How many are hidden.
-        here: Whether this module hides the peer's; else the peer hides this module's.
         text: Ready to read, with the remedy.
     """
 
     kind: str
     limit: int
     hidden: int
-    here: bool
     text: str
 
 
@@ -132,7 +130,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         topics_in: The number of topics that it offers.
         topics_out: The number of topics that it is offered.
         via: The name of the peer that relays its topics, if one does.
-        beyond: What either side hides of the other by its limits.
+        beyond: What this module hides of it by its limits.
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
         probes: What the failure detector holds of it, while it probes.

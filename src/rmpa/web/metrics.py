@@ -213,9 +213,9 @@ def _peers(snapshot: Snapshot, peers: Iterable[PeerInfo]) -> Iterator[Metric]:
     )
     hidden = _Family(
         "rmpa_peer_hidden",
-        "Nodes, topics or services hidden because a limit is exceeded, at this module (here) or at the peer (there).",
+        "Nodes, topics or services of a peer that this module hides because a limit is exceeded.",
         "gauge",
-        ("peer", "kind", "at"),
+        ("peer", "kind"),
     )
     for peer in peers:
         linked.add(peer.state == "linked", peer.name)
@@ -223,7 +223,7 @@ def _peers(snapshot: Snapshot, peers: Iterable[PeerInfo]) -> Iterator[Metric]:
         topics.add(peer.topics_in, peer.name, "in")
         topics.add(peer.topics_out, peer.name, "out")
         for bound in peer.beyond:
-            hidden.add(bound.hidden, peer.name, bound.kind, "here" if bound.here else "there")
+            hidden.add(bound.hidden, peer.name, bound.kind)
     yield from (family.metric for family in (linked, missing, topics, hidden))
 
 

@@ -92,7 +92,7 @@ def test_beyond_the_limit_the_first_one_takes_the_next_free_place() -> None:
     assert made.put("a", 1)
     assert not made.put("b", 1)
     assert not made.put("c", 1)
-    assert (made.is_beyond("b"), made.beyond.hidden, made.next_beyond()) == (True, 2, None)
+    assert (made.is_beyond("b"), made.beyond, made.next_beyond()) == (True, 2, None)
     assert "limits.topics = 1" in made.warning("sources.too_many").text
     assert not made.remove("c"), "it was not offered"
     assert made.remove("a")

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rmpa.bridge import limits
 from rmpa.bridge.catalogue.peer_limits import NodePlaces
 from rmpa.bridge.catalogue.peer_offers import Change, PeerOffers
+
+if TYPE_CHECKING:
+    import pytest
 
 Offers = PeerOffers[str, int, str]
 
@@ -40,16 +45,23 @@ def test_what_a_complete_account_does_not_mention_is_removed_at_its_end() -> Non
 
 def test_offers_beyond_the_limit_are_taken_when_there_is_room() -> None:
     made = offers("/a")
-    made.surplus.add("/b", "/b")
-    assert made.beyond("topics", 1).hidden == 1
+    made.refuse("/b", "/b")
     assert made.admitted(1) is None
     assert made.admitted(2) == "/b"
     assert made.admitted(2) is None
 
 
-def test_a_complete_account_and_a_long_absence_empty_the_surplus() -> None:
+def test_a_complete_account_and_a_long_absence_forget_what_was_refused() -> None:
     made = offers()
     for end in (lambda: changes(made, full=True), made.give_up):
-        made.surplus.add("/b", "/b")
+        made.refuse("/b", "/b")
         end()
-        assert made.beyond("topics", 1).hidden == 0
+        assert not made.refused
+
+
+def test_a_bounded_number_of_refused_offers_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "REFUSED_MAX", 1)
+    made = offers()
+    for name in ("/a", "/b", "/a"):
+        made.refuse(name, name.upper())
+    assert dict(made.refused) == {"/a": "/A"}

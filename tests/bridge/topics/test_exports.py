@@ -5,7 +5,6 @@ import pytest
 from msgspec import UNSET
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
-from rmpa.bridge.catalogue.peer_limits import Beyond
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -202,7 +201,7 @@ def test_too_many_sources_are_cut_and_said() -> None:
     actions = graph(exports, {Source(f"/t{i}", "/n"): JOY for i in range(3)})
     assert [type(action) for action in actions] == [Warn]
     assert len(exports.offered) == 2
-    assert exports.beyond == Beyond("topics", 2, 1)
+    assert exports.beyond == 1
     assert exports.is_beyond(Source("/t2", "/n"))
 
 

@@ -57,7 +57,7 @@ def test_a_bulk_lane_that_nothing_wants_is_no_trouble() -> None:
         (peer({"clock_offset": 2.0}), TOLD, "clock", "2000.0 ms ahead"),
         (peer(), replace(TOLD, cpu=97.0), "load", "97 % of a core"),
         (peer(), replace(TOLD, files_open=1000), "files", "1000 of 1024"),
-        (peer(beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, here=True, text="1 node hides; raise it"),)), TOLD,
+        (peer(beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, text="1 node hides; raise it"),)), TOLD,
          "limits", "1 node hides"),
         (peer(topics_in=0), TOLD, "offers", "offers 0 topics"),
     ],

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Warn
-from rmpa.bridge.catalogue.peer_limits import Beyond
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -123,9 +122,9 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         return self._offered
 
     @property
-    def beyond(self) -> Beyond:
+    def beyond(self) -> int:
         """The count of entries that are offered to no peer because there are more than the limit."""
-        return Beyond(self._kind, self.limit, len(self._beyond))
+        return len(self._beyond)
 
     def is_beyond(self, key: KeyT) -> bool:
         """Whether an entry is offered to no peer because the limit is reached."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces, Surplus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from rmpa.bridge.catalogue.peer_limits import NodePlaces
 
 EntryT = TypeVar("EntryT")
 OfferT = TypeVar("OfferT")
@@ -35,10 +37,10 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
 
     Args:
         name: The peer's name.
-        nodes: Which of its nodes have a place in the local graph, and what waits for one. The owner decides whether
-            the things in it go by their names on the wire or by their local names.
+        nodes: Which of its nodes have a place in the local graph, and what is refused for want of one. The owner
+            decides whether the things in it go by their names on the wire or by their local names.
         entries: The offers that are taken, by name on the wire.
-        surplus: The offers beyond the limit.
+        refused: The offers beyond the limit, at most ``limits.REFUSED_MAX``; further ones come with its next link.
         doubtful: Names on the wire that were offered over the last link and are not confirmed over the present one.
         away: Whether the peer has no link but may come back.
     """
@@ -46,7 +48,7 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
     name: str
     nodes: NodePlaces[WireT]
     entries: dict[WireT, EntryT] = field(default_factory=dict)
-    surplus: Surplus[OfferT] = field(default_factory=lambda: Surplus(limits.SURPLUS_MAX))
+    refused: OrderedDict[WireT, OfferT] = field(default_factory=OrderedDict)
     doubtful: set[WireT] = field(default_factory=set)
     away: bool = False
 
@@ -71,7 +73,7 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         """
         if full:
             self.doubtful = set(self.entries)
-            self.surplus.clear()
+            self.refused.clear()
         self.doubtful.difference_update(map(wire, added))
         if self.doubtful and not more:
             removed += tuple(sorted(self.doubtful))  # type: ignore[type-var] # names are in order
@@ -82,19 +84,16 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         for begin in range(0, len(added), step):
             yield Change(added=added[begin : begin + step])
 
+    def refuse(self, wire: WireT, offer: OfferT) -> None:
+        """Remember an offer beyond the limit."""
+        if wire in self.refused or len(self.refused) < limits.REFUSED_MAX:
+            self.refused[wire] = offer
+
     def admitted(self, limit: int) -> OfferT | None:
-        """Take the offer in surplus that has waited longest.
-
-        Returns:
-            The offer; ``None`` if none waits, or ``limit`` entries are taken already.
-        """
-        return self.surplus.pop() if len(self.entries) < limit else None
-
-    def beyond(self, kind: str, limit: int) -> Beyond:
-        """How many offers are not taken because there are too many."""
-        return Beyond(kind, limit, len(self.surplus))
+        """Take the first refused offer; ``None`` if there is none, or ``limit`` entries are taken already."""
+        return self.refused.popitem(last=False)[1] if self.refused and len(self.entries) < limit else None
 
     def give_up(self) -> None:
-        """Drop all that waits for a place: the peer does not come back soon."""
+        """Forget all that is refused: the peer does not come back soon."""
         self.nodes.give_up()
-        self.surplus.clear()
+        self.refused.clear()

@@ -43,7 +43,6 @@ from rmpa.core.errors import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.services.rules import ServiceRules
 
 
@@ -121,7 +120,7 @@ class ServiceExports:
         return self._catalogue.offered
 
     @property
-    def beyond(self) -> Beyond:
+    def beyond(self) -> int:
         """The count of services that are offered to no peer because there are too many (``limits.services``)."""
         return self._catalogue.beyond
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.catalogue import peer_limits
-from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces
+from rmpa.bridge.catalogue.peer_limits import NodePlaces
 from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -96,7 +96,7 @@ class ServiceImports:
     ) -> None:
         self._gate = gate
         self._rules = rules
-        self._limit_settings = limit_settings
+        self.limit_settings = limit_settings
         self._peers: dict[int, _ServiceImportPeer] = {}
         self.ways = RelayPaths(gate.may_relay)
         """The path by which each relayed module is reached."""
@@ -132,14 +132,13 @@ class ServiceImports:
         found = self._peers.get(peer)
         return found is not None and found.away
 
-    def beyond(self, peer: int) -> peer_limits.Beyond:
+    def refused(self, peer: int) -> int:
         """The count of a peer's services beyond ``limits.services``."""
-        known, limit = self._peers.get(peer), self._limit_settings.services
-        return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
+        return len(known.refused) if (known := self._peers.get(peer)) is not None else 0
 
-    def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
-        """The nodes of a peer that have no place here (``limits.nodes``), and their services that wait for one."""
-        return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
+    def refused_nodes(self, peer: int) -> Mapping[str, Collection[str]]:
+        """The nodes of a peer that have no place here (``limits.nodes``), and their services."""
+        return known.nodes.refused if (known := self._peers.get(peer)) is not None else {}
 
     # --- links -------------------------------------------------------------------------------------------------
 
@@ -154,7 +153,7 @@ class ServiceImports:
         """
         known = self._peers.get(peer)
         if known is None:
-            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), rank=rank)
+            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self.limit_settings.nodes), rank=rank)
         else:
             known.away = False
             known.serial = -1
@@ -248,8 +247,7 @@ class ServiceImports:
             return []
         actions: list[ImportAction] = []
         for wire in change.removed:
-            if wire not in known.entries:
-                known.surplus.discard(wire)
+            known.refused.pop(wire, None)
             actions += self._remove(peer, wire, f"its server at {known.name} has gone")
         for offer in change.added:
             actions += self._offer(peer, known, offer)
@@ -261,8 +259,8 @@ class ServiceImports:
         return [action for change in self.portions(peer, message) for action in self.take_in(peer, change)]
 
     def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
-        """Take services that were beyond ``limits.services``, one at a time, while there is room."""
-        while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.services)):
+        """Take services that were refused beyond ``limits.services``, one at a time, while there is room."""
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self.limit_settings.services)):
             yield self._offer(peer, known, offer)
 
     def _offer(self, peer: int, known: _ServiceImportPeer, offer: ServiceOffer) -> list[ImportAction]:
@@ -274,9 +272,9 @@ class ServiceImports:
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
-        elif len(known.entries) >= self._limit_settings.services:
-            known.surplus.add(offer.service, offer)
-            text = peer_limits.warning(known.name, "services", self._limit_settings.services)
+        elif len(known.entries) >= self.limit_settings.services:
+            known.refuse(offer.service, offer)
+            text = peer_limits.warning(known.name, "services", self.limit_settings.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
@@ -318,10 +316,10 @@ class ServiceImports:
         return actions + self._next_in(known)
 
     def _next_in(self, known: _ServiceImportPeer) -> list[ImportAction]:
-        """Choose again among the services that waited for a node's place, as far as places are free."""
+        """Choose again among the services that were refused a node's place, as far as places are free."""
         actions: list[ImportAction] = []
-        for waiting in known.nodes.next_in():
-            for name in waiting:
+        for refused in known.nodes.admitted():
+            for name in refused:
                 if name in self._claims:
                     actions += self._choose(name)
         return actions
@@ -349,9 +347,9 @@ class ServiceImports:
         Returns:
             The actions for one service after the other; each service is judged when its item is requested.
         """
-        self._rules, self._limit_settings = rules, limit_settings
+        self._rules, self.limit_settings = rules, limit_settings
         for known in self._peers.values():
-            known.nodes.bound(limit_settings.nodes)
+            known.nodes.limit = limit_settings.nodes
         offers = [(number, wire) for number, known in self._peers.items() for wire in known.entries]
         # A second time, for services whose new name was still the old name of another one.
         judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
@@ -412,7 +410,7 @@ class ServiceImports:
             hidden = seen or objection
             nodes.leave(remote.node, service)
             if hidden is None and not nodes.free(remote.node):
-                nodes.wait(remote.node, service)
+                nodes.refuse(remote.node, service)
                 hidden = f"{self._peers[number].name} has more nodes than limits.nodes = {nodes.limit} of this module"
             if hidden is None:
                 new = (number, remote)

@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
     from rmpa.bridge.catalogue.offers import Portion
-    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
     from rmpa.mesh.reliable import ReliableSender
@@ -175,7 +174,7 @@ class Exports:
         return self._catalogue.offered
 
     @property
-    def beyond(self) -> Beyond:
+    def beyond(self) -> int:
         """How many sources are offered to no peer because of ``limits.topics``."""
         return self._catalogue.beyond
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.catalogue import peer_limits
-from rmpa.bridge.catalogue.peer_limits import Beyond, NodePlaces
+from rmpa.bridge.catalogue.peer_limits import NodePlaces
 from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     Advertise,
@@ -100,7 +100,7 @@ class Imports:
     ) -> None:
         self._gate = gate
         self._policy = policy
-        self._limit_settings = limit_settings
+        self.limit_settings = limit_settings
         self._names = names
         self._contracts = contracts if contracts is not None else Contracts()
         self._routes = ImportRoutes(self.get, self._contracts, position, rng)
@@ -165,20 +165,13 @@ class Imports:
                     actions.append(Send(peer, Mismatch(source.topic, source.node, "", "")))
         return actions
 
-    def beyond(self, peer: int) -> peer_limits.Beyond:
-        """How much a peer offers beyond ``limits.topics``."""
-        known, limit = self._peers.get(peer), self._limit_settings.topics
-        return known.beyond("topics", limit) if known is not None else Beyond("topics", limit, 0)
+    def refused(self, peer: int) -> int:
+        """How many topics a peer offers beyond ``limits.topics``."""
+        return len(known.refused) if (known := self._peers.get(peer)) is not None else 0
 
-    def crowded(self, peer: int) -> Mapping[str, Collection[Source]]:
+    def refused_nodes(self, peer: int) -> Mapping[str, Collection[Source]]:
         """The nodes of a peer that are hidden because of ``limits.nodes``, with their sources."""
-        return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
-
-    def left_out(self) -> Iterator[tuple[int, str, TopicOffer]]:
-        """The remembered offers beyond ``limits.topics``: peer, local topic and offer of each."""
-        for peer, known in list(self._peers.items()):
-            for offer in list(known.surplus):
-                yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
+        return known.nodes.refused if (known := self._peers.get(peer)) is not None else {}
 
     def apply_rules(
         self,
@@ -193,11 +186,11 @@ class Imports:
         Returns:
             The actions, source by source; each source is judged when its item is taken.
         """
-        self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
+        self._policy, self._contracts, self._names, self.limit_settings = policy, contracts, names, limit_settings
         self._routes.contracts = contracts
         for known in self._peers.values():
             known.names = names.of(known.name)
-            known.nodes.bound(limit_settings.nodes)
+            known.nodes.limit = limit_settings.nodes
         # Shown ones first: what another relay brings from now on has the same proxies.
         sources = sorted(self, key=lambda one: not one[2].shown) if self._gate.on else self
         return chain(
@@ -206,8 +199,8 @@ class Imports:
         )
 
     def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
-        """Adds the remembered offers beyond ``limits.topics``, one at a time, while there is room."""
-        while (known := self._peers.get(peer)) and (offer := known.admitted(self._limit_settings.topics)):
+        """Adds the refused offers beyond ``limits.topics``, one at a time, while there is room."""
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self.limit_settings.topics)):
             yield self._add(peer, offer, now)
 
     def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
@@ -237,7 +230,7 @@ class Imports:
             name: The peer's name, which selects the rules for it.
             who: The peer itself: sources of it that relays offer are hidden while it has a link of its own.
         """
-        new = _ImportPeer(name=name, nodes=NodePlaces(self._limit_settings.nodes), names=self._names.of(name))
+        new = _ImportPeer(name=name, nodes=NodePlaces(self.limit_settings.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
         known.away = known.silent = False
         self._routes.link_up(peer)
@@ -347,8 +340,7 @@ class Imports:
         known = self._peers[peer]
         actions: list[Action] = []
         for source in change.removed:
-            if source not in known.entries:
-                known.surplus.discard(source)
+            known.refused.pop(source, None)
             actions += self._forget(peer, source)
         for offer in change.added:
             actions += self._add(peer, offer, now)
@@ -402,10 +394,10 @@ class Imports:
                     entry.problem = ""  # the peer was away, and is back
                 return self._routes.open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
-        elif len(known) >= self._limit_settings.topics:
+        elif len(known) >= self.limit_settings.topics:
             name = self._peers[peer].name
-            self._peers[peer].surplus.add(source, offer)
-            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self._limit_settings.topics))]
+            self._peers[peer].refuse(source, offer)
+            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self.limit_settings.topics))]
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
         entry = known[source] = RemoteTopic(self._shared(offer.type), topic, origin=offer.origin)
         self._peers[peer].topics.setdefault(topic, {})[source] = None
@@ -417,7 +409,7 @@ class Imports:
         if entry.crowded:
             name = self._peers[peer].name
             actions.append(
-                Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self._limit_settings.nodes))
+                Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self.limit_settings.nodes))
             )
         return actions + self._report_conflict(peer, source, entry)
 
@@ -433,7 +425,7 @@ class Imports:
         entry.crowded = not entry.hidden and not nodes.free(source.node)
         if entry.crowded:
             entry.hidden = f"{self._peers[peer].name} has more nodes than limits.nodes = {nodes.limit} of this module"
-            nodes.wait(source.node, source)
+            nodes.refuse(source.node, source)
         else:
             nodes.leave(source.node, source)
         if entry.shown is not bool(entry.hidden):
@@ -470,12 +462,12 @@ class Imports:
         ]
 
     def _yield_place(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """Frees the place of a source that has left the local graph, and shows sources that waited for it."""
+        """Frees the place of a source that has left the local graph, and shows sources that were refused."""
         known = self._peers[peer]
         del known.places[entry.topic, source.node]
         known.nodes.hide(source.node)
         actions = self._behind(peer, source, entry)
-        for sources in known.nodes.next_in():
+        for sources in known.nodes.admitted():
             actions += [a for s in sources for a in self._show_or_hide(peer, s, known.entries[s])]
         return actions
 

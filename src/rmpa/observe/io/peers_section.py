@@ -16,12 +16,11 @@ from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.reasons import not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
-    from rmpa.bridge.catalogue.peer_limits import Beyond
     from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.limit_reports import LimitReports
     from rmpa.bridge.io.twin_watch import TwinWatch
+    from rmpa.bridge.services.io.part import Services
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
@@ -53,13 +52,13 @@ class PeersSection:
 
     Args:
         bridge: The agent's bridge.
-        bounds: Its part for limits.
+        services: Its part for services.
         twins: Its part for peers of this module's kind.
     """
 
-    def __init__(self, bridge: Bridge, bounds: LimitReports, twins: TwinWatch) -> None:
+    def __init__(self, bridge: Bridge, services: Services, twins: TwinWatch) -> None:
         self._bridge = bridge
-        self._bounds = bounds
+        self._services = services
         self._twins = twins
         self._clock = SystemClock()
 
@@ -107,9 +106,26 @@ class PeersSection:
         return mark_shared_addresses(infos, own)
 
     def _beyond(self, session: PeerSession) -> tuple[BoundInfo, ...]:
-        name, peer = session.link.name, session.peer
-        here = [_bound_here(name, one) for one in self._bounds.here(peer)]
-        return (*here, *(_bound_there(name, one) for one in self._bounds.there(peer)))
+        """What of a peer this module refuses because of its limits."""
+        topics, services = self._bridge.topics.imports, self._services.imports
+        most, peer, name = topics.limit_settings, session.peer, session.link.name
+        there, here = topics.refused_nodes(peer), services.refused_nodes(peer)
+        counts = (
+            (len(there.keys() | here.keys()), "nodes", most.nodes),
+            (topics.refused(peer), "topics", most.topics),
+            (services.refused(peer), "services", most.services),
+        )
+        further = [
+            f"{count} {kind}"
+            for kind, count in (("topics", sum(map(len, there.values()))), ("services", sum(map(len, here.values()))))
+            if count
+        ]
+        found = []
+        for hidden, kind, limit in counts:
+            what = " with ".join((_count(hidden, kind), *([" and ".join(further)] if kind == "nodes" else ())))
+            text = f"{what} of {name} stay hidden here: it has more than limits.{kind} = {limit} of this module; "
+            found.append(BoundInfo(kind=kind, limit=limit, hidden=hidden, text=text + _remedy(kind)))
+        return tuple(one for one in found if one.hidden)
 
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
         """Modules without a link whose topics a relay passes on; the membership may know them too."""
@@ -235,39 +251,21 @@ def _lane(lane: LaneSender, stream: Stream | None) -> LaneInfo:
     )
 
 
-def _bound_here(peer: str, beyond: Beyond) -> BoundInfo:
-    """What this module hides of a peer because of its limits."""
-    text = (
-        f"{beyond.what} of {peer} stay hidden here: it has more than {_setting(beyond)} of this module; "
-        f"raise it in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"
-    )
-    return _bound(beyond, text, here=True)
-
-
-def _bound_there(peer: str, beyond: Beyond) -> BoundInfo:
-    """What a peer hides of this module because of its limits."""
-    text = (
-        f"{beyond.what} of this module stay hidden at {peer}: there are more than {_setting(beyond)} over there; "
-        f"raise it in its rmpa.toml and `rmpa reload` there, or deny some here by {_deny(beyond)}"
-    )
-    return _bound(beyond, text, here=False)
-
-
-def own_text(beyond: Beyond) -> str:
+def own_bounds(bridge: Bridge, services: Services) -> Iterator[str]:
     """What this module offers to no peer because of its limits, ready to read."""
-    return (
-        f"{beyond.what} of this module are offered to no peer: more than {_setting(beyond)}; raise it "
-        f"in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"
-    )
+    most = bridge.topics.imports.limit_settings
+    for hidden, kind, limit in (
+        (bridge.topics.exports.beyond, "topics", most.topics),
+        (services.exports.beyond, "services", most.services),
+    ):
+        if hidden:
+            which = f"{_count(hidden, kind)} of this module are offered to no peer"
+            yield f"{which}: more than limits.{kind} = {limit}; {_remedy(kind)}"
 
 
-def _setting(beyond: Beyond) -> str:
-    return f"limits.{beyond.kind} = {beyond.limit}"
+def _count(hidden: int, kind: str) -> str:
+    return f"{hidden} {kind if hidden > 1 else kind[:-1]}"
 
 
-def _deny(beyond: Beyond) -> str:
-    return _DENY.get(beyond.kind, "bridge.deny")
-
-
-def _bound(beyond: Beyond, text: str, *, here: bool) -> BoundInfo:
-    return BoundInfo(kind=beyond.kind, limit=beyond.limit, hidden=beyond.hidden, here=here, text=text)
+def _remedy(kind: str) -> str:
+    return f"raise it in rmpa.toml and `rmpa reload`, or deny some by {_DENY.get(kind, 'bridge.deny')}"

@@ -14,7 +14,7 @@ import psutil
 import rmpa
 from rmpa.observe import limits
 from rmpa.observe.io.direct_section import DirectSection
-from rmpa.observe.io.peers_section import PeersSection, detector_info, own_text
+from rmpa.observe.io.peers_section import PeersSection, detector_info, own_bounds
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.peer_agent import PeerAgent
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
     from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.limit_reports import LimitReports
     from rmpa.bridge.io.twin_watch import TwinWatch
     from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
@@ -51,7 +50,6 @@ class SnapshotSources:
         bridge: Its bridge.
         clocks: The clocks of its peers.
         services: The bridge's part for services.
-        limit_reports: The bridge's part for limits.
         twins: The bridge's part for peers of this module's kind.
         endpoint: Its place in the network now; ``None`` while it has none.
         counters: The counters of parts that are not named here.
@@ -65,7 +63,6 @@ class SnapshotSources:
     bridge: Bridge
     clocks: PeerClocks
     services: Services
-    limit_reports: LimitReports
     twins: TwinWatch
     endpoint: Callable[[], EndpointView | None]
     counters: tuple[Counters, ...]
@@ -90,7 +87,7 @@ class SnapshotBuilder:
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
-        self._peers = PeersSection(sources.bridge, sources.limit_reports, sources.twins)
+        self._peers = PeersSection(sources.bridge, sources.services, sources.twins)
         self.direct = DirectSection(sources.core, sources.bridge)
         """What is known of direct transport."""
         self.sampler = self.direct.sampler
@@ -186,7 +183,7 @@ class SnapshotBuilder:
         if DESCRIPTORS.shortage is not None:
             notes.append(DESCRIPTORS.shortage.problem)
         notes += self._sources.notes()
-        notes += map(own_text, self._sources.limit_reports.own())
+        notes += own_bounds(self._sources.bridge, self._sources.services)
         missing = refused(self._sources.requests)
         return (*notes, missing) if missing else tuple(notes)
 

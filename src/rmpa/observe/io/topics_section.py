@@ -99,7 +99,7 @@ class TopicsSection:
         state = self._core.state()
         routes: dict[str, list[RouteInfo]] = {}
         mismatches: dict[str, list[str]] = {}
-        for source, info, texts in (*self._inbound(wanted), *self._left_out(wanted), *self._outbound(wanted)):
+        for source, info, texts in (*self._inbound(wanted), *self._outbound(wanted)):
             if info is not None:
                 routes.setdefault(source.topic, []).append(info)
             mismatches.setdefault(source.topic, []).extend(texts)
@@ -151,12 +151,11 @@ class TopicsSection:
         first.update(name for name in yielding_to_data(state.publishers) if name not in others)
         problems -= first
         idle -= first | problems
-        beyond = {topic for _, topic, _ in yielding_to_data(bridge.imports.left_out())} - first - problems - idle
         room = max(0, most - len(first))
-        if len(problems) + len(idle) + len(beyond) <= room:
+        if len(problems) + len(idle) <= room:
             return None, 0
-        rest = chain(*(sorted_yielding(part) for part in (problems, beyond, idle)))
-        return first | set(islice(rest, room)), len(problems) + len(idle) + len(beyond) - room
+        rest = chain(*(sorted_yielding(part) for part in (problems, idle)))
+        return first | set(islice(rest, room)), len(problems) + len(idle) - room
 
     def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
         """Whether a topic of this module may cross."""
@@ -179,30 +178,6 @@ class TopicsSection:
             texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
             texts += self._bridge.topics.mismatches(source)
             yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts
-
-    def _left_out(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
-        """The topics of peers beyond ``limits.topics``, which are hidden."""
-        names = {at.peer: at.link.name for at in self._bridge.sessions}
-        for peer, topic, offer in self._bridge.topics.imports.left_out():
-            if wanted is not None and topic not in wanted:
-                continue
-            yield_to_data()
-            limit = self._bridge.topics.imports.beyond(peer).limit
-            problem = f"{names[peer]} has more topics than limits.topics = {limit} of this module"
-            yield (
-                Source(topic, offer.node),
-                RouteInfo(
-                    peer=names[peer],
-                    node=offer.node,
-                    direction="in",
-                    state="hidden",
-                    type=offer.type,
-                    problem=problem,
-                    wire=offer.topic if offer.topic != topic else "",
-                    limit="topics",
-                ),
-                [],
-            )
 
     def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClockHistory) -> RouteInfo:
         topics = self._bridge.topics.of(at)

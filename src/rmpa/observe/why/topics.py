@@ -294,7 +294,7 @@ def _not_offered(ends: BothEnds, report: PublisherReport | None, peer: str) -> C
         text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
         return Check("offer", FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
     peers = [p for p in ends.here.snapshot.peers if p.name == peer]
-    for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
+    for bound in (bound for p in peers for bound in p.beyond if bound.kind == "topics"):
         return Check.from_message("limit", FAIL, bound.text)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
@@ -307,7 +307,7 @@ def _not_offered(ends: BothEnds, report: PublisherReport | None, peer: str) -> C
 def _limit(here: TopicAtSubscriber, route: RouteInfo) -> Check:
     """A limit of this module hides the topic: the setting, and how much else it hides."""
     peers = [p for p in here.snapshot.peers if p.name == route.peer]
-    hidden = [b.hidden for p in peers for b in p.beyond if b.here and b.kind == route.limit]
+    hidden = [b.hidden for p in peers for b in p.beyond if b.kind == route.limit]
     text = route.problem + (f"; {hidden[0]} {route.limit} of it are hidden" if hidden else "")
     remedy = f"raise limits.{route.limit} in this module's rmpa.toml and `rmpa reload`, or deny what is not needed"
     return Check("limit", FAIL, text, remedy)

@@ -212,7 +212,7 @@ class TopicEvidence:
             lost=numbering.lost if numbering is not None else 0,
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
-            beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
+            beyond=self._bridge.topics.imports.limit_settings.topics if exports.is_beyond(source) else 0,
             unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
             direct=self._snapshots.direct.granted_to(session.peer, source),
         )
