@@ -79,14 +79,6 @@ DOCTOR_OUTPUT_MAX: Final = 4 * MIB
 DOCTOR_FILES_LOW: Final = 4096
 """A limit of open files that is too low for a large graph: each subscriber takes one, and a proxy two where proxies
 cannot share their sockets."""
-DOCTOR_FILES_OWN: Final = 20
-"""File descriptors of an agent without peers, nodes and subscribers."""
-DOCTOR_BEACON_BYTES: Final = 2304
-"""Kernel memory of one beacon that waits to be read: at most 1,200 bytes in a buffer of 2 KiB with its descriptor."""
-DOCTOR_NEIGHBOURS_SHARE: Final = 0.75
-"""The share of the kernel's table of neighbours that modules may take; other hosts need room too."""
-DOCTOR_NEIGHBOURS_USUAL: Final = 1024
-"""The size of that table unless it was changed (net.ipv4.neigh.default.gc_thresh3)."""
 DOCTOR_PEERS_LISTED: Final = 16
 """Peers of an agent that are listed one by one; of more, those with a problem are, and the others are counted."""
 DOCTOR_CLOCK_LOOK: Final = 0.3

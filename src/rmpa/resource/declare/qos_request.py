@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.resource.declare.requirements import Bound, bound
@@ -39,14 +39,7 @@ class QoSRequest:
         Raises:
             ConfigError: The request is not valid for that attribute; see ``requirements.bound``.
         """
-        return bound(
-            attribute,
-            at_least=self.at_least,
-            at_most=self.at_most,
-            exactly=self.exactly,
-            weight=self.weight,
-            hard=self.hard,
-        )
+        return bound(attribute, **asdict(self))
 
 
 def at_least(value: float | str, *, hard: bool = False, weight: float = 1.0) -> QoSRequest:

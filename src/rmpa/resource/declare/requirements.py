@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING
 
 from rmpa.config.values import did_you_mean
@@ -165,77 +164,27 @@ class MergedRequirements:
 
 def merge(requirements: Iterable[Requirement]) -> MergedRequirements:
     """Intersect the bounds of all clients by descending priority; equal priorities keep their given order."""
-    clients = sorted(requirements, key=_descending_priority)
-    requested: dict[str, list[Bound]] = {}
-    for requirement in clients:
-        for name, one in requirement.bounds.items():
-            if (known := requested.get(name)) is None:
-                requested[name] = [one]  # faster than setdefault, which would make a list each time
-            else:
-                known.append(one)
     bounds: dict[str, Bound] = {}
-    conflicts: list[tuple[int, RequirementConflict]] = []
-    for name, several in requested.items():
-        common = _intersect_all(several)
-        bounds[name] = common if common is not None else _intersect_by_priority(name, clients, conflicts)
-    conflicts.sort(key=itemgetter(0))
-    return MergedRequirements(bounds, tuple(conflict for _, conflict in conflicts))
-
-
-def _descending_priority(requirement: Requirement) -> int:
-    return -requirement.priority
-
-
-_low, _high, _weight, _hard, _words_of = (attrgetter(name) for name in ("low", "high", "weight", "hard", "words"))
-
-
-def _intersect_all(bounds: list[Bound]) -> Bound | None:
-    """The intersection of intervals; ``None`` if it is empty, or if any bound consists of words."""
-    if len(bounds) == 1:
-        return bounds[0]
-    if any(map(_words_of, bounds)):
-        return None
-    low, high = max(map(_low, bounds)), min(map(_high, bounds))
-    if low > high:
-        return None
-    return Bound(low, high, weight=max(map(_weight, bounds)), hard=any(map(_hard, bounds)))
-
-
-def _intersect_by_priority(
-    name: str, clients: list[Requirement], conflicts: list[tuple[int, RequirementConflict]]
-) -> Bound:
-    """The intersection for one attribute, client by client; bounds that are left out are added to ``conflicts``."""
-    found: Bound | None = None
-    kept: list[str] = []
-    for rank, requirement in enumerate(clients):
-        one = requirement.bounds.get(name)
-        if one is None:
-            continue
-        common = _intersect(found, one) if found is not None else one
-        if common is None:
-            conflicts.append((rank, RequirementConflict(requirement.client, name, tuple(kept))))
-        else:
-            found = common
-            kept.append(requirement.client)
-    return found if found is not None else Bound()
+    kept: dict[str, list[str]] = {}
+    conflicts = []
+    for requirement in sorted(requirements, key=lambda each: -each.priority):
+        for name, one in requirement.bounds.items():
+            common = _intersect(bounds[name], one) if name in bounds else one
+            if common is None:
+                conflicts.append(RequirementConflict(requirement.client, name, tuple(kept[name])))
+            else:
+                bounds[name] = common
+                kept.setdefault(name, []).append(requirement.client)
+    return MergedRequirements(bounds, tuple(conflicts))
 
 
 def _intersect(one: Bound, other: Bound) -> Bound | None:
     """The intersection of two bounds; ``None`` if it is empty."""
-    low = one.low if one.low >= other.low else other.low  # noqa: FURB136 - max() takes twice as long
-    high = one.high if one.high <= other.high else other.high  # noqa: FURB136
-    words = one.words
-    if other.words is not words:
-        words = one.words & other.words if one.words and other.words else one.words or other.words
-        if not words:
-            return None
-    if low > high:
+    low, high = max(one.low, other.low), min(one.high, other.high)
+    words = one.words & other.words if one.words and other.words else one.words or other.words
+    if low > high or ((one.words or other.words) and not words):
         return None
-    weight = one.weight if one.weight >= other.weight else other.weight  # noqa: FURB136
-    hard = one.hard or other.hard
-    if low == one.low and high == one.high and words is one.words and weight == one.weight and hard == one.hard:
-        return one
-    return Bound(low, high, words, weight, hard)
+    return Bound(low, high, words, max(one.weight, other.weight), one.hard or other.hard)
 
 
 def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str) -> Attribute:
