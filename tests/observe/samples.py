@@ -35,7 +35,7 @@ SNAPSHOT = Snapshot(
         links="full mesh (3 modules, mesh.full_mesh_up_to = 64)",
         config_file="/etc/rmpa/rmpa.toml",
         realtime=("SCHED_FIFO 50: granted",),
-        core_memory="kept in /s/core-11311.sqlite; 2 of 2 nodes of the run before are taken up",
+        core_memory="kept in /s/core-11311.state; 2 of 2 nodes of the run before are taken up",
         files=FilesInfo(open=57, limit=1024, hard=1_048_576, reserved=64, refused=3),
         proxies=17,
         proxy_sockets=2,

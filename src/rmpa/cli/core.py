@@ -78,7 +78,7 @@ async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
     click.echo(f"ROS_MASTER_URI={core.uri}")
     click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
     click.echo("started core service [/rosout]")
-    if core.persistence is not None and (text := core.persistence.beginning()):
+    if core.stored is not None and (text := core.stored.restored()):
         click.echo(text)
     sys.stdout.flush()
     await ended.wait()

@@ -53,7 +53,7 @@ def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: 
     directory = state_dir(environ, setting or None)
     if directory is None or not port:
         return None
-    return (module_dir(directory, module) if module else directory) / f"core-{port}.sqlite"
+    return (module_dir(directory, module) if module else directory) / f"core-{port}.state"
 
 
 # --- the module's name ----------------------------------------------------------------------------------------------

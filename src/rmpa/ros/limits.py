@@ -207,47 +207,30 @@ ROSOUT_RESPAWN: Final = 0.5
 ROSOUT_LOOK: Final = 1.0
 """Seconds between two checks whether the name /rosout is free again, and between attempts to start."""
 CORE_STATE_BYTES: Final = 64 * MIB
-"""A core's state file, all rows together: a robot's parameters with its description are some MB."""
+"""A core's state file: a robot's parameters with its description are some MB."""
 CORE_STATE_NAME_MAX: Final = 4096
 """Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200."""
+CORE_STATE_DEPTH_MAX: Final = PARAM_DEPTH_MAX + XMLRPC_DEPTH_MAX // 3
+"""Namespaces, structs and arrays within each other in a state file: as many as ``setParam`` can make, whose name and
+value have their bounds; each is three XML elements."""
 CORE_STATE_GATHER: Final = 0.3
 """Changes of the graph are gathered this long before they are written; with the write, a kill -9 loses up to 0.5 s. A
 starting node registers a dozen things."""
+CORE_STATE_SHARE: Final = 20
+"""After a write, a pause of this many times the processor time that its state took: a large one is written less
+often."""
+CORE_STATE_REST: Final = 10.0
+"""The longest such pause."""
 CORE_STATE_RETRY: Final = 5.0
 """Pause before a failed write is tried again: the disk is full, or not mounted yet."""
-CORE_STATE_LOCKED: Final = 1.0
-"""Time for which a locked state file is waited for: the previous process may still be ending."""
 CORE_STATE_OPEN: Final = 3.0
-"""Time-out for opening and reading the state file at the start; a disk that hangs must not delay the core longer."""
+"""Time-out for reading the state file at the start; a disk that hangs must not delay the core longer."""
 CORE_STATE_WRITE: Final = 10.0
-"""Time-out of one write, after which the disk is reported as not answering. The first write after a start may be
-64 MiB on a slow card."""
+"""A write that takes longer is reported: the disk does not answer. The first one may be 64 MiB on a slow card."""
 CORE_STATE_CLOSE: Final = 3.0
 """Time-out of the last write of an ending core, whose disk may hang."""
-CORE_STATE_UNFIT_SHOWN: Final = 3
-"""Names of rows that did not fit, in a text for the user."""
-VERIFY_AT_ONCE: Final = 32
-"""Restored nodes that are verified concurrently, each on a connection of its own: calls to the core have to wait
-for these."""
-VERIFY_PROMPT: Final = 0.25
-"""A node that has not answered after this time no longer counts in ``VERIFY_AT_ONCE``, so that a node that hangs
-delays no other."""
-VERIFY_START: Final = 1.0
-"""A core that starts waits this long for an answer of one node of the run before; one that does not answer counts as
-running."""
-VERIFY_RETRY_FIRST: Final = 0.5
-"""Pause before a node that did not answer is verified again."""
-VERIFY_RETRY_MAX: Final = 10.0
-"""The longest pause between two attempts to verify a node."""
-VERIFY_PATIENCE: Final = 600.0
-"""A node that did not answer for this long is discarded: one that a debugger stopped may have continued by then."""
-VERIFY_LISTS: Final = 8
-"""Nodes whose own lists of publications and subscriptions are compared concurrently, once all have been verified."""
-VERIFY_COMPARED: Final = 3
-"""Attempts to compare a node's lists; a node that registers something during each registers everything by itself."""
-VERIFY_ANNOUNCE: Final = 3.0
-"""Subscribers are notified of verified publishers when all nodes have answered or hang, or after this time. Verifying
-500 nodes takes a second, and the connections that follow from each notification would slow the rest."""
+CORE_STATE_ASK: Final = 1.0
+"""The nodes of the run before are asked for this long before the core listens."""
 NODE_KILL_WAIT: Final = 3.0
 """Seconds for a node to end after it was asked to; one with much to save takes a second or two."""
 NODE_KILL_LOOK: Final = 0.2

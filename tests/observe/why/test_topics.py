@@ -223,12 +223,6 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
         "/echo there only subscribe",
         "start its",
     ),
-    "published before its agent was restarted": (
-        Case(source=None, route=None, there=TopicAtPublisher(awaited=("/talker at http://127.0.0.1:4001/",))),
-        "publisher",
-        "/talker at http://127.0.0.1:4001/ published /cmd before the agent of joystick was restarted",
-        "it is asked again by itself",
-    ),
     "an older agent, nothing offered": (
         Case(route=None, there=None, refusal="it does not know the question"),
         "publisher",

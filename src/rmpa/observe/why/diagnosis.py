@@ -165,7 +165,6 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
         sources: The publishers of the topic in its own module.
         subscribers: The subscribers in its own module.
         similar: A topic of that module with nearly this name, or empty; ``near`` on the wire.
-        awaited: Nodes that published it before the agent was restarted and do not answer now, with their addresses.
         permitted: Whether the permissions of its module let the module that asks subscribe; ``None``: trust is off
             there. If not, nothing else is told, also not whether there is such a topic.
     """
@@ -173,7 +172,6 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
     sources: tuple[PublisherReport, ...] = ()
     subscribers: tuple[str, ...] = ()
     similar: str = msgspec.field(default="", name="near")
-    awaited: tuple[str, ...] = ()
     permitted: bool | None = None
 
 

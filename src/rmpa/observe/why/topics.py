@@ -208,11 +208,6 @@ def _published(ends: BothEnds, peer: str, wire: str) -> Check:
         text = f"{nodes} on {peer} publish{'' if len(there.sources) > 1 else 'es'} {wire}"
         others = {source.topic for source in there.sources} - {"", wire}
         return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
-    if there.awaited:
-        nodes = ", ".join(there.awaited)
-        text = f"{nodes} published {wire} before the agent of {peer} was restarted, and does not answer"
-        remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-        return Check("publisher", FAIL, text, remedy)
     text = f"no node of {peer} publishes {wire}"
     if there.subscribers:
         text += f"; {', '.join(there.subscribers)} there only subscribe to it"

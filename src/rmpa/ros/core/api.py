@@ -98,6 +98,3 @@ class Core(Protocol):
 
     def restored(self) -> str:
         """Where the core stores its state and what it restored, for people; empty for nothing."""
-
-    def unverified(self, topic: str) -> Mapping[str, str]:
-        """Publishers of a topic, from the previous run, that have not answered since; with their slave APIs."""

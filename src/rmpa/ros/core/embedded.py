@@ -16,9 +16,9 @@ from rmpa.ros.core.api import Core
 from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness
 from rmpa.ros.core.notifier import Notifier
-from rmpa.ros.core.persistence import CorePersistence
 from rmpa.ros.core.returned_publishers import ReturnedPublishers
 from rmpa.ros.core.rosout import NODE, Rosout
+from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.master.master_api import MasterApi
@@ -56,7 +56,7 @@ class RosCore(Core):
         counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
         state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
-        keep: When the content of the file is restored; see ``CorePersistence``.
+        keep: When the content of the file is restored; see ``CoreState``.
         temporary: Whether a node of this name is not stored, because its owner registers it anew.
     """
 
@@ -86,17 +86,16 @@ class RosCore(Core):
         self._listeners = GraphListeners()
         self._returned = ReturnedPublishers(self._repeat_publishers)
         self.on_change(self._returned.graph_changed)
-        self.persistence: CorePersistence | None = None
+        self.stored: CoreState | None = None
         """Stores the state for the next run, if ``state`` is given."""
         if state is not None:
             own = {NODE, CALLER_ID}
-            self.persistence = CorePersistence(
+            self.stored = CoreState(
                 state,
                 self._api,
                 keep=keep,
                 temporary=lambda node: node in own or temporary(node),
                 carry_out=self._carry_out,
-                counters=self.counters,
             )
 
     # --- its life ---------------------------------------------------------------------------------------------
@@ -112,8 +111,8 @@ class RosCore(Core):
             nodes_at=registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
         )
         self._liveness = Liveness(nodes=registrations.nodes, on_dead=self._dead)
-        if self.persistence is not None:
-            await self.persistence.open()
+        if self.stored is not None:
+            await self.stored.restore()
         try:
             await self._server.start()
         except BaseException:
@@ -126,8 +125,8 @@ class RosCore(Core):
         self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
         self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
         self._liveness.start()
-        if self.persistence is not None:
-            self.persistence.start()
+        if self.stored is not None:
+            self.stored.start()
         if self._with_rosout:
             self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, registrations, self.counters)
             self.on_change(self._rosout.graph_changed)
@@ -143,16 +142,14 @@ class RosCore(Core):
         rosout, self._rosout = self._rosout, None
         if rosout is not None:
             await rosout.close()
-        if self.persistence is not None:
-            await self.persistence.stop_verification()
         self._returned.close()
         if self._notifier is not None:
             await self._notifier.close()
         if self._liveness is not None:
             await self._liveness.close()
         await self._server.close()
-        if self.persistence is not None:
-            await self.persistence.close()
+        if self.stored is not None:
+            await self.stored.close()
 
     @property
     def uri(self) -> str:
@@ -213,13 +210,10 @@ class RosCore(Core):
 
     def notes(self) -> tuple[str, ...]:
         """Problems with storing the core's state; the core itself runs as long as the agent."""
-        return self.persistence.notes() if self.persistence is not None else ()
+        return self.stored.notes() if self.stored is not None else ()
 
     def restored(self) -> str:
-        return self.persistence.summary() if self.persistence is not None else ""
-
-    def unverified(self, topic: str) -> Mapping[str, str]:
-        return self._api.registrations.unverified.publishers_of(topic)
+        return self.stored.summary() if self.stored is not None else ""
 
     def unreachable(self) -> Mapping[str, Unreachable]:
         return self._liveness.unreachable if self._liveness is not None else {}
@@ -238,8 +232,8 @@ class RosCore(Core):
 
     def _carry_out(self) -> None:
         effects, changes = self._api.take()
-        if self.persistence is not None:
-            self.persistence.schedule_write()
+        if self.stored is not None:
+            self.stored.schedule_write()
         # Queued before the callbacks run: what a callback registers must be notified after these effects.
         if self._notifier is not None:
             for effect in effects:
@@ -248,7 +242,7 @@ class RosCore(Core):
 
     def _repeat_publishers(self, topics: list[str]) -> None:
         for topic in yielding_to_data(topics):  # a thousand peers that return have 20,000
-            self._api.registrations.repeat_publishers(topic)
+            self._api.registrations.notify_subscribers(topic)
         self._carry_out()
 
     def _unreachable(self, api: str) -> None:

@@ -227,9 +227,6 @@ class ExternalCore(Core):
     def restored(self) -> str:
         return ""
 
-    def unverified(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
-        return {}
-
     def suspect(self, node: str) -> None:
         if not self._mirror.is_ours(node):
             self._liveness.suspect(node)

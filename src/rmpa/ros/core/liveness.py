@@ -29,7 +29,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.ros.master.reachability import Unreachable
 
@@ -195,22 +195,6 @@ def _local_port(api: str) -> int | None:
     except UnreachableError:
         return None  # the attempt to connect reports the reason
     return port if is_own_name(host) or host.startswith("127.") else None
-
-
-def is_gone(api: str, ports: set[int] | None, addresses: Container[str]) -> bool:
-    """Whether a slave API is at an address of this machine where nothing listens; ``False`` where that is unknown.
-
-    Args:
-        api: Its URI.
-        ports: From ``listening_ports``.
-        addresses: This machine's.
-    """
-    try:
-        host, port, _ = split_uri(api)
-    except UnreachableError:
-        return False
-    here = is_own_name(host) or host.startswith("127.") or host in addresses
-    return here and ports is not None and port not in ports
 
 
 async def refuses(api: str) -> bool:

@@ -1,22 +1,37 @@
 """The master's tables of publishers, subscribers, services and parameter subscriptions.
 
-Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them. Nodes
-restored from the previous run (``unverified``) are in no table and no answer until they are verified (``confirm``).
+Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import msgspec
 
 from rmpa.ros.master.effects import Effect, GraphChange, GraphState, PublisherUpdate, RegistrationKind, Shutdown
-from rmpa.ros.master.unverified import NodeRecord, UnverifiedNodes
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 ANY_TYPE: Final = "*"
 _NOBODY: Final[dict[str, str]] = {}
+
+
+class NodeRecord(msgspec.Struct, omit_defaults=True):
+    """Everything that one node registered.
+
+    Attributes:
+        api: The URI of its slave API.
+        publishers: Topics that it publishes, with their types.
+        subscribers: Topics that it subscribes to, with their types.
+        services: Services that it provides, with their ``rosrpc://`` URIs.
+        params: Parameters that it subscribed to; each ends in ``/``.
+    """
+
+    api: str
+    publishers: dict[str, str] = {}
+    subscribers: dict[str, str] = {}
+    services: dict[str, str] = {}
+    params: list[str] = []
 
 
 @dataclass(slots=True)
@@ -51,12 +66,8 @@ class Registrations:
         # node -> the slave API of the former node of that name, for as long as a new node has the name.
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
-        self.unverified = UnverifiedNodes()
-        self._restored: set[str] = set()
         self.revision = 0
         """Another number after each change of a node's record."""
-        self.revisions: dict[str, int] = {}
-        """A number for each registered or unverified node, which differs after each change of the node."""
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
 
@@ -106,6 +117,20 @@ class Registrations:
         """
         return list(self._tables[kind].items())
 
+    def record(self, node: str) -> NodeRecord | None:
+        """Everything that a node registered; ``None`` for an unknown node."""
+        found = self._nodes.get(node)
+        if found is None:
+            return None
+        services = found.keys[RegistrationKind.SERVICE]
+        return NodeRecord(
+            found.api,
+            {topic: self._types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.PUBLISHER]},
+            {topic: self._types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.SUBSCRIBER]},
+            {name: uri for name in services if (uri := self._services.get(name, {}).get(node))},
+            list(found.keys[RegistrationKind.PARAM]),
+        )
+
     def state(self) -> GraphState:
         """All registrations; the same object until something changes.
 
@@ -133,11 +158,7 @@ class Registrations:
             retyped = self._types.get(topic) != topic_type
             self._types[topic] = topic_type
         self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
-        self._notify_subscribers(topic)
-
-    def repeat_publishers(self, topic: str) -> None:
-        """Send the subscribers of a topic its list of publishers once more."""
-        self._notify_subscribers(topic)
+        self.notify_subscribers(topic)
 
     def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
         """Add a subscriber; its type counts only while the topic has none."""
@@ -175,14 +196,13 @@ class Registrations:
         Returns:
             Whether it was there.
         """
-        withdrawn = self._withdraw(kind, key, node, api)
         found = self._tables[kind].get(key, {}).get(node) == api
         if found:
             self._remove(kind, key, node, api)
-        if kind is RegistrationKind.PUBLISHER and (found or withdrawn):
-            self._notify_subscribers(key)
+            if kind is RegistrationKind.PUBLISHER:
+                self.notify_subscribers(key)
         self._forget_if_empty(node)
-        return found or withdrawn
+        return found
 
     def unregister_service(self, service: str, uri: str, node: str) -> bool:
         """Remove a service, if its provider still is this node with this ``rosrpc://`` URI.
@@ -194,9 +214,6 @@ class Registrations:
         found = api is not None and self._service_uris.get(service) == uri
         if api is not None and found:
             self._remove(RegistrationKind.SERVICE, service, node, api)
-        record = self.unverified.get(node)
-        if record is not None and record.services.get(service) == uri:
-            found = self._withdraw(RegistrationKind.SERVICE, service, node, record.api)
         self._forget_if_empty(node)
         return found
 
@@ -213,121 +230,27 @@ class Registrations:
         self._empty(node)
         self._nodes.pop(node, None)
         self._evicted.pop(node, None)
-        self._mark_changed(node)
-        for topic in topics:
-            self._notify_subscribers(topic)
-        return True
-
-    # --- nodes of the previous run ----------------------------------------------------------------------------
-
-    def record(self, node: str) -> NodeRecord | None:
-        """Everything that a node registered before the core's restart and after it; ``None`` for an unknown node."""
-        found, awaited = self._nodes.get(node), self.unverified.get(node)
-        if found is None:
-            return awaited
-        types = self._types
-        record = NodeRecord(
-            found.api,
-            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.PUBLISHER]},
-            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.SUBSCRIBER]},
-            {
-                name: uri
-                for name in found.keys[RegistrationKind.SERVICE]
-                if (uri := self._services.get(name, {}).get(node))
-            },
-            dict(found.keys[RegistrationKind.PARAM]),
-        )
-        if awaited is not None:
-            for kind in RegistrationKind:
-                record.of(kind).update(awaited.of(kind))  # type: ignore[arg-type] # both of one kind
-        return record
-
-    def restore(self, node: str, record: NodeRecord) -> None:
-        """Restore a node of the previous run as unverified. The types of its topics count at once."""
-        self.unverified.add(node, record)
-        for topic, topic_type in [*record.publishers.items(), *record.subscribers.items()]:
-            self._types.setdefault(topic, topic_type)
-        self._state = None
-        self._mark_changed(node)
-
-    def confirm(self, node: str) -> tuple[list[str], list[str]]:
-        """Register an unverified node, which has answered, with all that it had.
-
-        A service that another node provides by now stays with that node.
-
-        Returns:
-            The topics that it publishes, for ``notify_new_subscribers``, and those that it subscribes to, for
-            ``notify_subscriber``.
-        """
-        record = self.unverified.pop(node)
-        if record is None:
-            return [], []
-        self._restored.add(node)
-        for topic in record.publishers:
-            self._register(RegistrationKind.PUBLISHER, topic, node, record.api)
-        for topic in record.subscribers:
-            self._register(RegistrationKind.SUBSCRIBER, topic, node, record.api)
-        for service, uri in record.services.items():
-            if service not in self._service_uris:
-                self.register_service(service, uri, node, record.api)
-        for key in record.params:
-            self._register(RegistrationKind.PARAM, key, node, record.api)
-        self._mark_changed(node)
-        return list(record.publishers), list(record.subscribers)
-
-    def notify_subscriber(self, topic: str, node: str) -> None:
-        """Send one subscriber the publishers of a topic."""
-        api = self.at(RegistrationKind.SUBSCRIBER, topic).get(node)
-        if api is not None:
-            publishers = self._publishers(topic, unverified=node in self._restored)
-            self.effects.append(PublisherUpdate(api, topic, publishers))
-
-    def discard(self, node: str) -> None:
-        """Drop an unverified node, and notify the restored subscribers, which may be connected to it."""
-        record = self.unverified.pop(node)
-        if record is not None:
-            self._mark_changed(node)
-            for topic in record.publishers:
-                self._notify_subscribers(topic, self._restored.__contains__)
-
-    def notify_new_subscribers(self, topic: str) -> None:
-        """Notify those subscribers of a topic that registered after the core's restart."""
-        self._notify_subscribers(topic, lambda node: node not in self._restored)
-
-    def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Remove a registration of an unverified node; return whether it was there."""
-        if not self.unverified.withdraw(kind, key, node, api):
-            return False
-        record = self.unverified.get(node)
-        if record is not None and not any(record.of(kind) for kind in RegistrationKind):
-            self.unverified.pop(node)
-        self._mark_changed(node)
-        return True
-
-    def _mark_changed(self, node: str) -> None:
-        """Give a node a new revision, because its record has changed; forget one that has no record left."""
         self.revision += 1
-        if node in self._nodes or self.unverified.get(node) is not None:
-            self.revisions[node] = self.revision
-        else:
-            self.revisions.pop(node, None)
-            self._restored.discard(node)
+        for topic in topics:
+            self.notify_subscribers(topic)
+        return True
+
+    def notify_subscribers(self, topic: str) -> None:
+        """Send the subscribers of a topic the list of its publishers."""
+        publishers = tuple(self.apis(RegistrationKind.PUBLISHER, topic))
+        # Nodelets of one process share a slave API, which is notified once.
+        apis = dict.fromkeys(self.apis(RegistrationKind.SUBSCRIBER, topic))
+        self.effects += [PublisherUpdate(api, topic, publishers) for api in apis]
 
     # --- the tables -------------------------------------------------------------------------------------------
 
     def _claim_name(self, node: str, api: str) -> _Node:
         """Return the node's entry; a node of that name at another URI loses its registrations and is asked to end."""
-        awaited = self.unverified.get(node)
-        if awaited is not None and awaited.api != api:
-            self.effects.append(Shutdown(awaited.api, node, tuple(awaited.publishers)))
-            self._evicted[node] = awaited.api
-            self.discard(node)
         found = self._nodes.get(node)
         if found is not None and found.api != api:
             self.effects.append(Shutdown(found.api, node, tuple(found.keys[RegistrationKind.PUBLISHER])))
             self._empty(node)
             self._evicted[node] = found.api
-            self._restored.discard(node)
             found = None
             # The name keeps its place in the order of nodes, as in rosmaster.
         if found is None:
@@ -338,7 +261,7 @@ class Registrations:
         keys = self._claim_name(node, api).keys[kind]
         if retyped or key not in keys:
             keys[key] = None
-            self._mark_changed(node)
+            self.revision += 1
         providers = self.at(kind, key)
         new = node not in providers
         if providers.get(node) != api:
@@ -357,7 +280,7 @@ class Registrations:
                 del self._service_uris[key]
                 del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
-        self._mark_changed(node)
+        self.revision += 1
         self._changed(kind, key, node, api, added=False)
 
     def _empty(self, node: str) -> None:
@@ -373,32 +296,10 @@ class Registrations:
             del self._nodes[node]
             self._evicted.pop(node, None)
             self._state = None
-            self._mark_changed(node)
+            self.revision += 1
 
     def _changed(self, kind: RegistrationKind, key: str, node: str, api: str, *, added: bool) -> None:
         self._state = None
         if kind is not RegistrationKind.PARAM:
             topic_type = "" if kind is RegistrationKind.SERVICE else self._types.get(key, "")
             self.changes.append(GraphChange(kind, added, key, node, api, topic_type))
-
-    def _publishers(self, topic: str, *, unverified: bool) -> tuple[str, ...]:
-        """The slave APIs of a topic's publishers, with or without unverified ones."""
-        apis = self.apis(RegistrationKind.PUBLISHER, topic)
-        more = self.unverified.publishers(topic) if unverified else ()
-        return tuple(dict.fromkeys([*apis, *more])) if more else tuple(apis)
-
-    def _notify_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
-        """Send the subscribers of a topic (those that ``which`` accepts) the list of its publishers.
-
-        Restored subscribers get unverified publishers too: they are connected to these, and would disconnect if the
-        list lacked them.
-        """
-        known = self._publishers(topic, unverified=False)
-        old = self._publishers(topic, unverified=True)
-        told: dict[str, tuple[str, ...]] = {}
-        for node, api in self.at(RegistrationKind.SUBSCRIBER, topic).items():
-            if api not in told and (
-                which is None or which(node)
-            ):  # nodelets of one process share a slave API, which is notified once
-                told[api] = old if node in self._restored else known
-        self.effects += [PublisherUpdate(api, topic, publishers) for api, publishers in told.items()]

@@ -58,10 +58,6 @@ class TopicEvidence:
         """The module's own publishers of a topic, and their addresses."""
         return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
 
-    def awaited(self, topic: str) -> list[str]:
-        """Nodes that published a topic before this agent was restarted, each with its address."""
-        return [f"{node} at {uri}" for node, uri in self._core.unverified(topic).items()]
-
     def there(self, peer: str, topic: str) -> tuple[str, str]:
         """The names of a topic of a peer here and at the peer.
 
@@ -140,7 +136,6 @@ class TopicEvidence:
         state = self._core.state()
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
-        awaited: list[str] = []
         topics = [topic for topic in names.locals_of(wire) if self._may_know(asker, topic)]
         if not topics:
             return TopicAtPublisher(permitted=False)
@@ -151,12 +146,10 @@ class TopicEvidence:
             if names.wire_name(topic, kind) == wire:
                 sources += [self._report(session, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
-                awaited += self.awaited(topic)
         return TopicAtPublisher(
             sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
             similar="" if sources else await self._similar(session.link.name, wire),
-            awaited=tuple(awaited[: observe_limits.WHY_SOURCES_MAX]),
             permitted=True if self._bridge.gate.on else None,
         )
 

@@ -224,10 +224,6 @@ class WhyService:
             return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
         state = self._core.state()
         similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
-        if awaited := self._topics.awaited(topic):
-            text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
-            remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-            return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer=here, to="")
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = "`rmpa topic list` shows what there is, `rmpa peer list` who"
         remedy = f"did you mean {similar}?" if similar else remedy

@@ -1,0 +1,490 @@
+"""Keeps a core's registrations and parameters over a restart: one file, written whole and renamed.
+
+Restored is what was lost under running nodes: each node of the file is asked before the core listens. After the end
+of all nodes the core begins empty, as a roscore does: what a launch file of yesterday set would act for ever.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import time
+from collections import defaultdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import msgspec
+
+from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.ros import limits
+from rmpa.ros.core.identify import name_at
+from rmpa.ros.http.client import call_api
+from rmpa.ros.master.registrations import NodeRecord  # noqa: TC001 - msgspec reads the annotations
+from rmpa.ros.wire.xmlrpc import RosFault, brief
+from rmpa.ros.wire.xmlrpc_writer import legal_text
+from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.threads import in_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.ros.master.master_api import MasterApi
+
+_log = logging.getLogger(__name__)
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+_CALLER_ID: Final = "/rmpa_identify"
+_SIMULATED: Final = "use_sim_time"
+_DATE: Final = 1
+"""A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one."""
+_OF_A_CORE: Final = frozenset({"/run_id", "/rosdistro", "/rosversion"})
+_SHOWN: Final = 3
+"""Names of nodes or parameters in a text for people."""
+_RECORDS: Final = 8
+"""Nodes recorded in a row, before other pending data is served; each takes some 25 microseconds."""
+
+
+class StoredState(msgspec.Struct):
+    """The content of the file.
+
+    Attributes:
+        format: Tells other programs' files and other formats from this one.
+        boot: In which boot of the machine the core runs; empty once it has ended in order.
+        nodes: Records by the node's name.
+        params: The parameter tree.
+    """
+
+    format: Literal["rmpa core 1"]
+    boot: str = ""
+    nodes: dict[str, NodeRecord] = {}
+    params: dict[str, Any] = {}
+
+
+def _unpacked_ext(code: int, data: memoryview) -> datetime:
+    if code != _DATE:
+        raise ValueError(f"extension {code}")
+    return datetime.fromisoformat(bytes(data).decode())
+
+
+_decode = msgspec.msgpack.Decoder(StoredState, ext_hook=_unpacked_ext).decode
+_encode = msgspec.msgpack.Encoder().encode
+
+
+def serialize(state: StoredState) -> bytes:
+    """Return the content of the file.
+
+    Raises:
+        ValueError, TypeError, OverflowError, RecursionError: MessagePack cannot express a parameter.
+    """
+    return _encode(StoredState(state.format, state.boot, state.nodes, _packable(state.params)))
+
+
+def _packable(value: Any) -> Any:
+    """The value with each date as an extension; the same object where there is none."""
+    match value:
+        case dict():
+            parts = {name: _packable(part) for name, part in value.items()}
+            return parts if any(parts[name] is not part for name, part in value.items()) else value
+        case list() | tuple():
+            packed = [_packable(part) for part in value]
+            return packed if any(new is not old for new, old in zip(packed, value, strict=True)) else value
+        case datetime():
+            return msgspec.msgpack.Ext(_DATE, value.isoformat().encode())
+    return value
+
+
+def parse(data: bytes) -> StoredState:
+    """Read the content of a file.
+
+    Raises:
+        ValueError: It is damaged, of another format, or holds what no call of a node could have caused.
+    """
+    try:
+        state = _decode(data)
+    except (msgspec.MsgspecError, TypeError, RecursionError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from None
+    for name, node in state.nodes.items():
+        for text in (name, *node.publishers, *node.subscribers, *node.services, *node.params):
+            if not text.startswith("/") or len(text) > limits.CORE_STATE_NAME_MAX:
+                raise ValueError(f"{brief(text)} is no global name")
+        if not node.api.startswith("http://"):
+            raise ValueError(f"{brief(node.api)} is no URI of a slave API")
+        for texts in (node.publishers, node.subscribers, node.services):
+            _check_text("".join((*texts, *texts.values())))
+        _check_text("".join((name, node.api, *node.params)))
+    _check(state.params)
+    return state
+
+
+def _check_text(text: str) -> None:
+    if legal_text(text) != text:
+        raise ValueError(f"{brief(text)} has a character that XML cannot hold")
+
+
+def _check(value: Any, depth: int = 0) -> None:
+    """Raise ``ValueError`` for what ``setParam`` could not have set."""
+    match value:
+        case bool() | float() | bytes() | datetime():
+            pass
+        case str():
+            _check_text(value)
+        case int() if INT32_MIN <= value <= INT32_MAX:
+            pass
+        case dict() if depth < limits.CORE_STATE_DEPTH_MAX and all(isinstance(name, str) for name in value):
+            _check_text("".join(value))
+            for part in value.values():
+                _check(part, depth + 1)
+        case list() if depth < limits.CORE_STATE_DEPTH_MAX:
+            for part in value:
+                _check(part, depth + 1)
+        case _:
+            raise ValueError(f"{brief(value)} is nothing that a parameter can be")
+
+
+class CoreState:
+    """The stored state of one core.
+
+    Args:
+        path: The file; created with its folders, for this user alone.
+        api: The core's master.
+        keep: When to restore it: ``auto``, if a node of it still runs or the core died within this boot of the
+            machine; ``always``; ``never``.
+        temporary: Whether a node of this name is not stored, because its owner registers it anew.
+        carry_out: Called after each change of the registrations.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        api: MasterApi,
+        *,
+        keep: str,
+        temporary: Callable[[str], bool],
+        carry_out: Callable[[], None],
+    ) -> None:
+        self.path = path
+        self._api = api
+        self._keep = keep
+        self._temporary = temporary
+        self._carry_out = carry_out
+        self._boot = ""
+        self._unread = False
+        """Whether there is a file that could not be read: it is renamed before another one is written."""
+        self._up = self._gone = self._params = 0
+        self._silent: dict[str, str] = {}
+        self._dropped = ""
+        self._late: set[asyncio.Task[bool | None]] = set()
+        self._problem = ""
+        self._written: tuple[int, object] = (-1, None)
+        self._digest = 0
+        self._rest_until = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._began = self._took = 0.0
+        self._open = False
+
+    # --- the start --------------------------------------------------------------------------------------------
+
+    async def restore(self) -> None:
+        """Read the file, ask its nodes, and restore what shall be; to be called before the core listens."""
+        try:
+            async with asyncio.timeout(limits.CORE_STATE_OPEN):
+                state = await in_thread(self._read, "core state")
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        except (OSError, ValueError) as error:
+            self._unread = True
+            self._problem = self._reason(error) if isinstance(error, OSError) else ""
+            why, aside = self._reason(error), self._aside.name
+            _log.warning("! the core begins empty: %s; before it is written anew, it is renamed to %s", why, aside)
+            return
+        if self._keep == "never":
+            self._drop(state, "core.keep is never")
+            return
+        await self._ask_all({name: node for name, node in state.nodes.items() if not self._temporary(name)})
+        left, died = bool(self._up or self._silent), bool(self._boot) and state.boot == self._boot
+        if self._keep == "auto" and not left and not died:
+            self._drop(state, "no node of the run before is left")
+            return
+        if not left and state.params.pop(_SIMULATED, None) is not None:
+            # With that parameter and no clock, a node that starts would wait for ever.
+            _log.warning("= /use_sim_time of the run before is not taken up: no node of it is left")
+        self._api.parameters.set("/", state.params)
+        self._params = sum(1 for name in self._api.parameters.names() if name not in _OF_A_CORE)
+
+    def start(self) -> None:
+        """Begin to write changes; to be called once the core listens."""
+        self._open = True
+        if text := self.restored():
+            _log.info("= %s: %s", self.path, text)
+        self.schedule_write()
+
+    def _read(self) -> StoredState:
+        with contextlib.suppress(OSError):
+            self._boot = _BOOT_ID.read_text().strip()
+        if self.path.stat().st_size > limits.CORE_STATE_BYTES:
+            raise ValueError("it is larger than a core's file can be")
+        return parse(self.path.read_bytes())
+
+    def _drop(self, state: StoredState, why: str) -> None:
+        names = [name for name in state.params if f"/{name}" not in _OF_A_CORE]
+        if not names and not state.nodes:
+            return
+        self._dropped = f"the core begins empty: {why}"
+        if names and self._keep == "auto":
+            shown = _first([f"/{name}" for name in names])
+            self._dropped += f'; its parameters {shown} are dropped (core.keep = "always" keeps them)'
+
+    async def _ask_all(self, nodes: dict[str, NodeRecord]) -> None:
+        """Ask all nodes at once, and register those that answer within ``limits.CORE_STATE_ASK``.
+
+        One that answers later, within the time-outs of its calls, is registered then.
+        """
+        at: defaultdict[str, dict[str, NodeRecord]] = defaultdict(dict)  # nodelets share an address
+        for name, node in nodes.items():
+            at[node.api][name] = node
+        asked = {asyncio.create_task(_is_there(api, at[api]), name=f"ask {api}"): at[api] for api in at}
+        if not asked:
+            return
+        done, self._late = await asyncio.wait(asked, timeout=limits.CORE_STATE_ASK)
+        up: dict[str, NodeRecord] = {}
+        for task, asked_nodes in asked.items():
+            if task not in done or task.result() is None:
+                self._silent |= {name: node.api for name, node in asked_nodes.items()}
+            elif task.result():
+                up |= asked_nodes
+            else:
+                self._gone += len(asked_nodes)
+                _log.info("= %s, of the run before, is not there any more", ", ".join(asked_nodes))
+        self._register(up)
+        for task in self._late:
+            task.add_done_callback(lambda task: self._answered_late(task, asked[task]))
+
+    def _answered_late(self, task: asyncio.Task[bool | None], nodes: dict[str, NodeRecord]) -> None:
+        self._late.discard(task)
+        if task.cancelled() or task.result() is None:
+            return
+        for name in nodes:
+            del self._silent[name]
+        if not task.result():
+            self._gone += len(nodes)
+            return
+        self._register(nodes)
+
+    def _register(self, nodes: dict[str, NodeRecord]) -> None:
+        table = self._api.registrations
+        nodes = {name: node for name, node in nodes.items() if table.node_api(name) in {None, node.api}}
+        for name, node in nodes.items():
+            for topic, kind in node.publishers.items():
+                table.register_publisher(topic, kind, name, node.api)
+        for name, node in nodes.items():
+            for topic, kind in node.subscribers.items():
+                table.register_subscriber(topic, kind, name, node.api)
+            for service, uri in node.services.items():
+                if table.service_uri(service) is None:
+                    table.register_service(service, uri, name, node.api)
+            for key in node.params:
+                table.subscribe_param(key, name, node.api)
+        for topic in {topic for node in nodes.values() for topic in node.subscribers}:
+            table.notify_subscribers(topic)
+        self._up += len(nodes)
+        self._carry_out()
+
+    # --- what people see --------------------------------------------------------------------------------------
+
+    @property
+    def problem(self) -> str:
+        """Why nothing is stored at present, or empty."""
+        late = self._task is not None and self._loop_time() - self._began > limits.CORE_STATE_WRITE
+        return f"{self.path}: the disk does not answer" if late else self._problem
+
+    def restored(self) -> str:
+        """What became of the file's content at the start; empty if there was none."""
+        parts = [self._dropped] if self._dropped else []
+        if nodes := self._up + self._gone + len(self._silent):
+            text = f"{self._up} of {nodes} nodes of the run before are taken up"
+            if self._gone:
+                text += f", {self._gone} {'is' if self._gone == 1 else 'are'} gone"
+            if self._silent:
+                text += f", {_first(list(self._silent))} did not answer"
+            parts.append(text)
+        if self._params:
+            some = "1 parameter of it was" if self._params == 1 else f"{self._params} parameters of it were"
+            parts.append(f"{some} taken up")
+        return "; ".join(parts)
+
+    def summary(self) -> str:
+        """The file and what was restored from it, for people."""
+        kept = f"kept in {self.path}" if not self.problem else "nothing is kept"
+        return "; ".join(filter(None, (kept, self.restored())))
+
+    def notes(self) -> tuple[str, ...]:
+        """Problems that the user should know of."""
+        notes = [f"nothing of the core is kept over a restart: {self.problem}"] if self.problem else []
+        notes += [
+            f"{node} at {api}, of the run before, does not answer and is not shown: start it again"
+            for node, api in list(self._silent.items())[:_SHOWN]
+            if not self._late and self._api.registrations.node_api(node) is None
+        ]
+        return tuple(notes)
+
+    # --- writing ----------------------------------------------------------------------------------------------
+
+    def schedule_write(self) -> None:
+        """Write soon, if something has changed."""
+        if self._open and self._timer is None and self._task is None and self._changed():
+            at = max(self._loop_time() + limits.CORE_STATE_GATHER, self._rest_until)
+            self._timer = asyncio.get_running_loop().call_at(at, self._begin)
+
+    async def close(self) -> None:
+        """Write what has changed, and that the core ended in order."""
+        for task in self._late:
+            task.cancel()
+        await asyncio.gather(*self._late, return_exceptions=True)
+        if not self._open:  # another core may have the port, and so this file
+            return
+        self._open = False
+        if self._timer is not None:
+            self._timer.cancel()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(limits.CORE_STATE_CLOSE):
+                if self._task is not None:
+                    await self._task
+                await self._write("")
+
+    def _changed(self) -> bool:
+        revision, tree = self._written
+        return revision != self._api.registrations.revision or tree is not self._api.parameters.tree
+
+    def _loop_time(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    def _begin(self) -> None:
+        self._timer = None
+        self._began = self._loop_time()
+        self._task = asyncio.get_running_loop().create_task(self._work(), name="keep the core's state")
+
+    async def _work(self) -> None:
+        try:
+            await self._write(self._boot)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! keeping the core's state failed")
+        finally:
+            rest = limits.CORE_STATE_RETRY if self._problem else self._took * limits.CORE_STATE_SHARE
+            self._rest_until = self._loop_time() + min(rest, limits.CORE_STATE_REST)
+            self._task = None
+            self.schedule_write()
+
+    async def _write(self, boot: str) -> None:
+        table, tree = self._api.registrations, self._api.parameters.tree
+        now = table.revision, tree
+        nodes = {
+            name: record
+            for name in yielding_to_data(list(table.nodes()), every=_RECORDS)
+            if not self._temporary(name) and (record := table.record(name)) is not None
+        }
+        # Trees and records are never changed in place, so that a thread may read them.
+        state = StoredState("rmpa core 1", boot, nodes, tree)
+        try:
+            await in_thread(lambda: self._put(state), "core state")
+        except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
+            if not self._problem:
+                _log.warning("! nothing of the core is kept over a restart: %s", self._reason(error))
+            self._problem = self._reason(error)
+            return
+        if self._problem:
+            _log.info("= %s: everything is kept again", self.path)
+        self._problem, self._written = "", now
+
+    def _put(self, state: StoredState) -> None:
+        began = time.thread_time()
+        data = serialize(state)
+        self._took = time.thread_time() - began
+        if len(data) > limits.CORE_STATE_BYTES:
+            raise ValueError(f"it would have {len(data):,} bytes, and has at most {limits.CORE_STATE_BYTES:,}")
+        if hash(data) == self._digest and self.path.exists():
+            return
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if self._unread:
+            with contextlib.suppress(FileNotFoundError):
+                self.path.replace(self._aside)
+            self._unread = False
+        new = self.path.with_name(f"{self.path.name}.new")
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+        with os.fdopen(os.open(new, flags, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(self.path)
+        self._digest = hash(data)
+
+    @property
+    def _aside(self) -> Path:
+        return self.path.with_name(f"{self.path.name}.before")
+
+    def _reason(self, error: Exception) -> str:
+        match error:
+            case TimeoutError():
+                return f"{self.path}: the disk does not answer"
+            case OSError(errno=errno.ENOSPC | errno.EDQUOT):
+                return f"{self.path}: {error.strerror}; make room on that disk"
+            case OSError():
+                return f"{self.path}: {error.strerror or error}; set RMPA_STATE_DIR to another place"
+        return f"{self.path}: {error}"
+
+
+def _first(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+# --- asking the nodes of the run before -----------------------------------------------------------------------------
+
+
+async def _is_there(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
+    """Whether these nodes are still at an address; ``None`` if nothing answers there, and nothing refuses.
+
+    A rospy node gives its name in ``getName``, a roscpp node in the header of a topic that it publishes; one that
+    publishes nothing is known by its own lists of topics. The records take up what these lists have.
+    """
+    topics = [topic for node in nodes.values() for topic in node.publishers if topic != "/rosout"]
+    try:
+        name = await name_at(api, topics)
+        if name is not None and name not in nodes:
+            return False
+        published, subscribed = await _listed(api, "getPublications"), await _listed(api, "getSubscriptions")
+    except UnreachableError as error:
+        return False if isinstance(error.__cause__, ConnectionRefusedError) else None
+    except RmpaError:  # such as no file descriptor left
+        return None
+    had = [(node.publishers, published) for node in nodes.values() if node.publishers]
+    had += [(node.subscribers, subscribed) for node in nodes.values() if node.subscribers]
+    if name is None and not (had and all(now is not None and then.keys() <= now.keys() for then, now in had)):
+        return None if topics else False  # a publisher tells its name, unless it is too busy at present
+    if len(nodes) == 1:  # the lists of nodelets do not say which node an entry belongs to
+        [node] = nodes.values()
+        node.publishers = node.publishers if published is None else published
+        node.subscribers = node.subscribers if subscribed is None else subscribed
+    return True
+
+
+async def _listed(api: str, method: str) -> dict[str, str] | None:
+    """The topics and types of a node's own list; ``None`` if it does not tell."""
+    try:
+        reply = await call_api(api, method, _CALLER_ID)
+    except (RosFault, RemoteProtocolError):
+        return None
+    if reply.code != 1 or not isinstance(reply.value, list):
+        return None
+    return dict(_entries(reply.value))
+
+
+def _entries(listed: list[Any]) -> Iterator[tuple[str, str]]:
+    for entry in listed:
+        match entry:
+            case [str(topic), str(topic_type)] if topic.startswith("/"):
+                yield topic, topic_type
