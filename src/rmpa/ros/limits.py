@@ -147,6 +147,8 @@ SLAVE_CALL_TIMEOUT: Final = 3.0
 """Time-out of one XML-RPC call to a node; a stopped node must not hold the others up."""
 
 # --- a roscore in place of the embedded core ----------------------------------------------------------------------
+MASTER_OTHER_AGENT: Final = 10.0
+"""Time for which another agent at the same roscore is told after its last registration was seen."""
 MASTER_LOOK_FIRST: Final = 0.1
 """Time between two polls of a roscore whose graph has just changed: nodes register one thing after the other. A poll
 of a graph of 50 nodes costs the roscore some milliseconds."""

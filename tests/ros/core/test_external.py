@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from rmpa.core.errors import LocalProtocolError, StartError, UnreachableError
+from rmpa.core.errors import LocalProtocolError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
 if TYPE_CHECKING:
@@ -232,19 +230,6 @@ async def test_refused_registration_is_reported_and_dropped(
     assert core.call("getParam", "/rmpa", "/good").code == -1, "only the master knows"
 
 
-async def test_service_no_poll_has_shown_is_not_replaced(master: RosCore, core: ExternalCore) -> None:
-    pushed: list[GraphChange] = []
-    async with a_node() as api:
-        master.call("registerService", "/n", "/srv", "rosrpc://127.0.0.1:1", api)
-        master.on_change(pushed.append)
-        core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:2", OURS)
-        core.call("registerService", "/rmpa", "/free", "rosrpc://127.0.0.1:2", OURS)
-        await until(lambda: core.state().services.get("/srv") == {"/n": "rosrpc://127.0.0.1:1"})
-        await until(lambda: core.state() == master.state())
-        assert [change.name for change in pushed] == ["/free"]
-        assert core.state().services["/free"] == {"/rmpa": "rosrpc://127.0.0.1:2"}
-
-
 async def test_writes_beyond_the_bound_are_found_by_the_next_look(
     master: RosCore, core: ExternalCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,39 +239,18 @@ async def test_writes_beyond_the_bound_are_found_by_the_next_look(
     await until(lambda: len(master.state().publishers) == 10)
 
 
-async def test_second_agent_is_refused_at_start_and_waits_later(master: RosCore) -> None:
-    node = SlaveNode("/rmpa", "127.0.0.1", master.uri)
-    await node.start()
-    first, second = external(master.uri), external(master.uri)
-    await first.start()
-    await second.start()
-    first.call("registerPublisher", "/rmpa", "/t", STRING, node.uri)
+async def test_another_agent_at_the_roscore_is_named(
+    master: RosCore, core: ExternalCore, caplog: pytest.LogCaptureFixture
+) -> None:
+    core.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     await until(lambda: master.publishers("/t"))
-    with pytest.raises(StartError, match=rf"another agent \(/rmpa at {node.uri}, process {os.getpid()}\)"):
-        await external(master.uri).start()
-    await until(second.notes)
-    assert "stands by" in second.notes()[0]
-    second.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
-    with pytest.raises(UnreachableError, match="/rmpa at"):
-        await second.ask("setParam", "/rmpa", "/key", 1)
-    await first.close()
-    await until(lambda: master.publishers("/u"))
-    assert second.notes() == ()
-    await second.close()
-    await node.close()
-
-
-async def test_what_a_killed_agent_left_is_taken_away(master: RosCore) -> None:
-    master.call("registerPublisher", "/rmpa", "/diagnostics", STRING, OURS)
-    master.call("registerSubscriber", "/rmpa/b/n", "/t", STRING, OURS)
-    master.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://127.0.0.1:1", OURS)
-    async with a_node() as api:
-        master.call("registerPublisher", "/n", "/t", STRING, api)
-        core = external(master.uri)
-        await core.start()
-        assert master.state().nodes == {"/n": api}, "before anything of ours is registered"
-        assert core.counters.as_dict()["master.leftovers"] == 3
-        await core.close()
+    assert core.notes() == ()
+    async with a_node() as other:
+        master.call("registerPublisher", "/rmpa", "/u", STRING, other)
+        await until(core.notes)
+        assert f"another agent (its node at {other}) is at the roscore {master.uri}" in core.notes()[0]
+        await until(lambda: master.publishers("/t"))
+    assert caplog.text.count("another agent") == 1
 
 
 async def test_dead_node_is_hidden_and_shown_again_if_alive(

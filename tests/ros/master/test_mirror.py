@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.master.master_api import MasterApi
-from rmpa.ros.master.mirror import Call, Mirror, stale_registrations
+from rmpa.ros.master.mirror import Call, Mirror
 from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Pair:
     def look(self) -> list[Call]:
         """Look at the master and learn; what must be registered again is written."""
         seen = self.mirror.asked
-        again = self.mirror.update(self.survey(), seen, {})
+        again = self.mirror.update(self.survey(), seen)
         self.writes += again
         return again
 
@@ -153,7 +153,7 @@ def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -
     pair.theirs("unregisterService", "/n", "/srv", "rosrpc://h:9")
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
     pair.flush()
-    pair.mirror.update(survey, seen, {})
+    pair.mirror.update(survey, seen)
     assert pair.mirror.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
     assert pair.look() == []
 
@@ -165,15 +165,14 @@ def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pai
     assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
     assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
-    assert pair.mirror.update(survey, seen, {}) == []
+    assert pair.mirror.update(survey, seen) == []
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
     pair.flush()
     assert pair.look() == []
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
-    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
-    assert pair.mirror.update(survey, seen, {}) == []
+    assert pair.mirror.update(survey, seen) == []
     assert pair.mirror.publishers("/t") == {}
 
 
@@ -253,31 +252,6 @@ def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     assert pair.mirror.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
 
 
-def test_a_proxy_that_left_since_the_look_began_is_no_stranger(pair: Pair) -> None:
-    pair.call("registerPublisher", "/rmpa/b/n", "/t", STRING, OURS)
-    pair.flush()
-    pair.look()
-    seen, survey = pair.mirror.asked, pair.survey()
-    pair.call("unregisterPublisher", "/rmpa/b/n", "/t", OURS)
-    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
-    assert set(pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
-
-
-def test_foreign_agents_are_found_and_unregistered(pair: Pair) -> None:
-    pair.theirs("registerPublisher", "/rmpa", "/diagnostics", STRING, THEIRS)
-    pair.theirs("registerSubscriber", "/rmpa", "/t", STRING, THEIRS)
-    pair.theirs("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", MOVED)
-    pair.theirs("registerPublisher", "/rmpaint", "/t", STRING, THEIRS)
-    survey = pair.survey()
-    strangers = pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)
-    assert strangers == {"/rmpa": THEIRS, "/rmpa/b/n": MOVED}
-    assert pair.mirror.update(survey, 0, strangers) == []
-    assert set(pair.mirror.state().nodes) == {"/rmpaint"}
-    for (method, params), _ in stale_registrations(survey, strangers):
-        pair.theirs(method, *map(str, params))
-    assert set(pair.master.registrations.nodes()) == {"/rmpaint"}
-
-
 def test_what_the_master_does_not_take_is_none(pair: Pair) -> None:
     pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     pair.mirror.forget(("registerPublisher", ("/rmpa", "/t", STRING, OURS)))
@@ -312,7 +286,7 @@ def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcVa
     except RemoteProtocolError:
         return
     mirror = Mirror()
-    mirror.update(survey, 0, mirror.foreign_agents(survey, "/rmpa", 0))
+    mirror.update(survey, 0)
     assert set(mirror.state().nodes) <= set(survey.uris)
 
 
@@ -366,9 +340,6 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     pair.flush()
     pair.look()
     pair.flush()
-    strangers = pair.mirror.foreign_agents(pair.survey(), "/rmpa", pair.mirror.asked)
-    for (method, params), _ in stale_registrations(pair.survey(), strangers):
-        pair.theirs(method, *map(str, params))
     assert pair.look() == []
     mirror, master = pair.mirror.state(), pair.master.registrations.state()
     assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.api import Core
-from rmpa.ros.core.identify import name_at
 from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.client import call, call_api, exchange, read_response
-from rmpa.ros.master.mirror import REGISTRATIONS, Mirror, stale_registrations
+from rmpa.ros.master.mirror import REGISTRATIONS, Mirror
 from rmpa.ros.master.survey import Survey, lookup_calls, one_call, read_lookups, read_survey, survey_calls
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.descriptors import Use
@@ -49,13 +48,11 @@ class _Write:
         method: A method of the Master API.
         params: Its parameters, the caller id included.
         done: Gets the answer; ``None`` if no caller waits for it.
-        from_poll: Whether the call follows from a poll, which has dealt with other providers of a service already.
     """
 
     method: str
     params: tuple[XmlRpcValue, ...]
     done: asyncio.Future[RosReply] | None = None
-    from_poll: bool = False
 
     def fail(self, error: Exception) -> None:
         if self.done is not None and not self.done.done():
@@ -67,10 +64,10 @@ class ExternalCore(Core):
 
     Args:
         uri: The master's URI.
-        own_node: The agent's own node. It and the nodes below its name belong to an agent: this one or another.
+        own_node: The agent's own node, which asks the master.
         node_host: The address at which the agent's nodes listen.
         node_address: The address of the agent's nodes that is registered.
-        counters: ``master.looks``, ``master.writes``, ``master.lost``, ``master.leftovers``, ``node.dead``.
+        counters: ``master.looks``, ``master.writes``, ``master.lost``, ``node.dead``.
     """
 
     def __init__(
@@ -98,7 +95,9 @@ class ExternalCore(Core):
         self._revival: asyncio.Task[None] | None = None
         self._ending = False
         self._problem = "it was not asked yet"
+        self._other_until = 0.0
         self._other_agent = ""
+        """The slave API of a node of another agent that has taken the name of the agent's own node."""
         # What the next poll looks up, its encoded request, and the last answer: both are mostly unchanged.
         self._nodes: tuple[str, ...] = ()
         self._services: tuple[str, ...] = ()
@@ -109,20 +108,10 @@ class ExternalCore(Core):
     # --- its life ---------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Poll the master for the first time; one that does not answer is polled again in the background.
-
-        Raises:
-            StartError: Another agent is connected to it.
-        """
+        """Poll the master for the first time; one that does not answer is polled again in the background."""
         self._loop = asyncio.get_running_loop()
         self._next_poll = self._loop.time()
         await self._poll()
-        if self._other_agent:
-            raise StartError(
-                f"core {self._uri}",
-                f"another agent ({self._other_agent}) joins this roscore's graph with the others already",
-                "end that one, or give this one a roscore of its own",
-            )
         await self._flush()
         self._task = self._loop.create_task(self._work(), name="external core")
         self._liveness.start()
@@ -130,7 +119,7 @@ class ExternalCore(Core):
     async def close(self) -> None:
         """Unregister all that the agent registered at the master, if it answers in ``limits.MASTER_FAREWELL``."""
         self._ending = True
-        if self._writable:
+        if not self._problem:
             for method, params in self._mirror.unregister_calls():
                 self.call(method, *params)
         self._wake.set()
@@ -160,13 +149,13 @@ class ExternalCore(Core):
         return self._node_address
 
     def notes(self) -> tuple[str, ...]:
-        """Whether the master does not answer, or another agent is connected to it."""
-        if self._other_agent:
-            where = f"another agent ({self._other_agent}) is at work at the roscore {self._uri}"
-            return (f"{where}: this one stands by until that one ends",)
+        """Whether the master does not answer, or another agent is at it too."""
         if self._problem:
             where = f"the roscore at {self._uri} does not answer ({self._problem})"
             return (f"{where}: what flows goes on, new nodes are not seen; start it again",)
+        if self._other_agent and self._loop.time() < self._other_until:
+            where = f"another agent (its node at {self._other_agent}) is at the roscore {self._uri} too"
+            return (f"{where}, and each undoes what the other registers: end one, or give it a roscore of its own",)
         return ()
 
     # --- asking it --------------------------------------------------------------------------------------------
@@ -182,7 +171,7 @@ class ExternalCore(Core):
             return reply
         if method not in _PARAM_WRITES:
             return RosReply(-1, f"{method} is for the master itself to answer: it has to be asked", 0)
-        if not self._writable:
+        if self._problem:
             return RosReply(0, self.notes()[0], 0)
         self._write(_Write(method, params))
         return RosReply(1, "will be written", 0)
@@ -195,8 +184,8 @@ class ExternalCore(Core):
             if reply.code != 1:
                 return reply
         if writes or method in _PARAM_WRITES:
-            if not self._writable:
-                raise UnreachableError("ROS master", self._uri, self._other_agent or self._problem)
+            if self._problem:
+                raise UnreachableError("ROS master", self._uri, self._problem)
             done: asyncio.Future[RosReply] = asyncio.get_running_loop().create_future()
             self._write(_Write(method, params, done))
             return await done
@@ -250,28 +239,24 @@ class ExternalCore(Core):
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
                 self._recheck_dead()
-            if not (self._writes and self._writable):
+            if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):
                         await self._wake.wait()
             self._wake.clear()
 
-    @property
-    def _writable(self) -> bool:
-        return not self._problem and not self._other_agent
-
     def _poll_soon(self) -> None:
-        if self._task is not None and self._writable:
+        if self._task is not None and not self._problem:
             self._next_poll = min(self._next_poll, self._loop.time() + limits.MASTER_LOOK_SOON)
             self._pace = limits.MASTER_LOOK_FIRST
             self._wake.set()
 
     def _write(self, write: _Write) -> None:
-        """Queue a call; drop it while the master does not answer, or another agent is connected to it.
+        """Queue a call; drop it while the master does not answer.
 
         The first poll afterwards finds the registrations that the master lacks.
         """
-        if not self._writable:
+        if self._problem:
             return
         self._queue(write)
         if len(self._writes) > limits.MASTER_WRITES_MAX:
@@ -292,15 +277,11 @@ class ExternalCore(Core):
         self._written.set()
 
     async def _flush(self) -> None:
-        while self._writes and self._writable:
+        while self._writes and not self._problem:
             batch = [self._writes.popleft() for _ in range(min(len(self._writes), limits.MASTER_WRITES_AT_ONCE))]
             self._seen = b""  # so that the next poll parses its answer even if the bytes are unchanged
             try:
-                if services := [one for one in batch if one.method == "registerService" and not one.from_poll]:
-                    taken = await self._taken(services)
-                    batch = [one for one in batch if one not in taken]
-                if batch:
-                    await self._send(batch)
+                await self._send(batch)
             except UnreachableError as error:
                 for write in batch:
                     write.fail(error)
@@ -310,26 +291,6 @@ class ExternalCore(Core):
                     write.fail(UnreachableError("ROS master", self._uri, "the call was given up"))
                 raise
         self._written.set()
-
-    async def _taken(self, services: list[_Write]) -> list[_Write]:
-        """Fail and return registrations of services that have another provider at the master.
-
-        No poll has shown that provider yet; the next poll is made at once.
-        """
-        try:
-            names = [str(one.params[1]) for one in services]
-            answers = await self._many(lookup_calls(self._own_node, (), names))
-        except (LocalProtocolError, RemoteProtocolError, RosFault):
-            return []  # sending the registrations shows what is wrong
-        found = []
-        for one, answer in zip(services, answers, strict=True):
-            match answer:
-                case [[1, _, str(uri)]] if uri != one.params[2]:
-                    found.append(one)
-                    one.fail(UnreachableError("room", str(one.params[1]), f"{uri} provides that service"))
-        if found:
-            self._next_poll = self._loop.time()
-        return found
 
     async def _send(self, batch: list[_Write]) -> None:
         """Send calls as one ``system.multicall``; if that fails as a whole, one by one."""
@@ -388,7 +349,7 @@ class ExternalCore(Core):
         took = self._loop.time() - begin
         # Reporting a large graph takes the master long; between polls it needs time for its own work.
         pause = min(max(self._pace, limits.MASTER_LOOK_SHARE * took), limits.MASTER_LOOK_MAX)
-        self._next_poll = self._loop.time() + (pause if self._writable else limits.MASTER_RETRY)
+        self._next_poll = self._loop.time() + (limits.MASTER_RETRY if self._problem else pause)
 
     async def _survey(self) -> bool:
         """Ask for the whole graph; return whether the answer differs from the last one."""
@@ -397,7 +358,7 @@ class ExternalCore(Core):
             calls = survey_calls(self._own_node, self._nodes, self._services)
             self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls]), every=1))
         body = await exchange(self._uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
-        if body == self._seen and self._writable:
+        if body == self._seen and not self._problem:
             return False
         answer = await read_response(body)
         survey = read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
@@ -406,7 +367,7 @@ class ExternalCore(Core):
         if self._ending:
             return True
         self._found()
-        await self._take(survey, seen)
+        self._take(survey, seen)
         return True
 
     async def _completed(self, survey: Survey) -> Survey:
@@ -422,45 +383,17 @@ class ExternalCore(Core):
             self._request, self._seen = b"", b""
         return survey
 
-    async def _take(self, survey: Survey, seen: int) -> None:
-        foreign = self._mirror.foreign_agents(survey, self._own_node, seen)
-        other = await self._find_other_agent(foreign) if foreign else ""
-        if other != self._other_agent:
-            self._other_agent_changed(other)
-        if foreign:
-            self._seen = b""
-        again = self._mirror.update(survey, seen, foreign)
+    def _take(self, survey: Survey, seen: int) -> None:
+        if other := self._mirror.taken(survey, self._own_node, seen):
+            if not self._other_agent:
+                _log.error("! another agent (its node at %s) is at the roscore %s too: end one", other, self._uri)
+            self._other_agent, self._other_until = other, self._loop.time() + limits.MASTER_OTHER_AGENT
+        again = self._mirror.update(survey, seen)
         self._report_changes()
-        if self._other_agent:
-            return
-        stale = [write for write, _ in stale_registrations(survey, foreign)]
-        if stale:
-            self.counters.add("master.leftovers", len(stale))
-            _log.warning(
-                "= %d registrations of an agent that was killed are taken away from %s", len(stale), self._uri
-            )
         if again:
             _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
-        for method, params in (*stale, *again):
-            self._queue(_Write(method, params, from_poll=True))
-
-    async def _find_other_agent(self, foreign: Mapping[str, str]) -> str:
-        """Describe another agent that is alive at this master, as a text for people; empty for none."""
-        for node in sorted(foreign, key=len):  # the agent's own node first: it has the shortest name
-            yield_to_data()
-            api = foreign[node]
-            if await refuses(api):
-                continue
-            try:
-                if await name_at(api) != node:
-                    continue  # its port is another program's now
-                reply = await call_api(api, "getPid", self._own_node, use=Use.CORE)
-            except UnreachableError:
-                return f"{node} at {api}, which does not answer"
-            except RmpaError:
-                return f"{node} at {api}"
-            return f"{node} at {api}, process {reply.value}"
-        return ""
+        for method, params in again:
+            self._queue(_Write(method, params))
 
     async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
         answers = await call(self._uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
@@ -486,14 +419,6 @@ class ExternalCore(Core):
             _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self._uri, problem)
         self._problem = problem
         self._drop_writes(error)
-
-    def _other_agent_changed(self, other: str) -> None:
-        self._other_agent = other
-        if other:
-            _log.error("! another agent is at work at the roscore %s (%s): standing by", self._uri, other)
-            self._drop_writes(UnreachableError("ROS master", self._uri, f"another agent is there: {other}"))
-        else:
-            _log.warning("= the other agent at the roscore %s is gone: this one goes on", self._uri)
 
     def _dead(self, node: str, api: str) -> None:
         self.counters.add("node.dead")

@@ -15,7 +15,7 @@ from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from rmpa.core.yielding import Yielder
     from rmpa.ros.master.survey import Survey
@@ -187,32 +187,26 @@ class Mirror:
         """Undo ``mark_dead``: the next survey shows the node again."""
         self._dead.pop(node, None)
 
-    def foreign_agents(self, survey: Survey, prefix: str, seen: int) -> dict[str, str]:
-        """Nodes with an agent's names that are not this agent's: of another agent, or left by one that was killed.
+    def taken(self, survey: Survey, node: str, seen: int) -> str:
+        """The slave API that a node of the agent has at the master, if another agent has registered it there.
 
         Args:
             survey: The survey.
-            prefix: The agent's own node; the names of its proxies are below it.
+            node: The node.
             seen: ``asked`` when the survey began.
         """
-        ours = {node: own.api for (_, _, node), own in self._own.items()}
-        fresh = {node for (_, _, node), asked in self._touched.items() if asked > seen}
-        return {
-            node: survey.uris[node]
-            for node in survey.nodes()
-            if (node == prefix or node.startswith(prefix + "/"))
-            and node not in fresh
-            and node in survey.uris
-            and survey.uris[node] != ours.get(node)
+        ours = {
+            own.api for entry, own in self._own.items() if entry[2] == node and self._touched.get(entry, 0) <= seen
         }
+        there = survey.uris.get(node, "")
+        return there if ours and there not in ours else ""
 
-    def update(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
+    def update(self, survey: Survey, seen: int) -> list[Call]:
         """Apply a survey to the copy.
 
         Args:
             survey: The survey, in which every node and service that still exists was looked up.
             seen: ``asked`` when the survey began.
-            ignored: Nodes that are left out.
 
         Returns:
             Calls that register what the master lacks of the agent's registrations, and unregister those of the
@@ -228,13 +222,13 @@ class Mirror:
         self._orphans = {node: api for node, api in self._orphans.items() if node not in listed}
         self._dead = {node: api for node, api in self._dead.items() if survey.uris.get(node) == api}
         ours = {node for _, _, node in self._own}
-        passed = {*ignored, *ours, *self._dead}
+        passed = {*ours, *self._dead}
         for kind, table in survey.holders.items():
             self._drop_gone(kind, table, ours, passed, survey)
         for kind, table in survey.holders.items():
             self._add_new(kind, table, passed, survey, seen)
         self._update_types(survey, passed)
-        again += self._missing(survey, seen, ignored)
+        again += self._missing(survey, seen)
         again += self._surplus(survey, seen)
         self._touched = {entry: asked for entry, asked in self._touched.items() if asked > seen}
         return again
@@ -307,10 +301,10 @@ class Mirror:
                 node, api = next(iter(nodes.items()))
                 self._known.register_subscriber(topic, type_name, node, api)
 
-    def _missing(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
+    def _missing(self, survey: Survey, seen: int) -> list[Call]:
         again = []
         for (kind, key, node), own in self._yielder(list(self._own.items())):
-            if kind is RegistrationKind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
+            if kind is RegistrationKind.PARAM or self._touched.get((kind, key, node), 0) > seen:
                 continue
             there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == own.api
             if not there or (kind is RegistrationKind.SERVICE and survey.services.get(key) != own.undo[1][2]):
@@ -321,33 +315,21 @@ class Mirror:
         """Calls that unregister what the master has of the agent's nodes and the agent does not have."""
         ours = {node: own.api for (_, _, node), own in self._own.items()}
         nodes = {node: api for node, api in ours.items() if survey.uris.get(node) == api}
-        again = []
-        for call, entry in stale_registrations(survey, nodes, self._yielder):
-            if entry not in self._own and self._touched.get(entry, 0) <= seen:
-                again.append(call)
+        again: list[Call] = []
+        for kind, table in survey.holders.items():
+            for key, holders in self._yielder(table.items()):
+                for node in holders:
+                    if (
+                        node not in nodes
+                        or (kind, key, node) in self._own
+                        or self._touched.get((kind, key, node), 0) > seen
+                    ):
+                        continue
+                    match kind:
+                        case RegistrationKind.PUBLISHER:
+                            again.append(("unregisterPublisher", (node, key, nodes[node])))
+                        case RegistrationKind.SUBSCRIBER:
+                            again.append(("unregisterSubscriber", (node, key, nodes[node])))
+                        case _:
+                            again.append(("unregisterService", (node, key, survey.services.get(key, ""))))
         return again
-
-
-def stale_registrations(
-    survey: Survey, nodes: Mapping[str, str], yielder: Yielder = iter
-) -> Iterator[tuple[Call, Entry]]:
-    """Yield all registrations that a master has of some nodes, each after the call that unregisters it.
-
-    Args:
-        survey: The survey.
-        nodes: The nodes and their slave APIs.
-        yielder: Iterates, and serves pending data in between, in large graphs.
-    """
-    for kind, table in survey.holders.items():
-        for key, holders in yielder(table.items()):
-            for node in holders:
-                if node not in nodes:
-                    continue
-                entry = kind, key, node
-                match kind:
-                    case RegistrationKind.PUBLISHER:
-                        yield ("unregisterPublisher", (node, key, nodes[node])), entry
-                    case RegistrationKind.SUBSCRIBER:
-                        yield ("unregisterSubscriber", (node, key, nodes[node])), entry
-                    case _:
-                        yield ("unregisterService", (node, key, survey.services.get(key, ""))), entry
