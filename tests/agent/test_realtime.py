@@ -16,7 +16,6 @@ from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.realtime import SchedulingRequest
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -144,20 +143,16 @@ async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
 
 
 async def test_the_snapshot_shows_what_was_granted(settings: Callable[[str], Settings], tmp_path: Path) -> None:
-    wishes = (
-        SchedulingRequest("SCHED_FIFO", True, "priority 50"),
-        SchedulingRequest(
-            "memory lock", False, "Operation not permitted", "put LimitMEMLOCK=infinity into the systemd unit"
-        ),
-    )
-    agent = Agent(settings("a"), wishes)
+    agent = Agent(settings("a"), ("SCHED_FIFO, priority 50", "no memory lock: Operation not permitted"))
     await agent.start()
     try:
         snapshot = await asyncio.to_thread(ask, tmp_path)
     finally:
         await agent.close()
-    assert snapshot.agent.realtime == ("SCHED_FIFO: priority 50", "no memory lock: Operation not permitted")
-    assert snapshot.notes == ("realtime: no memory lock; the agent's log says what would grant it",)
+    assert snapshot.agent.realtime == ("SCHED_FIFO, priority 50", "no memory lock: Operation not permitted")
+    assert snapshot.notes == (
+        "realtime: no memory lock: Operation not permitted; the agent's log says what would grant it",
+    )
 
 
 def ask(runtime_dir: Path) -> Snapshot:

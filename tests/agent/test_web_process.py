@@ -87,17 +87,6 @@ async def test_a_program_that_is_not_there_costs_the_agent_nothing(caplog: pytes
     await web.close()
 
 
-async def test_the_child_may_use_the_cpus_that_the_agent_keeps_for_itself_no_longer() -> None:
-    cpu = min(os.sched_getaffinity(0))
-    web = WebProcess([sys.executable, "-c", "import sys; sys.stdin.read()"], lambda: 1.0, cpus={cpu})
-    web.start()
-    await until(lambda: web.pid)
-    pid = web.pid
-    assert pid is not None
-    await until(lambda: os.sched_getaffinity(pid) == {cpu})
-    await web.close()
-
-
 def test_its_command_and_environment_have_what_the_agent_was_told(tmp_path: Path) -> None:
     settings = Settings(
         name="base",

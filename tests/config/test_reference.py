@@ -99,7 +99,7 @@ def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
         "name = 'robot-1'",
         "[log]\nlevel = 'wran'",
         "[bridge]\nallow = '/a'",
-        "[realtime]\ncpus = [1, 1]",
+        "[bridge]\nallow = ['/a', '/a']",
         "[discovery]\nmulticast = 5",
         "[[contract]]\ntopics = ['/a']\ndept = 1",
         "[[contract]]\ntopics = []",

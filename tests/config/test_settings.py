@@ -146,9 +146,7 @@ bulk_priority = 1
 [realtime]
 enabled = true
 priority = 80
-cpus = [1, 3]
 lock_memory = false
-keep_awake = true
 [log]
 level = "debug"
 json = true
@@ -167,7 +165,7 @@ json = true
         contracts=(ContractRule(("/cmd/**",), (), {"depth": 1}),),
         limits=LimitSettings(7, 8, 9, 10),
         lanes=LaneSettings(46, 5, 8, 1),
-        realtime=RealtimeSettings(True, 80, (1, 3), False, True),
+        realtime=RealtimeSettings(True, 80, False),
         log_level="debug",
         log_json=True,
         config_file=settings.config_file,
@@ -289,9 +287,7 @@ def test_every_variable(load: Load) -> None:
         "RMPA_BULK_PRIORITY": "1",
         "RMPA_REALTIME": "1",
         "RMPA_REALTIME_PRIORITY": "80",
-        "RMPA_REALTIME_CPUS": "1, 3",
         "RMPA_REALTIME_LOCK_MEMORY": "no",
-        "RMPA_REALTIME_KEEP_AWAKE": "yes",
         "RMPA_LOG_LEVEL": "WARNING",
         "RMPA_LOG_JSON": "yes",
         "RMPA_RUNTIME_DIR": "/run/x",
@@ -313,7 +309,7 @@ def test_every_variable(load: Load) -> None:
         multicast=Multicast(True, "239.0.0.1"),
         policy=PolicySettings(("/a", "/b/**"), ("/c",), ("std_msgs/*",), ("std_msgs/Header",)),
         lanes=LaneSettings(46, 5, 8, 1),
-        realtime=RealtimeSettings(True, 80, (1, 3), False, True),
+        realtime=RealtimeSettings(True, 80, False),
         log_level="warning",
         log_json=True,
         runtime_dir="/run/x",
@@ -438,11 +434,7 @@ def test_what_is_ignored_is_noted(load: Load, environ: dict[str, str], note: str
             "[realtime]\npriority = 0",
             "rmpa.toml:2: realtime.priority: 0 is out of range; a priority of SCHED_FIFO is be",
         ),
-        (
-            "[realtime]\ncpus = [0,\n-1]",
-            "rmpa.toml:3: realtime.cpus: -1 is out of range; the number of a CPU is betwee",
-        ),
-        ("[realtime]\ncpus = [1, 1]", "rmpa.toml:2: realtime.cpus: 1 stands there twice; delete one of them"),
+        ('[bridge]\nallow = ["/a", "/a"]', "rmpa.toml:2: bridge.allow: '/a' stands there twice; delete one of them"),
         ("[realtime]\nenable = true", "rmpa.toml:2: realtime.enable: an unknown key; did you mean realtime.enabled"),
         ('[bridge]\nallow = "/a"', "rmpa.toml:2: bridge.allow: '/a' is not a list; did you mean [\"/a\"]?"),
         ("name = robot", 'rmpa.toml:1: the file: not TOML: Invalid value; texts need quotes: "robot"'),

@@ -50,14 +50,13 @@ from rmpa.trust.page_names import host_names, page_hosts
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
     from rmpa.core.identity import Identity
     from rmpa.observe.io.control_server import Handler
     from rmpa.ros.core.api import Core
-    from rmpa.runtime import realtime
 
 _log = logging.getLogger(__name__)
 
@@ -72,14 +71,14 @@ class Agent:
 
     Args:
         settings: Complete: the name is filled in.
-        requests: The outcome of each request of ``--realtime``.
+        realtime: The outcomes of ``--realtime``, ready to read.
         load: Reads the settings again, as they were read for this agent; it may block.
     """
 
     def __init__(
         self,
         settings: Settings,
-        requests: tuple[realtime.SchedulingRequest, ...] = (),
+        realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
     ) -> None:
         self._settings = settings
@@ -158,7 +157,7 @@ class Agent:
             counters=(counters,),
             notes=self._notes,
             started=time.time(),
-            requests=requests,
+            realtime=realtime,
             trust=self.trust.status if self.trust is not None else lambda: None,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
@@ -274,13 +273,12 @@ class Agent:
 
 async def _serve(
     settings: Settings,
-    requests: tuple[realtime.SchedulingRequest, ...],
+    realtime: tuple[str, ...],
     load: Callable[[], Loaded] | None = None,
-    cpus: Collection[int] = (),
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    agent = Agent(settings, requests, load)
-    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ), cpus=cpus)
+    agent = Agent(settings, realtime, load)
+    web = WebProcess(web_command(settings), random.random, environ=web_environment(settings, os.environ))
     agent.reloaded = web.reload
 
     async def start() -> None:
@@ -309,4 +307,4 @@ def run(
     Raises:
         StartError: The agent cannot start on this machine with these settings.
     """
-    return run_process(settings, lambda requests, cpus: _serve(settings, requests, load, cpus, started))
+    return run_process(settings, lambda realtime: _serve(settings, realtime, load, started))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import signal
 import sys
 from typing import TYPE_CHECKING
@@ -19,7 +18,7 @@ from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.service_manager import notify_service_manager
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Coroutine
+    from collections.abc import Awaitable, Callable, Coroutine
 
     from rmpa.agent.reload import Reloader
     from rmpa.config.settings import Settings
@@ -69,25 +68,24 @@ async def serve(
 
 def run_process(
     settings: Settings,
-    main: Callable[[tuple[realtime.SchedulingRequest, ...], Collection[int]], Coroutine[None, None, None]],
+    main: Callable[[tuple[str, ...]], Coroutine[None, None, None]],
 ) -> int:
     """Run the event loop of a process with an agent; return the exit code.
 
     Args:
         settings: The agent's settings.
-        main: ``(requests, cpus)``: the outcome of each request of ``--realtime``, and the CPUs that the process had
-            before.
+        main: Gets the outcomes of ``--realtime``.
 
     Raises:
         StartError: The agent cannot start on this machine with these settings.
     """
     raise_file_limit()
     sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
-    cpus = os.sched_getaffinity(0)  # before the agent takes some for itself
-    requests = realtime.apply(settings.realtime)
+    wanted = settings.realtime
+    outcomes = realtime.apply(wanted.priority, lock_memory=wanted.lock_memory) if wanted.enabled else ()
     try:
         with asyncio.Runner(loop_factory=AgentLoop) as runner:
-            runner.run(main(requests, cpus))
+            runner.run(main(outcomes))
     except OSError as error:
         if is_shortage(error):
             raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error

@@ -18,7 +18,7 @@ from rmpa.agent import limits
 from rmpa.core.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from rmpa.config.settings import Settings
 
@@ -52,7 +52,6 @@ class WebProcess:
         command: Its command line.
         rng: Uniform numbers in [0, 1), for the delays.
         environ: Its environment; ``None``: the agent's.
-        cpus: The CPUs that it may run on; empty: the agent's. An agent with CPUs of its own keeps them for itself.
     """
 
     def __init__(
@@ -61,11 +60,9 @@ class WebProcess:
         rng: Callable[[], float],
         *,
         environ: Mapping[str, str] | None = None,
-        cpus: Collection[int] = (),
     ) -> None:
         self._command = command
         self._environ = environ
-        self._cpus = cpus
         self._backoff = Backoff(limits.WEB_RESTART_FIRST, limits.WEB_RESTART_CAP, rng)
         self._task: asyncio.Task[None] | None = None
         self.pid: int | None = None
@@ -111,9 +108,6 @@ class WebProcess:
         process = await asyncio.to_thread(self._spawn)
         try:
             self.pid = process.pid
-            if self._cpus:
-                with contextlib.suppress(OSError):  # it has ended already, or a container forbids it
-                    os.sched_setaffinity(process.pid, self._cpus)
             await _ended(process.pid)
         except asyncio.CancelledError:
             await self._end(process)

@@ -50,8 +50,6 @@ WEB_TOKENS_MAX: Final = 64
 """Tables ``[[web_token]]``: each request is compared with the token of each."""
 BOUND_MAX: Final = 1_000_000
 """Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
-CPU_MAX: Final = 1023
-"""Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
 
 # --- discovery --------------------------------------------------------------------------------------------------
 MULTICAST_GROUP: Final = "239.255.82.77"

@@ -191,6 +191,14 @@ REMOVED: Final = {
     "--fresh": "write --keep never",
     "--known": "rosbag record /SONAR/descriptor keeps what a resource was",
     **dict.fromkeys(
+        ("realtime.cpus", "RMPA_REALTIME_CPUS"),
+        "write CPUAffinity= into the systemd unit, or start it by `taskset -c`",
+    ),
+    **dict.fromkeys(
+        ("realtime.keep_awake", "RMPA_REALTIME_KEEP_AWAKE"),
+        "keep the CPUs awake by the system: tuned's profile latency-performance, or processor.max_cstate=1",
+    ),
+    **dict.fromkeys(
         (
             "gateway.ros1_bridge",
             "gateway.ros1_bridge_namespace",

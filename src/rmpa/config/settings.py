@@ -31,7 +31,6 @@ from rmpa.config.values import (
     COMMAND_AGE,
     CORE_KEEP,
     CORE_MODE,
-    CPU,
     DOMAIN,
     DSCP,
     FIFO_PRIORITY,
@@ -216,7 +215,7 @@ class RealtimeSettings:
     enabled: bool = setting(
         False,
         BOOL,
-        "Ask for SCHED_FIFO, locked memory and the CPUs of [realtime] in rmpa.toml.",
+        "Ask for SCHED_FIFO and locked memory.",
         env="RMPA_REALTIME",
         option="--realtime/--no-realtime",
     )
@@ -226,15 +225,8 @@ class RealtimeSettings:
         "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
         env="RMPA_REALTIME_PRIORITY",
     )
-    cpus: tuple[int, ...] = setting((), list_of(CPU), "The CPUs to run on; empty: any.", env="RMPA_REALTIME_CPUS")
     lock_memory: bool = setting(
         True, BOOL, "Keep the agent's memory in RAM (mlockall).", env="RMPA_REALTIME_LOCK_MEMORY"
-    )
-    keep_awake: bool = setting(
-        False,
-        BOOL,
-        "Keep the CPUs from idle states that they leave late; it costs power.",
-        env="RMPA_REALTIME_KEEP_AWAKE",
     )
 
 

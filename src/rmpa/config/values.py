@@ -226,7 +226,6 @@ PORT_OR_ANY: Final = whole_number(0, 65535, "a port (0: any)", "PORT")
 DSCP: Final = whole_number(0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
 PACKET_PRIORITY: Final = whole_number(0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
 FIFO_PRIORITY: Final = whole_number(1, 99, "a priority of SCHED_FIFO")
-CPU: Final = whole_number(0, limits.CPU_MAX, "the number of a CPU")
 BOUND: Final = whole_number(1, limits.BOUND_MAX, "a limit")
 
 # --- addresses ------------------------------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.config.sources import Loaded
     from rmpa.gateway.neighbour import Neighbour
     from rmpa.gateway.zenoh_api import OwnedSession
-    from rmpa.runtime.realtime import SchedulingRequest
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ class Gateway:
 
     Args:
         settings: Complete: the name is filled in.
-        requests: The outcome of each request of ``--realtime``.
+        realtime: The outcomes of ``--realtime``, ready to read.
         load: Reads the settings again; it may block.
         open_session: Opens the session; raises ``StartError``.
         make_neighbours: ``(graph, session, settings)``: makes the neighbours by their names; they are not started.
@@ -44,7 +43,7 @@ class Gateway:
     def __init__(
         self,
         settings: Settings,
-        requests: tuple[SchedulingRequest, ...] = (),
+        realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
         *,
         open_session: Callable[[Settings], Awaitable[OwnedSession]],
@@ -53,7 +52,7 @@ class Gateway:
         self._settings = replace(settings, relay=True)
         self._open_session = open_session
         self._make_neighbours = make_neighbours
-        self.agent = Agent(self._settings, requests, load)
+        self.agent = Agent(self._settings, realtime, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
         self.agent.add_operations({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
@@ -252,11 +251,11 @@ async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
 
 async def _main(
     settings: Settings,
-    requests: tuple[SchedulingRequest, ...],
+    realtime: tuple[str, ...],
     load: Callable[[], Loaded] | None,
     check: Callable[[], None],
 ) -> None:
-    gateway = Gateway(settings, requests, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
+    gateway = Gateway(settings, realtime, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
     await serve(gateway.start, gateway.close, gateway.agent.reloader, lambda: _keep_checking(check))
 
 
@@ -289,4 +288,4 @@ def run(
     Raises:
         StartError: The gateway cannot start on this machine with these settings, or ``check`` has ended it.
     """
-    return run_process(settings, lambda requests, _: _main(settings, requests, load, check))
+    return run_process(settings, lambda realtime: _main(settings, realtime, load, check))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.core.sizes import KIB
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
+from rmpa.runtime.realtime import REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -108,13 +109,9 @@ def judge_rights(rights: KernelRights) -> list[Check]:
     if not missing:
         found = [Check("realtime", OK, "SCHED_FIFO and locked memory are allowed")]
     else:
-        remedy = (
-            "systemd: LimitRTPRIO=50, LimitMEMLOCK=infinity; a log-in: 'USER - rtprio 50' and 'USER - memlock "
-            "unlimited' in /etc/security/limits.d/rmpa.conf (docs/realtime.md)"
-        )
         level = WARN if rights.wanted else OK
         asked = "" if rights.wanted else "; not asked for (rmpa up --realtime)"
-        found = [Check("realtime", level, "; ".join(missing) + asked, remedy if rights.wanted else "")]
+        found = [Check("realtime", level, "; ".join(missing) + asked, REMEDY if rights.wanted else "")]
     if rights.files is None:
         return found
     if rights.files < limits.DOCTOR_FILES_LOW:

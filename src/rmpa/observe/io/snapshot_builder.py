@@ -23,7 +23,6 @@ from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.realtime import refused
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
-    from rmpa.runtime.realtime import SchedulingRequest
     from rmpa.trust.status import TrustStatus
 
 
@@ -55,7 +53,7 @@ class SnapshotSources:
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
         started: When the agent started, seconds since the epoch.
-        requests: The outcome of each request of ``--realtime``.
+        realtime: The outcomes of ``--realtime``, ready to read; those that were refused begin with ``no``.
         trust: The state of trust; ``None``: it is off.
     """
 
@@ -68,7 +66,7 @@ class SnapshotSources:
     counters: tuple[Counters, ...]
     notes: Callable[[], Iterable[str]]
     started: float
-    requests: tuple[SchedulingRequest, ...] = ()
+    realtime: tuple[str, ...] = ()
     trust: Callable[[], TrustStatus | None] = lambda: None
 
 
@@ -184,8 +182,9 @@ class SnapshotBuilder:
             notes.append(DESCRIPTORS.shortage.problem)
         notes += self._sources.notes()
         notes += own_bounds(self._sources.bridge, self._sources.services)
-        missing = refused(self._sources.requests)
-        return (*notes, missing) if missing else tuple(notes)
+        refused = (outcome for outcome in self._sources.realtime if outcome.startswith("no "))
+        notes += (f"realtime: {outcome}; the agent's log says what would grant it" for outcome in refused)
+        return tuple(notes)
 
     def _agent(self, endpoint: EndpointView | None) -> AgentInfo:
         identity = endpoint.identity if endpoint is not None else None
@@ -207,7 +206,7 @@ class SnapshotBuilder:
             interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
             links=str(endpoint.mode) if endpoint is not None else "",
             config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
-            realtime=tuple(map(str, self._sources.requests)),
+            realtime=self._sources.realtime,
             files=_files(),
             proxies=proxies,
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
