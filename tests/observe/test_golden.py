@@ -92,7 +92,7 @@ def findings() -> Iterator[Check]:
         "base": msgspec.structs.replace(SNAPSHOT, unreachable=(cam, gone)),
         "stopped": "no agent answers in time",
         "few": with_files(near=True),
-        "none": with_files(near=True, problem="node /x has to wait: none left; raise it"),
+        "none": with_files(near=True, problem="node /x is refused: none left; raise it"),
         "alone": with_peers(),
         "stuck": with_stuck(),
         "refused": with_peers(msgspec.structs.replace(PC, state="refused", conflicts=("no remedy",), last_error="")),
@@ -228,7 +228,7 @@ def snapshots() -> Iterator[Snapshot]:
         )
     lost = msgspec.structs.replace(JOYSTICK, state="linking", link=None, last_error="silent")
     yield with_peers(lost, msgspec.structs.replace(PC, state="refused"))
-    yield with_files(near=True, problem="node /x has to wait")
+    yield with_files(near=True, problem="node /x is refused")
     yield with_peers()
 
 

@@ -1,17 +1,16 @@
-"""Accepting connections while descriptors last, and waiting without noise when they do not."""
+"""Accepting connections while descriptors last, and refusing them without noise when they do not."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import errno
-import logging
 import socket
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.runtime import limits
+from rmpa.runtime import acceptor, limits
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import Descriptors, Use
 from tests.runtime.descriptors_left import descriptors_left
@@ -38,7 +37,7 @@ class Listening(socket.socket):
 class Server:
     """An acceptor with its socket and what it accepted."""
 
-    def __init__(self, descriptors: Descriptors, use: Use = Use.DATA, at_once: int = limits.ACCEPTS) -> None:
+    def __init__(self, use: Use = Use.DATA, at_once: int = limits.ACCEPTS) -> None:
         self.sock = Listening()
         self.sock.bind(("127.0.0.1", 0))
         self.sock.listen(64)
@@ -47,9 +46,7 @@ class Server:
         self.rounds: list[int] = []
         self._clients: list[socket.socket] = []
         self.came = asyncio.Event()
-        self.acceptor = Acceptor(
-            self.sock, self._take, name="the test's server", use=use, at_once=at_once, descriptors=descriptors
-        )
+        self.acceptor = Acceptor(self.sock, self._take, name="the test's server", use=use, at_once=at_once)
 
     def _take(self, sock: socket.socket, _address: tuple[str, int]) -> None:
         self.accepted.append(sock)
@@ -71,14 +68,16 @@ class Server:
             sock.close()
 
 
-@pytest.fixture
-def descriptors() -> Descriptors:
-    return Descriptors()
+@pytest.fixture(autouse=True)
+def descriptors(monkeypatch: pytest.MonkeyPatch) -> Descriptors:
+    made = Descriptors()
+    monkeypatch.setattr(acceptor, "DESCRIPTORS", made)
+    return made
 
 
 @contextlib.contextmanager
-def serving(descriptors: Descriptors, use: Use = Use.DATA, **options: int) -> Iterator[Server]:
-    server = Server(descriptors, use, **options)
+def serving(use: Use = Use.DATA, **options: int) -> Iterator[Server]:
+    server = Server(use, **options)
     try:
         yield server
     finally:
@@ -98,7 +97,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def test_it_hands_over_what_it_accepts_non_blocking(descriptors: Descriptors) -> None:
-    with serving(descriptors) as server:
+    with serving() as server:
         server.acceptor.start()
         server.dial(3)
         await server.until(3)
@@ -106,8 +105,8 @@ async def test_it_hands_over_what_it_accepts_non_blocking(descriptors: Descripto
         assert descriptors.counters.as_dict() == {}
 
 
-async def test_many_connections_are_accepted_a_few_at_a_time(descriptors: Descriptors) -> None:
-    with serving(descriptors, at_once=4) as server:
+async def test_many_connections_are_accepted_a_few_at_a_time() -> None:
+    with serving(at_once=4) as server:
         server.dial(10)
         server.acceptor._acceptable()
         assert len(server.accepted) == 4
@@ -115,55 +114,45 @@ async def test_many_connections_are_accepted_a_few_at_a_time(descriptors: Descri
         await server.until(10)
 
 
-async def test_without_descriptors_it_waits_and_says_so_once(
-    descriptors: Descriptors, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+async def test_data_leaves_the_last_descriptors_and_the_rest_is_closed_and_told_once(
+    descriptors: Descriptors, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The old servers tried again in each round of the loop: 119 MB of log in 75 s."""
-    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
-    monkeypatch.setattr(limits, "DESCRIPTORS_QUIET", 0.05)
-    with (
-        caplog.at_level(logging.INFO),
-        serving(descriptors) as one,
-        serving(descriptors) as other,
-        serving(descriptors, Use.LINK) as link,
-    ):
-        for server in (one, other, link):
-            server.dial(5)
-        with descriptors_left(0):
-            for server in (one, other, link):
-                server.acceptor.start()
-            await rounds(50)
-            assert all(server.acceptor.paused for server in (one, other, link))
-            await until(lambda: descriptors.counters["descriptors.refused.data"] >= 20)
-            assert one.sock.attempts + other.sock.attempts + link.sock.attempts == 0
-            assert not one.accepted
-            assert descriptors.short
-        for server in (one, other, link):
-            await server.until(5)
-        await until(lambda: not descriptors.short)
+    with serving() as data, serving(Use.CORE) as core, serving(Use.LINK) as link:
+        for server in (data, core, link):
+            server.dial(40)  # of the 80 that are left data gets 16, the core 32, the links 32
+        with descriptors_left(80):
+            reserve = descriptors.reserve
+            assert reserve == 64
+            data.acceptor.start()
+            await until(lambda: len(data.accepted) + descriptors.counters["descriptors.refused.data"] == 40)
+            assert len(data.accepted) == 80 - reserve
+            core.acceptor.start()
+            await until(lambda: len(core.accepted) + descriptors.counters["descriptors.refused.core"] == 40)
+            assert len(core.accepted) == reserve // 2
+            link.acceptor.start()
+            await until(lambda: link.acceptor.paused)
+            assert len(link.accepted) == 32
+            data._clients[-1].settimeout(10)
+            assert data._clients[-1].recv(1) == b""
+            assert "LimitNOFILE=" in descriptors.problem
+        await link.until(40)
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == 3  # for data, for the links, and that it is over
-    assert "the test's server has to wait: no file descriptors left" in lines[0]
-    assert "LimitNOFILE=" in lines[0]
+    assert len(lines) == 3  # for data, the core, the links
+    assert "a connection to the test's server is refused: no file descriptors left" in lines[0]
     assert "ulimit -n" in lines[0]
-    assert "free again" in lines[2]
 
 
-async def test_a_pause_is_one_look(descriptors: Descriptors, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_is_refused_is_told_for_a_while(descriptors: Descriptors, monkeypatch: pytest.MonkeyPatch) -> None:
+    descriptors.refuse(Use.DATA, "a connection")
+    assert descriptors.problem
+    monkeypatch.setattr(limits, "DESCRIPTORS_TOLD", 0.0)
+    assert not descriptors.problem
+
+
+async def test_an_error_is_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
     """A socket that stays readable must not be looked at in each round of the loop."""
     monkeypatch.setattr(limits, "ACCEPT_PAUSE", 3600.0)
-    with serving(descriptors) as server:
-        server.dial(5)
-        with descriptors_left(0):
-            server.acceptor.start()
-            await until(lambda: server.acceptor.paused)
-            await rounds(200)
-            assert descriptors.counters["descriptors.refused.data"] == 1
-
-
-async def test_an_error_is_one_look_too(descriptors: Descriptors, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 3600.0)
-    with serving(descriptors) as server:
+    with serving() as server:
         server.sock.failures = (errno.ENFILE,) * 500
         server.dial()
         server.acceptor.start()
@@ -172,66 +161,12 @@ async def test_an_error_is_one_look_too(descriptors: Descriptors, monkeypatch: p
         assert server.sock.attempts == 1
 
 
-async def test_the_last_descriptors_are_for_the_core_and_the_links(descriptors: Descriptors) -> None:
-    with (
-        serving(descriptors) as data,
-        serving(descriptors, Use.CORE) as core,
-        serving(descriptors, Use.LINK) as link,
-    ):
-        for server in (data, core, link):
-            server.dial(40)  # of the 80 that are left data gets 16, the core 32, the links 32
-        with descriptors_left(80):
-            reserve = descriptors.reserve
-            assert reserve == 64
-            for server, left in ((data, reserve), (core, reserve // 2), (link, 0)):
-                server.acceptor.start()
-                await until(lambda server=server: server.acceptor.paused)  # type: ignore[misc]
-                assert 80 - sum(len(each.accepted) for each in (data, core, link)) == left
-
-
-async def test_the_last_connection_that_fits_is_no_shortage(descriptors: Descriptors) -> None:
-    """Without a free descriptor accept(2) says EMFILE even when no connection waits."""
-    with serving(descriptors, Use.LINK) as server:
-        server.dial(3)
-        with descriptors_left(3):
-            server.acceptor.start()
-            await server.until(3)
-            await rounds(10)
-            assert not server.acceptor.paused
-        assert not descriptors.short
-
-
-async def test_an_idle_connection_is_closed_for_one_that_waits(descriptors: Descriptors) -> None:
-    with serving(descriptors, Use.LINK) as server:
-        server.dial(4)
-        idle: list[socket.socket] = []
-
-        def close_one() -> bool:
-            if idle:
-                idle.pop().close()
-                return True
-            return False
-
-        idle += [socket.socket() for _ in range(2)]
-        descriptors.offer(server, close_one)
-        with descriptors_left(1):
-            server.acceptor.start()
-            await server.until(3)
-            await until(lambda: server.acceptor.paused)
-        assert len(server.accepted) == 3
-        assert not idle
-        assert descriptors.counters["descriptors.idle_closed"] == 2
-        descriptors.offer(server, None)
-        assert not descriptors.make_room()
-        await server.until(4)
-
-
 @pytest.mark.parametrize("number", [errno.ENFILE, errno.ENOBUFS, errno.ENOMEM])
 async def test_a_system_without_room_is_told(
-    number: int, descriptors: Descriptors, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    number: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
-    with serving(descriptors) as server:
+    with serving() as server:
         server.sock.failures = (number,) * 3
         server.dial()
         server.acceptor.start()
@@ -241,10 +176,8 @@ async def test_a_system_without_room_is_told(
     assert "the system has no room" in caplog.text
 
 
-async def test_a_connection_that_left_is_passed_over(
-    descriptors: Descriptors, caplog: pytest.LogCaptureFixture
-) -> None:
-    with serving(descriptors) as server:
+async def test_a_connection_that_left_is_passed_over(caplog: pytest.LogCaptureFixture) -> None:
+    with serving() as server:
         server.sock.failures = (errno.ECONNABORTED, errno.EPROTO)
         server.dial()
         server.acceptor.start()
@@ -253,10 +186,10 @@ async def test_a_connection_that_left_is_passed_over(
 
 
 async def test_an_error_that_stays_does_not_spin(
-    descriptors: Descriptors, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
-    with serving(descriptors) as server:
+    with serving() as server:
         server.sock.failures = (errno.EPERM,) * 4
         server.dial()
         server.acceptor.start()
@@ -266,7 +199,7 @@ async def test_an_error_that_stays_does_not_spin(
     assert "cannot accept connections" in caplog.text
 
 
-async def test_what_cannot_be_taken_is_closed(descriptors: Descriptors) -> None:
+async def test_what_cannot_be_taken_is_closed() -> None:
     def refuse(_sock: socket.socket, _address: object) -> None:
         raise RuntimeError("not today")
 
@@ -274,15 +207,15 @@ async def test_what_cannot_be_taken_is_closed(descriptors: Descriptors) -> None:
         socket.create_server(("127.0.0.1", 0)) as listening,
         socket.create_connection(listening.getsockname()) as end,
     ):
-        acceptor = Acceptor(listening, refuse, name="the test's server", descriptors=descriptors)
+        acceptor = Acceptor(listening, refuse, name="the test's server")
         with pytest.raises(RuntimeError):
             acceptor._acceptable()
         end.settimeout(10)
         assert end.recv(1) == b""
 
 
-async def test_closing_ends_a_pause_too(descriptors: Descriptors) -> None:
-    server = Server(descriptors)
+async def test_closing_ends_a_pause_too() -> None:
+    server = Server(Use.LINK)
     server.dial()
     with descriptors_left(0):
         server.acceptor.start()
@@ -310,5 +243,4 @@ async def test_a_socket_of_ours_leaves_the_reserve_alone(descriptors: Descriptor
     assert descriptors.counters.as_dict() == {
         "descriptors.refused.data": 1,
         "descriptors.refused.link": 1,
-        "descriptors.shortages": 1,
     }

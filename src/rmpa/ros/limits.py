@@ -133,8 +133,6 @@ HTTP_CONNECTIONS_MAX: Final = 512
 the one to close for a new one."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
 """Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves."""
-HTTP_IDLE_MIN: Final = 0.25
-"""Idle time before a kept-alive connection may be closed for one that waits for a file descriptor."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
 """Time from a request's first byte to its last."""
 XMLRPC_DEPTH_MAX: Final = 256

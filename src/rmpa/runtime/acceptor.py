@@ -1,7 +1,7 @@
 """Accepts the connections of a listening socket, for every server of this process.
 
-A listening socket stays readable as long as a connection waits. Without a free file descriptor the loop would call
-the server again and again. An ``Acceptor`` stops watching the socket instead, and tries again after a pause.
+A connection for which no file descriptor is left is closed at once. Where accept(2) itself fails, the listening
+socket stays readable, and the loop would call the server again and again: an ``Acceptor`` pauses then.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import asyncio
 import errno
 import logging
 import os
-import select
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.counters import RefusalLog
 from rmpa.runtime import limits
-from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Descriptors, Use
+from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
 
 if TYPE_CHECKING:
     import socket
@@ -40,16 +39,18 @@ _GONE: Final = frozenset(
 
 
 class Acceptor:
-    """Hands each connection of ``sock`` to ``on_accept``, a few at a time, while there are descriptors for them.
+    """Hands each connection of ``sock`` to ``on_accept``, a few at a time.
 
     Args:
         sock: Bound and listening; closed by ``close()``.
         on_accept: ``(connection, address)``, called from the loop. The connection is non-blocking and belongs to the
             callee, unless the call raises.
         name: The server, for log messages: ``XML-RPC of /talker``.
-        use: The purpose of the connections, which decides whether they may take the last descriptors.
+        use: The purpose of the connections, which decides whether they may take the last descriptors; else they are
+            closed.
         at_once: Connections that are accepted in one callback of the loop.
-        descriptors: The file descriptors of this process.
+        make_room: Closes another connection where no descriptor is left for a new one, whose turn comes in the loop's
+            next iteration; returns whether there was one.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Acceptor:
         name: str,
         use: Use = Use.DATA,
         at_once: int = limits.ACCEPTS,
-        descriptors: Descriptors = DESCRIPTORS,
+        make_room: Callable[[], bool] | None = None,
     ) -> None:
         sock.setblocking(False)
         self._sock = sock
@@ -68,8 +69,8 @@ class Acceptor:
         self._name = name
         self._use = use
         self._at_once = at_once
-        self._descriptors = descriptors
-        self._refusals = RefusalLog(_log, descriptors.counters)
+        self._make_room = make_room
+        self._refusals = RefusalLog(_log, DESCRIPTORS.counters)
         self._listening = False
         self._closed = False
         self._timer: asyncio.TimerHandle | None = None
@@ -81,7 +82,7 @@ class Acceptor:
 
     @property
     def paused(self) -> bool:
-        """Whether accepting is paused: a connection waits for a descriptor, or ``pause`` was called."""
+        """Whether accepting is paused."""
         return self._timer is not None
 
     def start(self) -> None:
@@ -95,7 +96,7 @@ class Acceptor:
         """Leave connections to the kernel, which refuses those that its queue does not hold, for so long."""
         if not self._closed and self._timer is None:
             self._stop()
-            self._timer = asyncio.get_running_loop().call_later(seconds, self._again)
+            self._timer = asyncio.get_running_loop().call_later(seconds, self.start)
 
     def close(self) -> None:
         """Stop accepting, and close the listening socket; may be called twice."""
@@ -115,8 +116,7 @@ class Acceptor:
         for _ in range(self._at_once):
             if self._closed or self._timer is not None:
                 return  # ``on_accept`` closed or paused this acceptor
-            if not self._has_room():
-                self._wait_for_room(None)
+            if self._make_room is not None and not self._has_room() and self._make_room():
                 return
             try:
                 sock, address = self._sock.accept()
@@ -127,6 +127,8 @@ class Acceptor:
                     continue
                 self._failed(error)
                 return
+            if not DESCRIPTORS.keeps(self._use, sock, f"a connection to {self._name}"):
+                continue
             try:
                 sock.setblocking(False)
                 self._on_accept(sock, address)
@@ -141,40 +143,13 @@ class Acceptor:
         except OSError:
             return False
         os.close(lowest)
-        return self._descriptors.has_room(self._use, lowest)
-
-    def _has_connection(self) -> bool:
-        """Whether a connection waits; without a free descriptor accept(2) fails in either case."""
-        look = select.poll()
-        look.register(self._sock.fileno(), select.POLLIN)
-        return bool(look.poll(0))
+        return DESCRIPTORS.has_room(self._use, lowest)
 
     def _failed(self, error: OSError) -> None:
         if error.errno in OUT_OF_DESCRIPTORS:
-            self._wait_for_room(error)
-            return
-        now = asyncio.get_running_loop().time()
-        text = f"{self._name} cannot accept connections: {error.strerror}; next attempt in {limits.ACCEPT_PAUSE:g} s"
-        self._refusals.refuse(now, "accept.failed", self._name, text)
-        self._pause()
-
-    def _wait_for_room(self, error: OSError | None) -> None:
-        if not self._has_connection():
-            return
-        full = error is None or error.errno == errno.EMFILE
-        if full and self._descriptors.make_room():
-            return  # the loop calls again in its next iteration
-        self._descriptors.refuse(self._use, self._name, error)
-        self._pause()
-
-    def _pause(self) -> None:
-        self._stop()
-        self._timer = asyncio.get_running_loop().call_later(limits.ACCEPT_PAUSE, self._again)
-
-    def _again(self) -> None:
-        self._timer = None
-        if self._has_connection() and not self._has_room() and not self._descriptors.make_room():
-            self._descriptors.refuse(self._use, self._name)
-            self._timer = asyncio.get_running_loop().call_later(limits.ACCEPT_PAUSE, self._again)
+            DESCRIPTORS.refuse(self._use, f"a connection to {self._name}", error)
         else:
-            self.start()
+            now, pause = asyncio.get_running_loop().time(), limits.ACCEPT_PAUSE
+            text = f"{self._name} cannot accept connections: {error.strerror}; next attempt in {pause:g} s"
+            self._refusals.refuse(now, "accept.failed", self._name, text)
+        self.pause(limits.ACCEPT_PAUSE)

@@ -1,4 +1,4 @@
-"""The file descriptors of this process: which uses may take the last ones, and how a shortage is reported.
+"""The file descriptors of this process: which uses may take the last ones, and what is said when they run out.
 
 A process without a free descriptor can neither accept nor dial. Connections for data are refused early, so that the
 ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.
@@ -9,7 +9,6 @@ limit means that all lower ones are taken.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import enum
 import errno
@@ -19,17 +18,13 @@ import resource
 import socket
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from rmpa.core.counters import Counters
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import OutOfDescriptors
 from rmpa.core.open_files import remedy
 from rmpa.runtime import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _log = logging.getLogger(__name__)
 
@@ -50,46 +45,19 @@ class Use(enum.Enum):
     """Links to peers and the control socket: they may take the last descriptor."""
 
 
-@dataclass(slots=True)
-class DescriptorShortage:
-    """A period in which descriptors were refused.
-
-    Attributes:
-        last: When a descriptor was last refused, in seconds of the loop's clock.
-        began: When a descriptor was first refused, on the same clock.
-        least: Of the refused uses, the one that must leave the largest reserve; the shortage is over when this use
-            has room again.
-        most: Of the refused uses, the one that must leave the smallest reserve.
-        problem: What happened and what to do, as a text for the user.
-        told: Whether the shortage was logged.
-    """
-
-    last: float
-    began: float
-    least: Use
-    most: Use
-    problem: str
-    told: bool = False
-
-
 class Descriptors:
     """The descriptors of one process, shared by all servers and clients. Not thread-safe: for the loop's thread.
 
     Attributes:
-        counters: ``descriptors.refused.data`` (and ``.proxy``, ``.core``, ``.link``): attempts to accept or to dial
-            without a free descriptor, repeated attempts included; ``descriptors.idle_closed``;
-            ``descriptors.shortages``.
+        counters: ``descriptors.refused.data`` (``.proxy``, ``.core``, ``.link``): attempts to accept or to dial
+            without a free descriptor, repeated attempts included.
     """
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._shortage: DescriptorShortage | None = None
-        self._idle: dict[object, Callable[[], bool]] = {}
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._told: dict[Use, float] = {}
+        self._refusals = RefusalLog(_log, self.counters)
+        self._problem, self._refused_at = "", float("-inf")
         self._count, self._count_until = 0, float("-inf")
-
-    # --- how many ---------------------------------------------------------------------------------------------
 
     @property
     def limit(self) -> int:
@@ -118,24 +86,15 @@ class Descriptors:
             self._count_until = now + max(1.0, (time.monotonic() - now) * limits.DESCRIPTORS_COUNT_SHARE)
         return self._count
 
-    @property
-    def shortage(self) -> DescriptorShortage | None:
-        """The present shortage, or ``None``; a shortage ends with the event loop in which it began."""
-        if self._loop is not None and self._loop.is_closed():
-            self._loop = self._shortage = None
-        return self._shortage
-
-    @property
-    def short(self) -> bool:
-        """Whether there is a shortage."""
-        return self.shortage is not None
-
     def has_room(self, use: Use, fd: int) -> bool:
         """Whether ``use`` may keep the descriptor ``fd``, whose number was the lowest free one."""
         soft = self.limit
         return fd < soft - int(_reserve(soft) * use.value)
 
-    # --- refusing ---------------------------------------------------------------------------------------------
+    @property
+    def problem(self) -> str:
+        """What was refused in the last seconds and what to do, as a text for the user; empty for nothing."""
+        return self._problem if time.monotonic() - self._refused_at < limits.DESCRIPTORS_TOLD else ""
 
     def open_socket(
         self,
@@ -155,104 +114,33 @@ class Descriptors:
             if error.errno in OUT_OF_DESCRIPTORS:
                 self.refuse(use, what, error)
             raise
+        if not self.keeps(use, sock, what):
+            raise OSError(errno.EMFILE, "too many open files; the last ones are kept for the core and the links")
+        return sock
+
+    def keeps(self, use: Use, sock: socket.socket, what: str) -> bool:
+        """Whether there is a descriptor left for this new socket; else it is closed, counted and logged."""
         if self.has_room(use, sock.fileno()):
-            return sock
+            return True
         sock.close()
-        self.make_room()
         self.refuse(use, what)
-        raise OSError(errno.EMFILE, "too many open files; the last ones are kept for the core and the links")
+        return False
 
     def refuse(self, use: Use, what: str, error: OSError | None = None) -> None:
-        """Count an attempt for which there was no descriptor, and log the first one of a shortage.
+        """Count an attempt for which there was no descriptor; log one of each use in a while.
 
         Args:
             use: What the descriptor was for.
             what: What needed it, for the log: ``node /talker``.
             error: The system's error; ``None`` if there was a descriptor, but it belongs to the reserve.
         """
-        self.counters.add(f"descriptors.refused.{use.name.lower()}")
-        loop = asyncio.get_running_loop()
-        now = loop.time()
-        short = self.shortage
-        if short is None:
-            self.counters.add("descriptors.shortages")
-            short = self._shortage = DescriptorShortage(now, now, use, use, "")
-        short.last = now
-        short.least = max(short.least, use, key=_value)
-        if not short.problem or use.value < short.most.value:
-            short.most, short.problem = use, self._problem(use, what, error)
-            self._tell(short, now)
-        if self._loop is not loop:  # the first refusal, or the first one in a new loop
-            self._loop = loop
-            loop.call_later(limits.DESCRIPTORS_QUIET, self._look)
-
-    def _tell(self, short: DescriptorShortage, now: float) -> None:
-        if now - self._told.get(short.most, float("-inf")) >= limits.DESCRIPTORS_TELL:
-            self._told[short.most] = now
-            short.told = True
-            _log.warning("! %s", short.problem)
-
-    def _problem(self, use: Use, what: str, error: OSError | None) -> str:
         if error is not None and error.errno != errno.EMFILE:
-            return (
-                f"{what} has to wait: the system has no room for another file ({error.strerror}); see "
-                "/proc/sys/fs/file-nr and `free`"
-            )
-        kept = {
-            Use.PROXY: f", of which the last {2 * self.reserve} are kept for connections, the core and the links",
-            Use.DATA: f", of which the last {self.reserve} are kept for the core and the links",
-            Use.CORE: ", of which the last ones are kept for the links",
-            Use.LINK: "",
-        }
-        text = f"{what} has to wait: no file descriptors left (the limit is {self.limit}{kept[use]})"
-        return f"{text}; {remedy(os.getpid())}"
-
-    def _look(self) -> None:
-        """End the shortage if nothing was refused for a while and there is room; else check again later."""
-        self._loop = None
-        loop = asyncio.get_running_loop()
-        short = self.shortage
-        if short is None:
-            return
-        if loop.time() - short.last >= limits.DESCRIPTORS_QUIET and self._has_room_now(short.least):
-            self._shortage = None
-            if short.told:
-                _log.info("= file descriptors are free again after %.0f s", loop.time() - short.began)
-            return
-        self._loop = loop
-        loop.call_later(limits.DESCRIPTORS_QUIET, self._look)
-
-    def _has_room_now(self, use: Use) -> bool:
-        try:
-            with socket.socket() as probe:
-                return self.has_room(use, probe.fileno())
-        except OSError:
-            return False
-
-    # --- closing idle connections -----------------------------------------------------------------------------
-
-    def offer(self, owner: object, close_one: Callable[[], bool] | None) -> None:
-        """Register a function that closes an idle connection of ``owner`` when descriptors run out.
-
-        Args:
-            owner: Identifies the offer; a later offer of the same owner replaces it.
-            close_one: Closes one idle connection, and returns whether there was one; ``None`` withdraws the offer.
-        """
-        if close_one is None:
-            self._idle.pop(owner, None)
+            why = f"the system has no room for another file ({error.strerror}); see /proc/sys/fs/file-nr and `free`"
         else:
-            self._idle[owner] = close_one
-
-    def make_room(self) -> bool:
-        """Close one idle connection, and return whether there was one.
-
-        Its descriptor is free in the loop's next iteration.
-        """
-        for close_one in self._idle.values():
-            if close_one():
-                self.counters.add("descriptors.idle_closed")
-                return True
-        return False
+            kept = f"the limit is {self.limit}, of which the last {self.reserve} are kept for the core and the links"
+            why = f"no file descriptors left ({kept}); {remedy(os.getpid())}"
+        self._problem, self._refused_at = f"{what} is refused: {why}", time.monotonic()
+        self._refusals.refuse(self._refused_at, f"descriptors.refused.{use.name.lower()}", "", self._problem)
 
 
 def is_shortage(error: BaseException | None) -> bool:
@@ -260,10 +148,6 @@ def is_shortage(error: BaseException | None) -> bool:
     if error is None or isinstance(error, OutOfDescriptors):
         return error is not None
     return (isinstance(error, OSError) and error.errno in OUT_OF_DESCRIPTORS) or is_shortage(error.__cause__)
-
-
-def _value(use: Use) -> float:
-    return use.value
 
 
 def _count_open(limit: int) -> int:

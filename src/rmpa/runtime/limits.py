@@ -18,10 +18,8 @@ DESCRIPTORS_RESERVED: Final = 64
 16 peers that reconnect at once take 32."""
 DESCRIPTORS_RESERVED_PART: Final = 4
 """The reserve is at most the descriptor limit divided by this: 16 of 64."""
-DESCRIPTORS_QUIET: Final = 2.0
-"""A shortage of descriptors is over after this time without a refusal, if there is room."""
-DESCRIPTORS_TELL: Final = 60.0
-"""Shortest time between two log lines about shortages of one kind."""
+DESCRIPTORS_TOLD: Final = 10.0
+"""How long after a refusal for want of a descriptor the user is told of it."""
 DESCRIPTORS_NEAR: Final = 0.8
 """Users are warned above this share of the descriptors that are not in the reserve."""
 DESCRIPTORS_COUNT_SHARE: Final = 100

@@ -134,9 +134,9 @@ def test_the_agents_descriptors_are_judged() -> None:
     )
     assert files(near=True).level is CheckLevel.WARN
     assert "prlimit --pid 4242" in files(near=True).remedy
-    bad = files("node /x has to wait: none left; raise it", near=True)
+    bad = files("node /x is refused: none left; raise it", near=True)
     assert (bad.level, bad.text, bad.remedy) == (
         CheckLevel.FAIL,
-        "node /x has to wait: none left; 60 are open",
+        "node /x is refused: none left; 60 are open",
         "raise it",
     )

@@ -178,8 +178,8 @@ class SnapshotBuilder:
 
     def _notes(self, endpoint: EndpointView | None) -> tuple[str, ...]:
         notes = [*(endpoint.discovery.notes() if endpoint is not None else ()), *self._sources.core.notes()]
-        if DESCRIPTORS.shortage is not None:
-            notes.append(DESCRIPTORS.shortage.problem)
+        if DESCRIPTORS.problem:
+            notes.append(DESCRIPTORS.problem)
         notes += self._sources.notes()
         notes += own_bounds(self._sources.bridge, self._sources.services)
         refused = (outcome for outcome in self._sources.realtime if outcome.startswith("no "))
@@ -241,5 +241,5 @@ def _files() -> FilesInfo:
         reserved=reserved,
         near=used >= runtime_limits.DESCRIPTORS_NEAR * (limit - reserved),
         refused=sum(count for name, count in counts.items() if name.startswith("descriptors.refused.")),
-        problem=DESCRIPTORS.shortage.problem if DESCRIPTORS.shortage is not None else "",
+        problem=DESCRIPTORS.problem,
     )

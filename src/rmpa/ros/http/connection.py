@@ -55,7 +55,6 @@ class HttpConnection(asyncio.Protocol):
     Attributes:
         client: The client's address.
         begun: When the call began that is unfinished, or whose answer is not read yet, by the loop's clock.
-        answered: The time of the last answer, by the loop's clock.
         gone: Done when the connection is closed.
     """
 
@@ -74,7 +73,6 @@ class HttpConnection(asyncio.Protocol):
         self.begun = self._loop.time()
         self.gone: asyncio.Future[None] = self._loop.create_future()
         self.client = "?"
-        self.answered: float | None = None
 
     # --- http.eviction.Client ---------------------------------------------------------------------------------
 
@@ -251,7 +249,6 @@ class HttpConnection(asyncio.Protocol):
     def _reply(self, body: bytes) -> None:
         if self._transport is None or self._transport.is_closing():
             return
-        self.answered = self._loop.time()
         self._transport.write(response_head(200, len(body), close=self._closing) + body)
         if self._closing:
             self._close()

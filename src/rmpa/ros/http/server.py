@@ -20,7 +20,7 @@ from rmpa.ros.http.documents import read_large, read_small, slices
 from rmpa.ros.wire.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import DESCRIPTORS, Use
+from rmpa.runtime.descriptors import Use
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
@@ -88,7 +88,14 @@ class XmlRpcServer:
         """
         sock = await listen.listen(self._name, self._host, self._wanted_port, self._use)
         self.port = sock.getsockname()[1]
-        self._acceptor = Acceptor(sock, self.adopt, name=self._name, use=self._use, at_once=limits.HTTP_ACCEPTS)
+        self._acceptor = Acceptor(
+            sock,
+            self.adopt,
+            name=self._name,
+            use=self._use,
+            at_once=limits.HTTP_ACCEPTS,
+            make_room=self._evict,
+        )
         self._acceptor.start()
         _log.info("= %s listens at %s:%d", self._name, self._host, self.port)
 
@@ -128,16 +135,18 @@ class XmlRpcServer:
 
     def admit(self, connection: HttpConnection) -> bool:
         """Whether there is room for a new connection; another one may be closed for it."""
-        if len(self._connections) >= limits.HTTP_CONNECTIONS_MAX:
-            evicted = eviction.for_newcomer(self._connections, asyncio.get_running_loop().time())
-            if evicted is None:
-                self.refuse("http.refused.connections", connection, "all connections are busy; this one is refused")
-                return False
-            self._give_up(evicted)
-        if not self._connections:
-            DESCRIPTORS.offer(self, self._close_idle)
+        if len(self._connections) >= limits.HTTP_CONNECTIONS_MAX and not self._evict():
+            self.refuse("http.refused.connections", connection, "all connections are busy; this one is refused")
+            return False
         self._connections[connection] = None
         return True
+
+    def _evict(self) -> bool:
+        """Close a connection for a new one, if there is one that is idle or slow."""
+        evicted = eviction.for_newcomer(self._connections, asyncio.get_running_loop().time())
+        if evicted is not None:
+            self._give_up(evicted)
+        return evicted is not None
 
     def _give_up(self, connection: HttpConnection) -> None:
         """Close a connection for another one; the client of an idle one reconnects by itself."""
@@ -168,17 +177,6 @@ class XmlRpcServer:
     def remove(self, connection: HttpConnection) -> None:
         """Forget a closed connection."""
         self._connections.pop(connection, None)
-        if not self._connections:
-            DESCRIPTORS.offer(self, None)
-
-    def _close_idle(self) -> bool:
-        """Close an idle connection, to free a file descriptor for another part of the process."""
-        before = asyncio.get_running_loop().time() - limits.HTTP_IDLE_MIN
-        for connection in self._connections:
-            if connection.answered is not None and connection.answered < before and connection.idle:
-                connection.abort()
-                return True
-        return False
 
     def refuse(self, name: str, connection: HttpConnection, text: str) -> None:
         """Count a refusal by its name, and log it."""

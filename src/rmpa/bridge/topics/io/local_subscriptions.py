@@ -263,7 +263,7 @@ class LocalSubscriptions:
         if self._connections.get(source) is not connection:
             return
         self._connections.pop(source).close()
-        short = DESCRIPTORS.short  # reported once for the process; the node itself may be well
+        short = DESCRIPTORS.problem  # reported once for the process; the node itself may be well
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
             self._on_malformed(source, reason)
