@@ -115,27 +115,24 @@ def test_beyond_this_machine_a_token_is_made_and_told_once(place: Place) -> None
     assert told[0]["token_file"] == told[1]["token_file"] == str(file)
 
 
-def test_rmpa_reload_takes_a_clients_token_away(place: Place) -> None:
+def test_rmpa_reload_takes_other_rights_and_a_mistake_changes_nothing(place: Place) -> None:
     port, config = free_port(), place.path / "rmpa.toml"
     web = f"[web]\nenabled = true\nport = {port}\n"
-    tokens = place.path / ".local" / "state" / "rmpa" / "base" / "web-tokens"
-
-    def write(*clients: str) -> None:
-        config.write_text(web + "".join(f'[[web_token]]\nname = "{name}"\n' for name in clients))
-
-    write("wall", "tablet")
-    with running(place, *agent_options("--config", str(config))):
-        until(lambda: get(port, "/healthz")[0] == 200)
-        wall, tablet = ((tokens / name).read_text().strip() for name in ("wall", "tablet"))
-        assert (tokens / "wall").stat().st_mode & 0o777 == 0o600
-        assert [get(port, "/metrics", token)[0] for token in (wall, tablet, "x" * 43)] == [200, 200, 401]
-        write("wall")
+    config.write_text(web)
+    with running(place, *agent_options("--config", str(config))) as agent:
+        until(lambda: get(port, "/metrics")[0] == 200)
+        pid = child_of(agent.pid)
+        config.write_text(f"{web}control = true\n")
         assert place.run("reload")[0] == 0
-        until(lambda: get(port, "/metrics", tablet)[0] == 401)
-        assert get(port, "/metrics", wall)[0] == 200
-        write("wall", "wall")
-        assert place.run("reload")[0] != 0
-        assert get(port, "/metrics", wall)[0] == 200
+        until(lambda: get(port, "/metrics")[0] == 401)
+        token = (place.path / ".local" / "state" / "rmpa" / "base" / "web-token").read_text().strip()
+        assert get(port, "/metrics", token)[0] == 200
+        config.write_text(f'{web}[[web_token]]\nname = "wall"\n')
+        code, _, err = place.run("reload")
+        assert code != 0
+        assert "use the one token; control and drive of [web]" in err
+        assert get(port, "/metrics", token)[0] == 200
+        assert child_of(agent.pid) == pid
 
 
 def test_without_the_extra_it_says_what_to_install(place: Place) -> None:

@@ -158,7 +158,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
         theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
         settings = replace(settings, trust=theirs.settings.trust)
     files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
-    access = access_of(settings.web, module.name, os.environ, settings.state_dir, settings.web_tokens)
+    access = access_of(settings.web, module.name, os.environ, settings.state_dir)
     folder = str(store.folder) if store is not None else ""
     return WebSetup(settings, access, files, trusted, module.name, folder)
 
@@ -187,13 +187,11 @@ def _announce(address: Address, *, as_json: bool) -> None:
     if as_json:
         from rmpa.cli.output import print_json
 
-        print_json({"url": address.url, "token_file": address.token_file, "clients": dict(address.clients)})
+        print_json({"url": address.url, "token_file": address.token_file})
     else:
         click.echo(address.url)
         if address.is_new:
             click.echo(f"the token is kept in {address.token_file}; it is not printed again")
         elif address.token_file:
             click.echo(f"clients need the token of {address.token_file}")
-        for name, file in address.clients:
-            click.echo(f"the token of {name} is in {file}")
     sys.stdout.flush()

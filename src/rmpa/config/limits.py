@@ -46,8 +46,6 @@ SITE_NAME_MAX: Final = 63
 """Characters of a site's name, as for a module's name and for a label of DNS."""
 GATEWAY_BYTES_MAX: Final = 100_000_000_000
 """Highest ``size`` of a ``[[gateway.rule]]`` in bytes a second: more than any network carries."""
-WEB_TOKENS_MAX: Final = 64
-"""Tables ``[[web_token]]``: each request is compared with the token of each."""
 BOUND_MAX: Final = 1_000_000
 """Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
 

@@ -186,6 +186,7 @@ def settings_of(
 
 
 REMOVED: Final = {
+    "web_token": "use the one token; control and drive of [web] say what clients may do with it",
     "core.fresh": 'write keep = "never" in place of true',
     "RMPA_FRESH": "set RMPA_KEEP=never in its place",
     "--fresh": "write --keep never",

@@ -56,7 +56,6 @@ from rmpa.config.values import (
     Multicast,
     list_of,
 )
-from rmpa.config.web_tokens import WEB_TOKENS, WebToken
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 from rmpa.core.links import Links
 
@@ -272,12 +271,14 @@ class WebSettings:
         list_of(TEXT),
         "Pages of other sites that may connect, such as https://app.foxglove.dev.",
         env="RMPA_WEB_ORIGINS",
+        live=True,
     )
     control: bool = setting(
         False,
         BOOL,
         "Let clients publish, call and offer services, and set parameters; they then need the token.",
         env="RMPA_WEB_CONTROL",
+        live=True,
     )
     cert: str = setting(
         "",
@@ -296,12 +297,14 @@ class WebSettings:
         BOOL,
         "Let the monitor's joystick command a robot; clients then need the token.",
         env="RMPA_WEB_DRIVE",
+        live=True,
     )
     command_age_ms: int = setting(
         0,
         COMMAND_AGE,
         "Drop what rosbridge and Foxglove clients publish, call and set if it may be older than this; 0: take all.",
         env="RMPA_WEB_COMMAND_AGE_MS",
+        live=True,
     )
 
 
@@ -490,13 +493,6 @@ class Settings:
     lanes: LaneSettings = table(LaneSettings, "lanes")
     realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
     web: WebSettings = table(WebSettings, "web")
-    web_tokens: tuple[WebToken, ...] = setting(
-        (),
-        WEB_TOKENS,
-        "Clients of rmpa web with a token and a role of their own.",
-        key="web_token",
-        live=True,
-    )
     trust: TrustSettings = table(TrustSettings, "trust")
     gateway: GatewaySettings = table(GatewaySettings, "gateway")
     relay: bool = setting(

@@ -28,7 +28,6 @@ from rmpa.config.settings import SETTINGS, Settings
 from rmpa.config.state_dir import NAME_FILE, kept_name, state_dir
 from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue, did_you_mean
-from rmpa.config.web_tokens import web_token_problems
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -210,8 +209,6 @@ def _check_together(settings: Settings, given: _Layer) -> None:
         raise given["params.follow"].error(problem, "raise that, or follow a namespace as a whole", ())
     for at, problem, remedy in permission_problems(settings.trust.rules, settings.trust.groups):
         raise given["trust.rules"].error(problem, remedy, at)
-    for at, problem, remedy in web_token_problems(settings.web_tokens, settings.trust.groups):
-        raise given["web_tokens"].error(problem, remedy, at)
     for name, at, problem in follow_problems(settings.params.follow, settings.time.follow, settings.name):
         raise given[name].error(problem, "name another module", at)
 

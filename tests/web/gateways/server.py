@@ -91,7 +91,7 @@ async def running_server(
         monitor = Monitor(hub, watch, {}) if watch is not None else None
         if monitor is not None:
             monitor.start()
-        gateways = Gateways(hub, "test", lambda _: rights, priority, monitor)
+        gateways = Gateways(hub, "test", rights, priority, monitor)
         app = web.Application()
         for path in ("/", MONITOR_PATH):
             app.router.add_get(path, gateways.handle)

@@ -11,13 +11,14 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.requests import Answer, Failed, GraphChanged, ReceivedMessage
-from rmpa.web.hub.rights import FULL, Rights
+from rmpa.web.hub.rights import EVERYTHING, FULL, Rights
 from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.web.hub.requests import Request
+    from rmpa.web.hub.rights import NodeRules
 
 _A = TypeVar("_A", bound=Answer)
 _names = itertools.count(1)
@@ -39,7 +40,7 @@ def node(core: RosCore, name: str = "") -> Node:
 
 
 @contextlib.asynccontextmanager
-async def running_hub(core: RosCore) -> AsyncIterator[Hub]:
+async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIterator[Hub]:
     """A hub that has its node, and has read the graph and the parameters."""
 
     async def where() -> str:
@@ -48,6 +49,7 @@ async def running_hub(core: RosCore) -> AsyncIterator[Hub]:
     async with Hub(
         where,
         lambda uri, updated: Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated),
+        rules=rules,
     ) as hub:
         hub.start()
         await until(lambda: hub.graph.loaded.is_set() and hub.params.loaded.is_set())

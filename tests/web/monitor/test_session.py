@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.config.permission_rules import Effect, PermissionRule
-from rmpa.config.settings import TrustSettings
-from rmpa.trust.permissions import Permissions
 from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
-from rmpa.web.hub.rights import FULL, ClientRules, Rights
+from rmpa.web.hub.rights import FULL, Rights
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import apply
 from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
@@ -22,12 +19,6 @@ if TYPE_CHECKING:
 
 STOP = Speed("/cmd_vel", 0.0, 0.0)
 ALL = dataclasses.replace(FULL, drive=True)
-
-
-def denying(**names: str) -> ClientRules:
-    """The rules about a client that may do everything but what ``names`` say."""
-    rule = PermissionRule(("*",), effect=Effect.DENY, names={kind: (glob,) for kind, glob in names.items()})
-    return ClientRules("wall", Permissions(TrustSettings(default="allow", rules=(rule,))))
 
 
 class Page:
@@ -380,16 +371,6 @@ def test_a_flood_closes_the_connection() -> None:
         page.send("ack", n=0)
     assert isinstance(page.others[-1], MonitorClose)
     assert page.others[-1].refusal == "message_rate"
-
-
-def test_a_page_that_may_not_subscribe_to_the_log_does_not_get_it() -> None:
-    page = Page(dataclasses.replace(ALL, look=denying(subscribe="/rosout_agg")))
-    [failed] = page.send("log", on=True)
-    assert (failed["op"], failed["id"], page.others) == ("failed", 0, [])
-    assert "may not subscribe /rosout_agg; [[permission]] 1 denies" in failed["error"]
-    other = Page(dataclasses.replace(ALL, look=denying(subscribe="/camera/**")))
-    other.send("log", on=True)
-    assert other.others == [FollowLog(True)]
 
 
 def test_the_log_is_left_out_for_a_slow_page() -> None:

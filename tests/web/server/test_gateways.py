@@ -19,8 +19,9 @@ from rmpa.web.gateways.websocket_frames import Opcode, frame_header
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names
 from rmpa.web.server.hub_setup import make_hub, priority_of
-from rmpa.web.server.roles import WebRoles
+from rmpa.web.server.process import TokenAccess, WebSetup
 from rmpa.web.server.server import WebServer
+from rmpa.web.server.tls import CertificateFiles
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node
 from tests.web.snapshots import FULL as SNAPSHOT
@@ -39,8 +40,8 @@ async def running(token: str = "", **policy: Any) -> AsyncIterator[tuple[WebServ
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
         hub = make_hub(watch, 8480)
         settings = Settings(web=WebSettings(control=bool(token)))
-        rights = WebRoles(settings, has_token=bool(token), trusted=False).of("")
-        gateways = Gateways(hub, "test", lambda _: rights)
+        rights = WebSetup(settings, TokenAccess(token), CertificateFiles()).rights
+        gateways = Gateways(hub, "test", rights)
         access = AccessPolicy(0, own_names(("base",)), token, **policy)
         server = WebServer(watch, access, "127.0.0.1", gateways, (0,))
         try:

@@ -8,7 +8,6 @@ import logging
 import secrets
 import time
 from collections import Counter
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
@@ -28,7 +27,7 @@ from rmpa.web.rosbridge import limits as rosbridge_limits
 from rmpa.web.rosbridge.encodings import PublishFrames
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from rmpa.web.gateways.connection import ClientConnection
     from rmpa.web.hub.hub import Hub
@@ -46,16 +45,6 @@ def is_upgrade(request: web.BaseRequest) -> bool:
 
 _GOING_AWAY: Final = 1001
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
-_SERVICE_RESTART: Final = 1012
-"""Likewise, of IANA's registry: the client may connect again."""
-_RIGHTS_CHANGED: Final = "the rights of this client have changed; connect again"
-
-
-@dataclass(frozen=True, slots=True)
-class _OpenClient:
-    response: FrameSocket
-    request: web.Request
-    rights: Rights
 
 
 class Gateways:
@@ -64,7 +53,7 @@ class Gateways:
     Args:
         hub: The hub.
         name: The server's name, for users.
-        rights_of: What the sender of a request may do.
+        rights: What clients may do.
         priority: The priority of a topic's messages: higher ones go first.
         monitor: Serves the pages at ``MONITOR_PATH``; without it there are none.
     """
@@ -73,7 +62,7 @@ class Gateways:
         self,
         hub: Hub,
         name: str,
-        rights_of: Callable[[web.Request], Rights],
+        rights: Rights,
         priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
     ) -> None:
@@ -86,11 +75,11 @@ class Gateways:
         self._monitor = monitor
         self._hub = hub
         self._name = name
-        self._rights_of = rights_of
+        self._rights = rights
         self._priority = priority
         self._session_id = secrets.token_hex(8)
         self._frames = PublishFrames()
-        self._open: dict[ClientConnection, _OpenClient] = {}
+        self._open: dict[ClientConnection, FrameSocket] = {}
         self._sent: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
 
@@ -124,11 +113,10 @@ class Gateways:
                 self.refuse(address, "handshake", text)
                 return web.Response(status=400, text=f"{text}\n")
             await self._monitor.ready()
-            rights = self._rights_of(request)
-            connection = MonitorConnection(self._hub, rights, self._priority, address, monitor=self._monitor)
-            return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1, rights)
+            connection = MonitorConnection(self._hub, self._rights, self._priority, address, monitor=self._monitor)
+            return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
         await self._hub.settled(limits.SETTLE)
-        rights = self._rights_of(request)  # after the last wait: a reload before this is not noticed by end_changed
+        rights = self._rights
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
@@ -137,11 +125,9 @@ class Gateways:
         else:
             connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
             most = rosbridge_limits.FRAME_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
-        return await self._serve(request, connection, most, rights)
+        return await self._serve(request, connection, most)
 
-    async def _serve(
-        self, request: web.Request, connection: ClientConnection, most: int, rights: Rights
-    ) -> web.StreamResponse:
+    async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
         response = FrameSocket(
             protocols=(*SUBPROTOCOLS, SUBPROTOCOL),
             autoping=False,
@@ -151,12 +137,9 @@ class Gateways:
         )
 
         def upgraded(request: web.Request) -> Callable[[], int]:
-            # A WebSocket cannot be closed before this: end_changed leaves it open.
-            if self._rights_of(request) != rights:
-                connection.end(_SERVICE_RESTART, _RIGHTS_CHANGED)
             return self.upgraded(request, connection.unmasked)
 
-        self._open[connection] = _OpenClient(response, request, rights)
+        self._open[connection] = response
         try:
             refused = functools.partial(self._refuse_client, connection)
             await connection.run(request, response, upgraded, refused)
@@ -186,24 +169,11 @@ class Gateways:
     def _refuse_client(self, connection: ClientConnection, reason: str, text: str) -> None:
         self.refuse(connection.address, reason, f"a client of {connection.kind} is disconnected: {text}")
 
-    async def end_changed(self) -> int:
-        """Disconnect the clients whose rights are others now, so that nothing stays open that they no longer may.
-
-        Returns:
-            How many they were.
-        """
-        changed = [each for each in self._open.values() if self._rights_of(each.request) != each.rights]
-        await _close(changed, _SERVICE_RESTART, _RIGHTS_CHANGED.encode())
-        return len(changed)
-
     async def close(self) -> None:
         """Tell all clients that the server ends."""
-        await _close(self._open.values(), _GOING_AWAY, b"the server ends")
-
-
-async def _close(clients: Iterable[_OpenClient], code: int, message: bytes) -> None:
-    closing = [each.response.close(code=code, message=message) for each in clients if each.response.prepared]
-    await asyncio.gather(*closing, return_exceptions=True)
+        clients = [each for each in self._open.values() if each.prepared]
+        closing = [each.close(code=_GOING_AWAY, message=b"the server ends") for each in clients]
+        await asyncio.gather(*closing, return_exceptions=True)
 
 
 def _sends_data(rights: Rights) -> bool:

@@ -143,6 +143,8 @@ class MonitorConnection(ClientConnection):
                     self._drive(output)
                 case FollowLog(on=True):
                     self._monitor.log.follow(self, lambda lines: self._act(self._session.log(lines)))
+                    if (refused := self._monitor.log.refused) is not None:
+                        self._act(self._session.failed(str(refused)))
                 case FollowLog():
                     self._monitor.log.unfollow(self)
                 case MonitorClose():
@@ -154,7 +156,7 @@ class MonitorConnection(ClientConnection):
     def _ask(self, question: Question) -> None:
         async def answer() -> None:
             try:
-                value = await self._monitor.answers.answer(question, self.rights)
+                value = await self._monitor.answers.answer(question)
             except RmpaError as error:
                 failed = Failed.of(0, error)
                 self._act(self._session.refuse(question.id, failed.error, failed.remedy))

@@ -11,7 +11,6 @@ import os
 import time
 from typing import TYPE_CHECKING, Any, Self
 
-from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web import limits
 from rmpa.web.hub import requests
@@ -22,7 +21,7 @@ from rmpa.web.hub.graph import GraphWatch
 from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
 from rmpa.web.hub.publishers import Publishers
-from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
+from rmpa.web.hub.rights import CONTROL_REMEDY, EVERYTHING, READ_REMEDY
 from rmpa.web.hub.ros_time import RosTime
 from rmpa.web.hub.served import ServedServices
 from rmpa.web.hub.services import ServiceCalls
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.clients import Key, Receive
     from rmpa.web.hub.node_link import MakeNode, Where
     from rmpa.web.hub.requests import Request
-    from rmpa.web.hub.rights import Rights
+    from rmpa.web.hub.rights import NodeRules, Rights
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +49,7 @@ class Hub:
         make_node: Makes the node; it is made anew when the master was away or has shut it down.
         now_ns: The wall clock, in nanoseconds.
         environ: Where packages are searched for assets.
+        rules: What the node may do.
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class Hub:
         *,
         now_ns: Callable[[], int] = time.time_ns,
         environ: Mapping[str, str] | None = None,
+        rules: NodeRules = EVERYTHING,
     ) -> None:
         self._environ = os.environ if environ is None else environ
         self._now_ns = now_ns
@@ -66,7 +67,7 @@ class Hub:
         self._started = False
         self._clients: dict[int, HubClient] = {}
         self._tasks: dict[Key, asyncio.Task[None]] = {}
-        self.link = NodeLink(where, make_node, self._param_updated)
+        self.link = NodeLink(where, make_node, self._param_updated, rules)
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
@@ -220,7 +221,6 @@ class Hub:
     # --- topics -----------------------------------------------------------------------------------------------
 
     def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
-        client.rights.check_look(Access.SUBSCRIBE, request.topic)
         subscribed = self.topics.names
         if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
             known = self.graph.topics.get(request.topic)
@@ -244,7 +244,6 @@ class Hub:
 
     def _advertise(self, client: HubClient, request: requests.AdvertiseTopic) -> None:
         _check(client.rights.publish, "publish")
-        client.rights.check_change(Access.PUBLISH, request.topic)
 
         def failed(error: RmpaError) -> None:
             client.publishers.pop(request.handle, None)
@@ -280,7 +279,6 @@ class Hub:
 
     def _call(self, client: HubClient, request: requests.CallService) -> None:
         _check(client.rights.call_services, "call services")
-        client.rights.check_change(Access.CALL, request.service)
         md5sum = self.types.service(request.type).md5sum if request.type else ""
 
         async def call() -> None:
@@ -328,7 +326,6 @@ class Hub:
 
     def _serve(self, client: HubClient, request: requests.ServeService) -> None:
         _check(client.rights.serve_services, "offer services")
-        client.rights.check_change(Access.SERVE, request.service)
 
         def failed(error: RmpaError) -> None:
             client.services.pop(request.handle, None)
@@ -362,7 +359,7 @@ class Hub:
 
         async def get() -> None:
             await self.params.loaded.wait()
-            values = client.rights.visible(self.params.values(request.names, request.prefix))
+            values = self.link.rules.visible(self.params.values(request.names, request.prefix))
             client.receive(requests.ParamsChanged(request.handle, values))
 
         self._run(client, request.handle, get())
@@ -371,7 +368,6 @@ class Hub:
         _check(client.rights.set_parameters, "set parameters")
 
         async def set_() -> None:
-            await self.check_param_change(client.rights, request.name, request.value)
             await self.params.set(request.name, request.value)
             client.receive(requests.ParamsChanged(request.handle, {request.name: request.value}))
 
@@ -381,28 +377,16 @@ class Hub:
         _check(client.rights.set_parameters, "delete parameters")
 
         async def delete() -> None:
-            await self.check_param_change(client.rights, request.name)
             await self.params.delete(request.name)
             client.receive(requests.ParamsChanged(request.handle, {request.name: None}))
 
         self._run(client, request.handle, delete())
 
-    async def check_param_change(self, rights: Rights, name: str, after: requests.ParamValue = None) -> None:
-        """Check a change as ``Rights.check_param_change`` does, against the core's parameters, once they are known.
-
-        Raises:
-            RmpaError: The client may not, or there is no core.
-        """
-        if rights.change is not None:
-            self.link.need()
-            await self.params.known()
-            rights.check_param_change(name, self.params.value, after)
-
     def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
         _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
 
         def changed(values: Mapping[str, requests.ParamValue]) -> None:
-            visible = client.rights.visible(values)
+            visible = self.link.rules.visible(values)
             if visible:
                 client.receive(requests.ParamsChanged(request.handle, visible))
 

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.core.log import logged_failure
 from rmpa.web import limits
+from rmpa.web.hub.rights import EVERYTHING
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.web.hub.rights import NodeRules
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -35,9 +37,17 @@ class NodeLink:
         where: Finds the master.
         make: Makes a node.
         on_param_update: ``(key, value)``: a parameter has changed that the node follows.
+        rules: What the node may do.
     """
 
-    def __init__(self, where: Where, make: MakeNode, on_param_update: Callable[[str, XmlRpcValue], None]) -> None:
+    def __init__(
+        self,
+        where: Where,
+        make: MakeNode,
+        on_param_update: Callable[[str, XmlRpcValue], None],
+        rules: NodeRules = EVERYTHING,
+    ) -> None:
+        self.rules = rules
         self._where = where
         self._make = make
         self._on_param_update = on_param_update

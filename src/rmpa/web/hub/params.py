@@ -62,12 +62,6 @@ class ParamMirror:
         except KeyError:
             return None
 
-    async def known(self) -> None:
-        """Wait until the parameters are known, and no reading of them is under way."""
-        await self.loaded.wait()
-        while self._loading is not None and not self._loading.done():
-            await asyncio.wait([self._loading])
-
     def values(self, names: tuple[str, ...], prefix: str) -> dict[str, ParamValue]:
         """The values of ``names`` that exist; without names those of all parameters below ``prefix``."""
         if names:
@@ -87,8 +81,9 @@ class ParamMirror:
         """Set a parameter.
 
         Raises:
-            RmpaError: The master does not answer, or refuses.
+            RmpaError: The master does not answer, or refuses; or the rules deny it.
         """
+        await self._check(name, value)
         told = self._told
         await self._link.need().set_param(name, cast("XmlRpcValue", value))
         # The master does not tell the node that set it.
@@ -98,8 +93,9 @@ class ParamMirror:
         """Delete a parameter.
 
         Raises:
-            RmpaError: The master does not answer, or the parameter does not exist.
+            RmpaError: The master does not answer, or the parameter does not exist; or the rules deny it.
         """
+        await self._check(name)
         told = self._told
         await self._link.need().delete_param(name)
         self._own_change(told, lambda: self._remove(name))
@@ -129,6 +125,16 @@ class ParamMirror:
             await asyncio.wait([self._loading])
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    async def _check(self, name: str, after: ParamValue = None) -> None:
+        """Check a change as ``NodeRules`` does, once no reading of the core's parameters is under way."""
+        if self._link.rules.permissions is None:
+            return
+        self._link.need()
+        await self.loaded.wait()
+        while self._loading is not None and not self._loading.done():
+            await asyncio.wait([self._loading])
+        self._link.rules.check_param_change(name, self.value, after)
 
     def _own_change(self, told: int, apply: Callable[[], None]) -> None:
         """Apply a change that the master has taken, unless it told of others meanwhile: their order is not known."""

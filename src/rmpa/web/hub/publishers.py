@@ -10,6 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.web import limits
@@ -91,8 +92,9 @@ class Publishers:
         """Publish a topic, or join its publisher.
 
         Raises:
-            PeerRefused: Other clients publish it with another type, or there are too many topics.
+            PeerRefused: The rules deny it, other clients publish it with another type, or there are too many topics.
         """
+        self._link.rules.check(Access.PUBLISH, topic)
         shared = self._shared.get(topic)
         if shared is not None and shared.type != type_:
             if shared.users:

@@ -1,4 +1,4 @@
-"""What a client may do: kinds of acts, and names by the rules of ``[[permission]]``."""
+"""What clients may do: kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``."""
 
 from __future__ import annotations
 
@@ -16,38 +16,13 @@ if TYPE_CHECKING:
     from rmpa.web.hub.requests import ParamValue
 
 _WHO: Final = "the web server"
-
-
-@dataclass(frozen=True, slots=True)
-class ClientRules:
-    """The rules about one client, by names.
-
-    Args:
-        client: Its name, for which ``[[permission]]`` is judged as for a module's.
-        permissions: Judges.
-    """
-
-    client: str
-    permissions: Permissions
-
-    def check(self, access: Access, name: str) -> None:
-        """Check one name.
-
-        Raises:
-            PeerRefused: The client may not; the text has the rule.
-        """
-        decision = self.permissions.judge(access, self.client, _resolved(name))
-        if not decision.allowed:
-            raise PeerRefused(_WHO, f"the client {self.client} may not {access} {name}", decision.rule)
-
-    def allows(self, access: Access, name: str) -> bool:
-        """Whether the client may."""
-        return self.permissions.judge(access, self.client, _resolved(name)).allowed
+_NODE: Final = "web"
+"""The name of ``rmpa web`` for the rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rights:
-    """What a client may do beyond reading topics and the graph; nothing unless it is said.
+    """What clients may do beyond reading topics and the graph; nothing unless it is said.
 
     Attributes:
         publish: Publish messages.
@@ -58,9 +33,7 @@ class Rights:
         serve_services: Offer services.
         configure_resources: Choose the profile and the context of a Smart Resource.
         drive: Command a robot by the monitor's joystick.
-        look: Which topics and parameters it may read; ``None``: all.
-        change: What it may publish, call, serve and set, by names; ``None``: all.
-        command_age: Seconds that what it publishes, calls and sets may be old; 0: any age.
+        command_age: Seconds that what a client publishes, calls and sets may be old; 0: any age.
     """
 
     publish: bool = False
@@ -71,39 +44,43 @@ class Rights:
     serve_services: bool = False
     configure_resources: bool = False
     drive: bool = False
-    look: ClientRules | None = None
-    change: ClientRules | None = None
     command_age: float = 0.0
 
-    def check_look(self, access: Access, name: str) -> None:
-        """Check that the client may read something of this name.
+
+@dataclass(frozen=True, slots=True)
+class NodeRules:
+    """What the node of ``rmpa web`` may do, by names: for ``[[permission]]`` it is the module ``web``.
+
+    Args:
+        permissions: Judges; ``None``: it may do everything.
+    """
+
+    permissions: Permissions | None = None
+
+    def check(self, access: Access, name: str) -> None:
+        """Check one name.
 
         Raises:
-            PeerRefused: It may not.
+            PeerRefused: It may not; the text has the rule.
         """
-        if self.look is not None:
-            self.look.check(access, name)
-
-    def check_change(self, access: Access, name: str) -> None:
-        """Check that the client may change, or bring, something of this name; raises as ``check_look``."""
-        if self.change is not None:
-            self.change.check(access, name)
+        if self.permissions is not None:
+            decision = self.permissions.judge(access, _NODE, _resolved(name))
+            if not decision.allowed:
+                raise PeerRefused(_WHO, f"{_NODE} may not {access} {name}", decision.rule)
 
     def check_param_change(self, name: str, value_of: Callable[[str], ParamValue], after: ParamValue = None) -> None:
-        """Check each parameter that a change of a name replaces, makes or removes; raises as ``check_look``.
+        """Check each parameter that a change of a name replaces, makes or removes; raises as ``check``.
 
         Args:
             name: A parameter, or a namespace, which is changed as a whole.
             value_of: Returns the present value of a name; ``None`` if there is none.
             after: Its next value; ``None``: it is deleted.
         """
-        if self.change is None:
+        if self.permissions is None:
             return
         if (key := _bad_key(after)) is not None:
             # A core tells /motors/limit of the change where a key below /speed is that name.
-            text = (
-                f"the client {self.change.client} may not set {name}: the key {key[:80]!r} is not one part of a name"
-            )
+            text = f"{_NODE} may not set {name}: the key {key[:80]!r} is not one part of a name"
             raise PeerRefused(_WHO, text, "write a namespace as a value of values")
         name = _resolved(name)
         values = value_of(name), after
@@ -112,24 +89,36 @@ class Rights:
         above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
         changed |= {each for each in above if not isinstance(value_of(each), Mapping | None)}
         for each in sorted(changed) or [name]:
-            self.change.check(Access.PARAM, each)
+            self.check(Access.PARAM, each)
 
     def visible(self, values: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
-        """Those of some parameters that the client may read.
+        """Those of some parameters that clients may read.
 
         Args:
             values: Values by global names; a namespace is a mapping.
         """
-        if self.look is None:
+        if self.permissions is None:
             return values
-        shown = {name: _pruned(name, value, self.look) for name, value in values.items()}
+        shown = {name: self._pruned(name, value) for name, value in values.items()}
         return {name: value for name, value in shown.items() if value is not _HIDDEN}
 
     def visible_tree(self, tree: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
         """The same of a tree of parameters, whose keys are names below the root."""
-        if self.look is None:
+        if self.permissions is None:
             return tree
         return {name[1:]: value for name, value in self.visible({f"/{key}": tree[key] for key in tree}).items()}
+
+    def _pruned(self, name: str, value: ParamValue) -> ParamValue:
+        """A parameter without what is denied; ``_HIDDEN``: nothing is left."""
+        if not isinstance(value, Mapping):
+            try:
+                self.check(Access.PARAM, name)
+            except PeerRefused:
+                return _HIDDEN
+            return value
+        pruned = {key: self._pruned(f"{name}/{key}", each) for key, each in value.items()}
+        kept = {key: each for key, each in pruned.items() if each is not _HIDDEN}
+        return kept if kept or not value else _HIDDEN
 
 
 _HIDDEN: Final[ParamValue] = object()  # type: ignore[assignment] # it is compared by identity, and never shown
@@ -152,17 +141,10 @@ def _bad_key(value: ParamValue) -> str | None:
     return None
 
 
-def _pruned(name: str, value: ParamValue, rules: ClientRules) -> ParamValue:
-    """A parameter without what a client may not read; ``_HIDDEN``: nothing is left."""
-    if not isinstance(value, Mapping):
-        return value if rules.allows(Access.PARAM, name) else _HIDDEN
-    kept = {
-        key: shown for key, each in value.items() if (shown := _pruned(f"{name}/{key}", each, rules)) is not _HIDDEN
-    }
-    return kept if kept or not value else _HIDDEN
-
-
+EVERYTHING = NodeRules()
 READ_ONLY = Rights()
+LOOKS = Rights(read_parameters=True, fetch_assets=True)
+"""With the token alone."""
 FULL = Rights(
     publish=True,
     call_services=True,

@@ -8,6 +8,7 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
@@ -62,7 +63,11 @@ class ServedServices:
             kind: Its type.
             request: ``(call, payload)``: hands a call to the client, which answers by ``respond``.
             failed: Called where the service cannot be registered, or another client offers it; it has then ended.
+
+        Raises:
+            PeerRefused: The rules deny it.
         """
+        self._link.rules.check(Access.SERVE, name)
         if (old := self._served.get(name)) is not None:
             self._refused(old, RmpaError(f"another client offers {name} now"))
         served = self._served[name] = _Served(name, key, kind, request, failed)

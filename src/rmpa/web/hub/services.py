@@ -6,6 +6,7 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.config.permission_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
@@ -72,6 +73,7 @@ class ServiceCalls:
         Raises:
             RmpaError: The call failed; the text says why.
         """
+        self._link.rules.check(Access.CALL, service)
         seconds = limits.CALL_TIMEOUT if timeout is None else min(timeout, limits.CALL_TIMEOUT_MAX)
         key = service, md5sum or ANY
         server = self._servers.get(key)

@@ -10,6 +10,8 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.permission_rules import Access
+from rmpa.core.errors import PeerRefused
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
@@ -124,9 +126,14 @@ class HubTopics:
             topic: The global name.
             type_: The only type that is wanted; ``None`` for any.
             deliver: Takes each message.
-            failed: Called where the master refuses the subscription, which has then ended.
+            failed: Called where the rules or the master refuse the subscription, which has then ended.
             differs: Called once for each other type that all its publishers have.
         """
+        try:
+            self._link.rules.check(Access.SUBSCRIBE, topic)
+        except PeerRefused as error:
+            failed(error)
+            return
         sink = _Sink(key[1], None if type_ == ANY else type_, deliver, failed, differs)
         there = self._topics.get(topic)
         if there is None:

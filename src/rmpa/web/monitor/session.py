@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
-from rmpa.config.permission_rules import Access
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.core.token_bucket import TokenBucket
@@ -19,7 +18,6 @@ from rmpa.web.hub import requests
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.joystick import Joystick
 from rmpa.web.monitor.messages import (
-    LOG_TOPIC,
     VERSION,
     Ack,
     AskQuestion,
@@ -32,7 +30,6 @@ from rmpa.web.monitor.messages import (
     parse,
 )
 from rmpa.web.monitor.patch import difference
-from rmpa.web.monitor.visible import visible_resource, visible_state
 from rmpa.web.monitor.watches import WatchState
 
 if TYPE_CHECKING:
@@ -196,8 +193,6 @@ class MonitorSession:
         elif isinstance(message, AskQuestion):
             yield from self._ask(message, now)
         elif isinstance(message, Log):
-            if message.on:
-                self._rights.check_look(Access.SUBSCRIBE, LOG_TOPIC)
             yield FollowLog(message.on)
         elif isinstance(message, Drive):
             yield from self._drive(message, now)
@@ -341,9 +336,8 @@ class MonitorSession:
         if self._state is None:
             return
         self._stale, self._patched = False, now
-        found = {f"{kind}:{name}": self._detail(kind, name) for kind, name in self._looks}
-        state = visible_state(self._state, self._rights)
-        wanted: Tree = {**state, "detail": {key: tree for key, tree in found.items() if tree is not None}}
+        found = {f"{kind}:{name}": self._details(kind, name) for kind, name in self._looks}
+        wanted: Tree = {**self._state, "detail": {key: tree for key, tree in found.items() if tree is not None}}
         shown, self._shown = self._shown, wanted
         if shown is None:
             self._number += 1
@@ -351,10 +345,6 @@ class MonitorSession:
         elif patch := difference(shown, wanted):
             self._number += 1
             yield _text({"op": "patch", "n": self._number, "patch": patch})
-
-    def _detail(self, kind: str, name: str) -> Tree | None:
-        found = self._details(kind, name)
-        return visible_resource(found, self._rights) if kind == "resource" and found is not None else found
 
     def _flush(self, now: float) -> Iterator[Output]:
         if self._unsent() > 0:

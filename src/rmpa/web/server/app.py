@@ -50,8 +50,6 @@ WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
 _METHODS: Final = ("GET", "HEAD")
 _SHOWN: Final = 120
 """Characters of a faulty header that are told."""
-CLIENT: Final = web.RequestKey("rmpa.client", str)
-"""The client that a request is of, by its token (``AccessGranted.client``)."""
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
 """Marks requests that reached the middleware; aiohttp answers malformed ones before."""
 HEADERS: Final = {
@@ -111,8 +109,7 @@ class Routes:
     ) -> None:
         self._watch = watch
         self._gateways = gateways
-        self.policy = policy
-        """May be replaced at any time."""
+        self._policy = policy
         self._pages = pages
         self._connections = connections
         self._counters = counters
@@ -159,7 +156,7 @@ class Routes:
         return middleware
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        verdict = self.policy.judge(self._facts(request))
+        verdict = self._policy.judge(self._facts(request))
         if isinstance(verdict, AccessRefused):
             return self._refused(request, verdict.reason, rest.problem(verdict.status, verdict.detail))
         if request.method not in _METHODS and not isinstance(verdict, Preflight):
@@ -171,7 +168,6 @@ class Routes:
             return web.Response(status=204, headers=PREFLIGHT)
         if isinstance(verdict, MoveToken):
             return self._move_token(request)
-        request[CLIENT] = verdict.client
         if self._gateways is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
             return await self._upgrade(request, self._gateways)
         try:
@@ -203,7 +199,7 @@ class Routes:
             fetch_site=headers.get("Sec-Fetch-Site"),
             fetch_mode=headers.get("Sec-Fetch-Mode"),
             authorization=headers.get("Authorization"),
-            cookie=request.cookies.get(self.policy.cookie),
+            cookie=request.cookies.get(self._policy.cookie),
             token=request.query.get(TOKEN_PARAMETER),
             is_page=page is not None and page.is_html,
             is_open=request.path in _OPEN,
@@ -215,10 +211,10 @@ class Routes:
 
     def _sharing(self, request: web.Request) -> dict[str, str]:
         """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
-        if not self.policy.origins or request.path in self._pages:
+        if not self._policy.origins or request.path in self._pages:
             return {}
         origin = request.headers.get("Origin")
-        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self.policy.lists(origin) else {}
+        allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
         return {"Vary": "Origin", **allowed}
 
     def _refused(self, request: web.Request, reason: str, problem: rest.RestResponse) -> web.Response:
@@ -237,7 +233,9 @@ class Routes:
         token = request.query[TOKEN_PARAMETER]
         # Strict would leave the cookie out of the redirected request where the link stands on a page of another site,
         # and of each reload behind it. Lax sends it with such a navigation alone, which no other site can read.
-        response.set_cookie(self.policy.cookie, token, httponly=True, secure=request.secure, samesite="Lax", path="/")
+        response.set_cookie(
+            self._policy.cookie, token, httponly=True, secure=request.secure, samesite="Lax", path="/"
+        )
         return response
 
     # --- the paths ---

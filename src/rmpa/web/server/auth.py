@@ -6,7 +6,7 @@ Three checks, in this order:
   machine (DNS rebinding) sends its own name here.
 * ``Origin``, where the browser sends one, is this server or a listed site; ``Sec-Fetch-Site`` says the same of
   requests without one. A browser asks before it sends a listed site's token (CORS preflight): that has no token yet.
-* The token, where there is one; it tells which client it is: ``Authorization: Bearer`` (programs), a cookie
+* The token, where there is one: ``Authorization: Bearer`` (programs), a cookie
   (browsers), or ``?token=`` (clients that know only a URL). A page's ``?token=`` is moved into the cookie by a
   redirect, so that it leaves the address bar and the history. The cookie's name has the port, since browsers share
   cookies between the ports of a host.
@@ -63,14 +63,7 @@ class RequestFacts:
 
 @dataclass(frozen=True, slots=True)
 class AccessGranted:
-    """The request is served.
-
-    Attributes:
-        client: The name of the client whose token it has (``[[web_token]]``); empty: the server's own token, or none
-            where none is needed.
-    """
-
-    client: str = ""
+    """The request is served."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,14 +100,12 @@ class AccessPolicy:
         hosts: The names under which it may be asked, in lower case; addresses are always accepted.
         token: Empty: none is needed.
         origins: Other sites whose pages may connect, as ``Origin`` headers name them, in lower case.
-        clients: The tokens of clients that have their own, with their names; only where ``token`` is not empty.
     """
 
     port: int
     hosts: frozenset[str]
     token: str = field(default="", repr=False)
     origins: frozenset[str] = frozenset()
-    clients: tuple[tuple[str, str], ...] = field(default=(), repr=False)
 
     @property
     def cookie(self) -> str:
@@ -164,12 +155,11 @@ class AccessPolicy:
     def _by_token(self, request: RequestFacts) -> AccessGranted | MoveToken | AccessRefused:
         if not self.token or request.is_open:
             return AccessGranted()
-        if request.token is not None and (client := self._client(request.token)) is not None:
-            return MoveToken() if request.is_page else AccessGranted(client)
+        if self._fits(request.token):
+            return MoveToken() if request.is_page else AccessGranted()
         given = [bearer(request.authorization), request.cookie]
-        for each in given:
-            if each is not None and (client := self._client(each)) is not None:
-                return AccessGranted(client)
+        if any(map(self._fits, given)):
+            return AccessGranted()
         remedy = (
             "send it as Authorization: Bearer TOKEN or as ?token=TOKEN; rmpa web says at its start where the token is"
         )
@@ -177,13 +167,8 @@ class AccessPolicy:
             return AccessRefused("token", 401, f"this server needs a token; {remedy}")
         return AccessRefused("token", 401, f"the token is wrong; {remedy}")
 
-    def _client(self, token: str) -> str | None:
-        """The client whose token it is; ``None``: it is of none. Each is compared, so that the time tells nothing."""
-        given, found = token.encode("utf-8", "replace"), None
-        for name, each in (("", self.token), *self.clients):
-            if hmac.compare_digest(given, each.encode()):
-                found = name
-        return found
+    def _fits(self, token: str | None) -> bool:
+        return token is not None and hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
 
 def _foreign(whose: str) -> AccessRefused:

@@ -115,10 +115,6 @@ class WebServer:
             self._servers.append(server)
         self._runner = runner
 
-    def take(self, policy: AccessPolicy) -> None:
-        """Judge requests by another policy from now on; the port stays."""
-        self._routes.policy = policy
-
     @property
     def port(self) -> int:
         """The port that it listens at."""

@@ -42,10 +42,12 @@ class LogFeed:
         self._followers: dict[object, Callable[[list[dict[str, Any]]], None]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._count = 0
+        self.refused: RmpaError | None = None
+        """Why there is no log to show."""
 
     def start(self) -> None:
         """Begin to keep lines."""
-        self._hub.topics.subscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC, _TYPE, self._take, _ignore)
+        self._hub.topics.subscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC, _TYPE, self._take, self._refused)
 
     def close(self) -> None:
         """Keep no more."""
@@ -92,6 +94,5 @@ class LogFeed:
         for show in [*self._followers.values()]:
             show(lines)
 
-
-def _ignore(_error: RmpaError) -> None:
-    """The master refuses the subscription: there is no log to show."""
+    def _refused(self, error: RmpaError) -> None:
+        self.refused = error

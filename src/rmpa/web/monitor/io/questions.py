@@ -16,17 +16,14 @@ import msgspec
 from rmpa.bridge.io.node_requests import INFO
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.proxy_names import proxied_peer
-from rmpa.config.permission_rules import Access
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
 from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
-from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.nodes import node_key, shown_node
-from rmpa.web.monitor.visible import visible_history
 from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
@@ -36,7 +33,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import GraphService, ParamValue
-    from rmpa.web.hub.rights import Rights
+    from rmpa.web.hub.rights import NodeRules
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
 
@@ -46,9 +43,6 @@ _READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service", "module")
 _SET_PARAMETERS: Final = "set_parameters"
 """The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
-_RECONFIGURES: Final = ("profile", "context", "configure")
-_WITH_PARAMS: Final = ("params", "set_param", "delete_param")
-"""Questions whose answer has all parameters of a module."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
@@ -71,10 +65,6 @@ class Answers:
         self._environ = environ
         self._agent = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
-        self._changes: Mapping[str, Callable[[Args, Rights], Awaitable[Any]]] = {
-            "set_param": self._set_param,
-            "delete_param": self._delete_param,
-        }
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
             "history": self._history,
@@ -85,40 +75,24 @@ class Answers:
             "node": self._node,
             "param_names": self._param_names,
             "params": self._params,
+            "set_param": self._set_param,
+            "delete_param": self._delete_param,
             "call": self._call,
             "profile": self._profile,
             "context": self._context,
             "configure": self._configure,
         }
 
-    async def answer(self, question: Question, rights: Rights = FULL) -> Any:
+    async def answer(self, question: Question) -> Any:
         """The answer, as values for JSON.
 
         Args:
             question: One that the page may ask.
-            rights: What its client may do; names are judged here. A peer's parameters count by their names there.
 
         Raises:
-            RmpaError: There is none, or the client may not; the text says why.
+            RmpaError: There is none, or the rules deny it; the text says why.
         """
-        self._check(question, rights)
-        change = self._changes.get(question.what)
-        asked = change(question.args, rights) if change is not None else self._handlers[question.what](question.args)
-        value = await asked
-        if question.what in _WITH_PARAMS:
-            return _with_digest(rights.visible_tree(value), question.args.get("has"))
-        if question.what == "param_names":
-            return {"names": sorted(rights.visible(dict.fromkeys(value)))}
-        if question.what == "history":
-            return visible_history(value, rights)
-        return value
-
-    def _check(self, question: Question, rights: Rights) -> None:
-        args = question.args
-        if question.what == "call":
-            rights.check_change(Access.CALL, _name(args, "service"))
-        elif question.what in _RECONFIGURES:
-            rights.check_change(Access.CALL, f"{_name(args, 'resource')}/{_SET_PARAMETERS}")
+        return await self._handlers[question.what](question.args)
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -200,65 +174,53 @@ class Answers:
     # --- parameters -------------------------------------------------------------------------------------------
 
     async def _params(self, args: Args) -> Any:
-        """All parameters."""
+        """All parameters that the rules let a page see; a peer's count by their names there."""
         peer = _text(args, "peer")
-        if peer:
-            return _plain(await self._of_peer(peer, lambda params: params.get("/")))
-        return _plain(await self._own_params())
+        tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
+        return _with_digest(self._hub.link.rules.visible_tree(_plain(tree)), args.get("has"))
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
-        try:
-            async with asyncio.timeout(_READ_TIMEOUT):
-                await self._hub.params.loaded.wait()
-        except TimeoutError:
-            raise _unknown_params() from None
+        await _in_time(self._hub.params.loaded.wait())
         return self._hub.params.tree
 
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
-        return list(islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN))
+        names = islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN)
+        return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
-    async def _check_own(self, rights: Rights, name: str, after: ParamValue = None) -> None:
-        try:
-            async with asyncio.timeout(_READ_TIMEOUT):
-                await self._hub.check_param_change(rights, name, after)
-        except TimeoutError:
-            raise _unknown_params() from None
-
-    async def _set_param(self, args: Args, rights: Rights) -> Any:
+    async def _set_param(self, args: Args) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
         if value is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
         if peer:
 
             def change(params: PeerParams) -> None:
-                _check_of_peer(params, rights, name, value)
+                _check_of_peer(params, self._hub.link.rules, name, value)
                 present = params.get(name) if name in params.names() else None
                 params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
 
             await self._of_peer(peer, change)
         else:
-            await self._check_own(rights, name, value)
+            await self._own_params()
             kept = _as_before(name, self._hub.params.value(name), value)
             parameters_in(name, cast("XmlRpcValue", kept))
-            await self._hub.params.set(name, cast("ParamValue", kept))
+            await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
         return await self._params(args)
 
-    async def _delete_param(self, args: Args, rights: Rights) -> Any:
+    async def _delete_param(self, args: Args) -> Any:
         name, peer = _name(args, "name"), _text(args, "peer")
         if name == "/":
             raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
         if peer:
 
             def delete(params: PeerParams) -> None:
-                _check_of_peer(params, rights, name)
+                _check_of_peer(params, self._hub.link.rules, name)
                 params.delete(name)
 
             await self._of_peer(peer, delete)
         else:
-            await self._check_own(rights, name)
-            await self._hub.params.delete(name)
+            await _in_time(self._hub.params.delete(name))
         return await self._params(args)
 
     async def _of_peer(self, peer: str, do: Callable[[PeerParams], Any]) -> Any:
@@ -353,20 +315,29 @@ def _service_key(service: GraphService) -> str:
     return f"{peer}:{service.name}" if peer else service.name
 
 
-def _unknown_params() -> UnreachableError:
-    return UnreachableError("parameters of the core", "its API", "is it busy? ask again")
-
-
-def _check_of_peer(params: PeerParams, rights: Rights, name: str, after: ParamValue = None) -> None:
-    """Check a change of a peer's parameters as ``Rights.check_param_change`` does, against all that the peer has.
-
-    The peer judges what this module may do, and knows nothing of the client. Where it hides some of its parameters
-    from this module, a client with rules changes none of them: what a namespace holds is not known.
+async def _in_time(done: Awaitable[Any]) -> None:
+    """Wait for the core's parameters.
 
     Raises:
-        RmpaError: The client may not, or the peer does not tell its parameters.
+        RmpaError: They are not known in time, or what is done with them fails.
     """
-    if rights.change is None:
+    try:
+        async with asyncio.timeout(_READ_TIMEOUT):
+            await done
+    except TimeoutError:
+        raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
+
+
+def _check_of_peer(params: PeerParams, rules: NodeRules, name: str, after: ParamValue = None) -> None:
+    """Check a change of a peer's parameters as ``NodeRules`` does, against all that the peer has.
+
+    The peer judges what this module may do, and knows nothing of ``rmpa web``. Where it hides some of its parameters
+    from this module, a page changes none of them: what a namespace holds is not known.
+
+    Raises:
+        RmpaError: The rules deny it, or the peer does not tell its parameters.
+    """
+    if rules.permissions is None:
         return
     tree = params.get("/")
 
@@ -378,7 +349,7 @@ def _check_of_peer(params: PeerParams, rights: Rights, name: str, after: ParamVa
             value = value[part]
         return cast("ParamValue", value)
 
-    rights.check_param_change(name, value_of, after)
+    rules.check_param_change(name, value_of, after)
 
 
 def _as_before(name: str, present: object, value: object) -> object:

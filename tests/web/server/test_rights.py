@@ -1,0 +1,370 @@
+"""What web clients may do by the settings, and their node by the rules of ``[[permission]]``."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import asynccontextmanager, nullcontext
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+import msgspec
+import pytest
+
+from rmpa.config.permission_rules import Access, Effect, PermissionRule
+from rmpa.config.settings import Settings, TrustSettings, WebSettings
+from rmpa.core.errors import PeerRefused
+from rmpa.resource import Resource
+from rmpa.resource.run.descriptor import describe
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.master.parameters import Parameters
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.messages import MessageType
+from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.requests import DeleteParam, ParamsChanged, SetParam
+from rmpa.web.hub.rights import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
+from rmpa.web.monitor.io import questions
+from rmpa.web.monitor.io.log_feed import LogFeed
+from rmpa.web.monitor.io.questions import Answers
+from rmpa.web.monitor.io.resource_watch import ResourceWatch
+from rmpa.web.monitor.io.values import MessageValues
+from rmpa.web.monitor.session import Question
+from rmpa.web.server.agent_watch import AgentWatch
+from rmpa.web.server.auth import AccessPolicy, own_names
+from rmpa.web.server.hub_setup import make_hub
+from rmpa.web.server.process import TokenAccess, WebSetup
+from rmpa.web.server.server import WebServer
+from rmpa.web.server.tls import CertificateFiles
+from tests.ros.node.peers import DEADLINE, until
+from tests.web.hub.client import FakeClient, local_core, node, running_hub
+from tests.web.snapshots import FULL as SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.web.hub.requests import ParamValue
+
+RULES = (
+    PermissionRule(("*",), effect=Effect.DENY, names={"call": ("/motors/**",), "param": ("/motors/**",)}),
+    PermissionRule(("web",), effect=Effect.DENY, names={"subscribe": ("/camera/**",), "publish": ("/odom",)}),
+    PermissionRule(("tablet",), effect=Effect.DENY, names={"publish": ("/cmd_vel",)}),
+)
+SETTINGS = Settings(web=WebSettings(control=True), trust=TrustSettings(rules=RULES))
+TOKEN = TokenAccess("secret-" * 6)
+
+
+def setup(settings: Settings = SETTINGS, access: TokenAccess = TOKEN, *, trusted: bool = True) -> WebSetup:
+    return WebSetup(settings, access, CertificateFiles(), trusted)
+
+
+def denying(**names: tuple[str, ...]) -> NodeRules:
+    """The rules of a node that may do everything but what ``names`` say."""
+    rule = PermissionRule(("*",), effect=Effect.DENY, names=names)
+    return setup(replace(SETTINGS, trust=TrustSettings(rules=(rule,)))).rules
+
+
+RULED = setup().rules
+CAREFUL = denying(param=("/motors/limit",))
+"""May change every parameter but one, not the namespace around it."""
+TEXT = MessageType("std_msgs/String")
+TREE: dict[str, ParamValue] = {"speed": {"max": 1.5}, "motors": {"pid": {"p": 3}}, "name": "base"}
+
+
+def value_of(name: str) -> ParamValue:
+    value: ParamValue = TREE
+    for part in filter(None, name.split("/")):
+        if not isinstance(value, dict) or part not in value:
+            return None
+        value = value[part]
+    return value
+
+
+@pytest.mark.parametrize(
+    ("access", "name", "allowed"),
+    [
+        (Access.PUBLISH, "/cmd_vel", True),
+        (Access.PUBLISH, "/odom", False),
+        (Access.PUBLISH, "//odom/", False),
+        (Access.CALL, "/arm/stop", True),
+        (Access.CALL, "/motors/enable", False),
+        (Access.CALL, "/motors//enable", False),
+        (Access.CALL, "motors/enable", False),
+        (Access.SERVE, "/map", True),
+        (Access.SUBSCRIBE, "/odom", True),
+        (Access.SUBSCRIBE, "/camera/image", False),
+    ],
+)
+def test_in_a_secured_mesh_the_rules_bound_what_the_node_may(access: Access, name: str, allowed: bool) -> None:
+    EVERYTHING.check(access, name)
+    setup(trusted=False).rules.check(access, name)
+    if allowed:
+        RULED.check(access, name)
+    else:
+        with pytest.raises(PeerRefused, match=rf"web may not {access} {name}; .*permission.* denies"):
+            RULED.check(access, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "after", "refused"),
+    [
+        ("/speed/max", 2.0, ""),
+        ("/speed", {"max": 1.0, "min": 0.1}, ""),
+        ("/speed/new", 1, ""),
+        ("/motors/pid/p", 9, "/motors/pid/p"),
+        ("/motors", {"pid": {"p": 9}}, "/motors/pid/p"),
+        ("/motors", None, "/motors/pid/p"),  # deleting a namespace deletes what is below
+        ("/motors/pid/p/x", 1, "/motors/pid/p"),  # and a parameter gives way to a namespace
+        ("motors//pid/p", 9, "/motors/pid/p"),
+        ("/", {"speed": {"max": 2.0}}, "/motors/pid/p"),
+        ("/", {"motors": {"new": 1}}, "/motors/new"),
+        ("/name", "arm", ""),
+    ],
+)
+def test_a_denied_parameter_cannot_be_changed_by_its_namespace(name: str, after: ParamValue, refused: str) -> None:
+    if not refused:
+        RULED.check_param_change(name, value_of, after)
+        return
+    with pytest.raises(PeerRefused, match=f"may not param {refused};") as caught:
+        RULED.check_param_change(name, value_of, after)
+    assert "[[permission]] 1 denies param of '/motors/**' to '*'" in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["", "/", "/motors/pid/p", "max/", "a/b"])
+def test_a_key_that_a_core_takes_for_another_name_is_refused(key: str) -> None:
+    values: tuple[ParamValue, ...] = ({key: 99}, {"inner": {key: 99}})
+    for value in values:
+        with pytest.raises(PeerRefused, match="is not one part of a name"):
+            RULED.check_param_change("/speed", value_of, value)
+    EVERYTHING.check_param_change("/speed", value_of, {key: 99})
+
+
+def test_denied_parameters_are_not_shown() -> None:
+    assert RULED.visible_tree(TREE) == {"speed": {"max": 1.5}, "name": "base"}
+    assert RULED.visible({"/motors/pid/p": 3, "/name": "base"}) == {"/name": "base"}
+    assert EVERYTHING.visible_tree(TREE) is TREE
+
+
+def test_clients_may_what_the_settings_say() -> None:
+    def rights(access: TokenAccess = TOKEN, *, control: bool, drive: bool = False) -> Rights:
+        return setup(Settings(web=WebSettings(control=control, drive=drive)), access).rights
+
+    assert rights(TokenAccess(), control=True) is READ_ONLY
+    assert rights(control=True) == FULL
+    readers = rights(control=False)
+    assert readers.read_parameters
+    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
+    assert not readers.drive
+    assert rights(control=False, drive=True).drive
+    assert not rights(TokenAccess(), control=True, drive=True).drive
+
+
+def test_a_server_is_made_anew_for_other_rights_rules_or_another_token_alone() -> None:
+    assert setup().serves_as(setup(replace(SETTINGS, log_level="debug")))
+    assert not setup().serves_as(setup(replace(SETTINGS, web=WebSettings())))
+    assert not setup().serves_as(setup(replace(SETTINGS, trust=TrustSettings())))
+    assert not setup().serves_as(setup(access=TokenAccess("another" * 6)))
+    assert not setup(trusted=False).serves_as(setup())
+
+
+# --- over sockets -----------------------------------------------------------------------------------------------
+
+
+@asynccontextmanager
+async def connected() -> AsyncIterator[tuple[Any, Any]]:
+    """A rosbridge client of a ruled server, and the core."""
+    async with local_core() as core:
+        agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
+        watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
+        hub = make_hub(watch, 8480, RULED)
+        gateways = Gateways(hub, "test", setup().rights)
+        policy = AccessPolicy(0, own_names(("base",)), TOKEN.token)
+        server = WebServer(watch, policy, "127.0.0.1", gateways)
+        try:
+            async with hub, aiohttp.ClientSession() as session:
+                await server.start()
+                url = f"ws://127.0.0.1:{server.port}/rosbridge?token={TOKEN.token}"
+                async with session.ws_connect(url) as client:
+                    yield client, core
+                await gateways.close()
+        finally:
+            await server.close()
+
+
+async def asked(socket: Any, **request: object) -> dict[str, Any]:
+    """The first answer to a request."""
+    await socket.send_json(request)
+    async with asyncio.timeout(DEADLINE):
+        values: dict[str, Any] = json.loads((await socket.receive()).data)
+        return values
+
+
+TWIST = {"op": "advertise", "type": "geometry_msgs/Twist"}
+
+
+async def test_a_client_hears_the_rule_of_what_it_may_not() -> None:
+    async with connected() as (client, core):
+        await client.send_json({**TWIST, "topic": "/cmd_vel"})
+        await until(lambda: core.publishers("/cmd_vel"))
+        refused = await asked(client, **{**TWIST, "topic": "/odom"})
+        assert "web may not publish /odom; [[permission]] 2 denies" in refused["msg"]
+        assert not core.publishers("/odom")
+        said = await asked(client, op="subscribe", topic="/camera/image", type="std_msgs/String")
+        assert "[[permission]] 2 denies subscribe of '/camera/**' to 'web'" in said["msg"]
+        called = await asked(client, op="call_service", service="/motors/enable", type="std_srvs/Empty")
+        assert called["result"] is False
+        assert "web may not call /motors/enable" in called["values"]
+
+
+async def test_rosapi_shows_no_parameter_that_is_denied() -> None:
+    async with connected() as (boss, core), node(core, "setter") as setter:
+        await setter.set_param("/motors/pid", 3)
+        await setter.set_param("/name", "base")
+
+        async def names() -> list[str]:
+            found = await asked(boss, op="call_service", service="/rosapi/get_param_names", args={})
+            listed: list[str] = found["values"]["names"]
+            return listed
+
+        async with asyncio.timeout(DEADLINE):
+            while "/name" not in await names():
+                pass
+        assert "/motors/pid" not in await names()
+        await boss.send_json(
+            {"op": "call_service", "service": "/rosapi/set_param", "args": {"name": "/motors/pid", "value": "9"}}
+        )
+        async with asyncio.timeout(DEADLINE):
+            answer = (await boss.receive()).data
+        assert "web may not param /motors/pid" in answer
+        assert await setter.get_param("/motors/pid") == 3
+
+
+async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none() -> None:
+    async with local_core() as core, running_hub(core, RULED) as hub, node(core, "setter") as setter:
+        await setter.set_param("/motors/pid", 3)
+        await setter.set_param("/name", "base")
+        await setter.advertise_service("/motors/enable", "std_srvs/Empty", lambda _: {})
+        await until(lambda: hub.params.value("/name") and hub.params.value("/motors/pid"))
+        await until(lambda: "/motors/enable" in hub.graph.services)
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+
+        async def ask(what: str, **args: object) -> Any:
+            return await answers.answer(Question(1, what, args))
+
+        shown = await ask("params")
+        assert shown["values"]["name"] == "base"
+        assert "motors" not in shown["values"]
+        assert await ask("params", has=shown["digest"]) == {"digest": shown["digest"]}
+        assert "/motors/pid" not in (await ask("param_names"))["names"]
+        for what, args in (
+            ("set_param", {"name": "/motors/pid", "value": 4}),
+            ("delete_param", {"name": "/motors"}),
+            ("call", {"service": "/motors/enable"}),
+        ):
+            with pytest.raises(PeerRefused, match="web may not"):
+                await ask(what, **args)
+        assert await setter.get_param("/motors/pid") == 3
+        answers.close()
+
+
+async def test_a_page_sees_nothing_of_topics_that_are_denied() -> None:
+    rules = denying(subscribe=("/rosout_agg", "/arm/**"))
+    async with local_core() as core, running_hub(core, rules) as hub, node(core) as talker:
+        values = MessageValues(hub)
+        resources, log = ResourceWatch(hub, values), LogFeed(hub, values)
+        resources.start()
+        log.start()
+        for name in ("arm", "base"):
+            publisher = await talker.advertise(f"/{name}/descriptor", TEXT, latch=True)
+            descriptor = msgspec.json.encode(describe(Resource(name, role="acting"), talker.name)).decode()
+            publisher.publish_raw(TEXT.serialize(TEXT.make({"data": descriptor})))
+        await until(lambda: "/base" in resources.facts)
+        assert "/arm" not in resources.facts
+        assert "/rosout_agg" in str(log.refused)
+        resources.close()
+        log.close()
+
+
+async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read, reading, go_on = Node.follow_param, asyncio.Event(), asyncio.Event()
+
+    async def slow(self: Node, key: str) -> Any:
+        reading.set()
+        await go_on.wait()
+        return await read(self, key)
+
+    async def where() -> str:
+        return core.uri
+
+    def made(uri: str, updated: Any) -> Node:
+        return Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated)
+
+    monkeypatch.setattr(Node, "follow_param", slow)
+    async with local_core() as core, node(core, "setter") as setter, Hub(where, made, rules=CAREFUL) as hub:
+        await setter.set_param("/motors/limit", 3)
+        hub.start()
+        await until(reading.is_set)
+        boss = FakeClient(hub)
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+        question = Question(1, "delete_param", {"name": "/motors"})
+        page = asyncio.ensure_future(answers.answer(question))
+        for request in (SetParam(1, "/motors", 5), DeleteParam(2, "/motors"), SetParam(3, "/speed", 1)):
+            boss.ask(request)
+        go_on.set()
+        for handle in (1, 2):
+            assert "web may not param /motors/limit" in (await boss.failure(handle)).error
+        with pytest.raises(PeerRefused, match="web may not param /motors/limit"):
+            await page
+        await boss.answer(ParamsChanged, 3)
+        assert await setter.get_param("/motors") == {"limit": 3}
+        boss.close()
+        answers.close()
+
+
+class Peer:
+    """The parameters of a peer, in the place of ``PeerParams``."""
+
+    def __init__(self) -> None:
+        self.tree = Parameters()
+        self.tree.set("/", {"motors": {"limit": 3}, "speed": {"max": 1.5}})
+
+    def names(self) -> list[str]:
+        return [*self.tree.names()]
+
+    def get(self, key: str) -> Any:
+        return self.tree.get(key)
+
+    def set(self, key: str, value: Any) -> None:
+        self.tree.set(key, value)
+
+    def delete(self, key: str) -> None:
+        self.tree.delete(key)
+
+
+async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    peer = Peer()
+    monkeypatch.setattr(questions, "PeerParams", lambda _client, _peer: peer)
+    monkeypatch.setattr(Answers, "_control", lambda _self: nullcontext())
+    async with local_core() as core, running_hub(core, CAREFUL) as hub:
+        answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+
+        async def ask(what: str, **args: object) -> Any:
+            return await answers.answer(Question(1, what, {"peer": "arm", **args}))
+
+        for what, args in (
+            ("delete_param", {"name": "/motors"}),
+            ("set_param", {"name": "/motors", "value": 5}),
+            ("set_param", {"name": "/motors", "value": {"pid": 1}}),
+            ("set_param", {"name": "/motors/limit/x", "value": 1}),
+        ):
+            with pytest.raises(PeerRefused, match="web may not param /motors/limit;"):
+                await ask(what, **args)
+        assert peer.get("/motors") == {"limit": 3}
+        await ask("set_param", name="/speed/max", value=2)
+        assert peer.get("/speed/max") == 2.0
+        await ask("delete_param", name="/speed")
+        assert peer.names() == ["/motors/limit"]
+        answers.close()
