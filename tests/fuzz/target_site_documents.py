@@ -6,7 +6,9 @@ import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.sites.topic_header import TopicHeader
-from rmpa.gateway.sites.why import SourceThere, WhyAnswer, WhyQuestion, there_stages
+from rmpa.gateway.sites.why import WhyQuestion, parse_ways
+from rmpa.observe.check import OK, Check
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 
 _MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -17,9 +19,7 @@ SEEDS: list[bytes] = [
     ).serialize(),
     msgspec.json.encode(WhyQuestion(site="hall", name="/scan", module="arm")),
     msgspec.json.encode(
-        WhyAnswer(
-            sources=(SourceThere(kind="t", module="arm", node="/n", wanted=True, messages=3),), modules=("arm",)
-        )
+        [Diagnosis.of((Check("sent", OK, "3 messages"),), name="/scan", peer="arm", to="site hall", node="/n")]
     ),
 ]
 
@@ -32,16 +32,17 @@ def fuzz(data: bytes) -> None:
             raise AssertionError(f"{read} does not survive its text")
     except RemoteProtocolError as error:
         _check_text(error)
-    for question in (WhyQuestion, WhyAnswer):
+    for parse in (WhyQuestion.parse, parse_ways):
         try:
-            told = question.parse(data)
+            told = parse(data)
         except RemoteProtocolError as error:
             _check_text(error)
             continue
-        if question.parse(msgspec.json.encode(told)) != told:
+        if parse(msgspec.json.encode(told)) != told:
             raise AssertionError(f"{told} does not survive its text")
-        for source in told.sources if isinstance(told, WhyAnswer) else ():
-            there_stages("hall", "arm", "/scan", source, "")
+        for stage in (stage for way in told for stage in way.stages) if isinstance(told, tuple) else ():
+            if not f"{stage.name}{stage.text}{stage.remedy}".isprintable():
+                raise AssertionError(f"a stage is not safe to show: {stage}")
 
 
 def _check_text(error: RemoteProtocolError) -> None:

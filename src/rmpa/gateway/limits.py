@@ -39,7 +39,7 @@ LATCH_LOOK_TIMEOUT: Final = 10.0
 """Seconds for the publisher's answer to that."""
 LATCH_LOOKS_AT_ONCE: Final = 2
 """Publishers that are asked that at once: each opens a route in the mesh for a moment."""
-SITE_WHY_MAX: Final = 1 * MIB
+SITE_WHY_MAX: Final = MIB // 16
 """Bytes of what another site's gateway tells of a topic for ``rmpa why``."""
 SITES_REMEMBERED_MAX: Final = 256
 """Sites that are remembered as unreachable; those that left first are forgotten first."""

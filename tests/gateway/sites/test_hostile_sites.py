@@ -23,7 +23,7 @@ from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_t
 from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.gateway.sites.topic_header import TopicHeader
-from rmpa.gateway.sites.why import WhyAnswer
+from rmpa.gateway.sites.why import parse_ways
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -156,7 +156,7 @@ BOMBS = [
         ParamQuestion.parse,
         ParamAnswer.parse,
         TopicHeader.parse,
-        WhyAnswer.parse,
+        parse_ways,
         lambda d: to_json(from_json(d)),
     ],
 )

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from rmpa.bridge.permission_gate import PermissionGate
@@ -13,6 +14,7 @@ from rmpa.config.gateway_rules import Crossing, CrossingRule
 from rmpa.config.permission_rules import Access, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.history import SiteHistory
@@ -22,15 +24,14 @@ from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.gateway.sites.why import (
     SourceHere,
-    SourceThere,
-    WhyAnswer,
     WhyQuestion,
     here_stages,
+    parse_ways,
     sent_stages,
-    there_stages,
 )
-from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN
+from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions
 from tests.gateway.memory_zenoh import eventually as until
@@ -38,7 +39,6 @@ from tests.gateway.sites.site_bed import site_bed
 
 if TYPE_CHECKING:
     from rmpa.observe.sites import SitesReport
-    from rmpa.observe.why.diagnosis import Diagnosis
     from tests.gateway.sites.site_bed import Site, SiteBed
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
@@ -238,8 +238,8 @@ async def test_questions_are_checked_before_they_are_passed_on() -> None:
 
 
 def test_losses_are_told_with_the_hop_where_they_happen() -> None:
-    there = SourceThere(kind="t", module="arm", node="/n", wanted=True, messages=90, waiting=2, dropped=7, limited=3)
-    sent = sent_stages("yard", there)[-1]
+    there = {"wanted": True, "messages": 90, "waiting": 2, "dropped": 7, "limited": 3}
+    sent = sent_stages("yard", there, asked=True)[-1]
     assert sent.level is WARN
     assert "7 were dropped by its queue" in sent.text
     assert "3 were left out by rate or size of the rule" in sent.text
@@ -258,11 +258,35 @@ def test_another_definition_is_the_stage_md5() -> None:
     assert (stages[-1].name, stages[-1].level) == ("md5", FAIL)
 
 
-def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
-    (stage,) = there_stages("yard", "arm", "/t", None, "it does not answer")
-    assert stage.level is UNKNOWN
-    service = SourceThere(kind="s", module="arm", node="/n", rule="no gateway.rule fits: everything crosses")
-    assert [s.level for s in there_stages("yard", "arm", "/t", service, "")] == [OK, OK]
+async def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
+        yard.site.graph.add("/chatter", TEXT)
+        await until(lambda: hall.site.shows("/chatter"))
+        await yard.answers.close()
+        (way,) = await hall.why("/chatter")
+        assert levels(way)["source there"] == "unknown"
+        assert levels(way)["demand here"] == "fail"
+
+
+async def test_a_router_that_keeps_a_subscription_back_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = Check("demand there", WARN, "no other site subscribes")
+    way = Diagnosis.of((said,), name="/chatter", peer="arm", to="site hall", node="/talker")
+
+    async def ask(*_args: object, **_kwargs: object) -> object:
+        return (way,), ""
+
+    async with site_bed() as bed:
+        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
+        yard.site.graph.add("/chatter", TEXT)
+        await until(lambda: hall.site.shows("/chatter"))
+        monkeypatch.setattr(SiteWhy, "_ask", ask)
+        (told,) = await hall.why("/chatter")
+        assert levels(told)["demand there"] == "warn"
+        await hall.site.subscribed("/chatter")
+        (told,) = await hall.why("/chatter")
+        assert told.failed is not None
+        assert told.failed.name == "router"
 
 
 def test_history() -> None:
@@ -323,4 +347,15 @@ def test_a_question_that_is_none_is_refused() -> None:
         with pytest.raises(RemoteProtocolError):
             WhyQuestion.parse(data)
     with pytest.raises(RemoteProtocolError):
-        WhyAnswer.parse(b"{")
+        parse_ways(b"{")
+    with pytest.raises(RemoteProtocolError):
+        parse_ways(b" " * limits.SITE_WHY_MAX + b"[]")
+
+
+def test_the_words_of_another_site_are_bounded_and_safe_to_show() -> None:
+    stage = Check("sent\x1b[2J", OK, "a" * 1000, "\nroot@pc:~# ")
+    way = Diagnosis.of((stage,), name="/t", peer="arm", to="site hall")
+    (told,) = parse_ways(msgspec.json.encode([way]))
+    assert told.stages[0].name == "sent\ufffd[2J"
+    assert told.stages[0].remedy == "\ufffdroot@pc:~# "
+    assert len(told.stages[0].text) < 300

@@ -13,18 +13,17 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.why import (
+    DEMAND_THERE,
+    ROUTER,
     SourceHere,
-    SourceThere,
-    WhyAnswer,
     WhyQuestion,
     here_stages,
+    parse_ways,
     refused_stage,
     sent_stages,
-    site_stage,
-    there_stages,
     why_key,
 )
-from rmpa.observe.check import FAIL, OK, Check
+from rmpa.observe.check import FAIL, OK, UNKNOWN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 
 if TYPE_CHECKING:
@@ -118,7 +117,12 @@ class SiteWhy:
             for away, had in self._history.had(name):
                 ways.append(await self._no_way(name, away, had, permitted))
         if not site:
-            ways += self._leaving(name, asker, service=service)
+
+            def own(source: MeshSource) -> bool:
+                mine = source.module == asker and source.name == name if asker else source.here == name
+                return mine and source.kind in kinds
+
+            ways += [msgspec.structs.replace(way, name=name) for way in self._leaving(own)]
         return ways
 
     # --- what comes in ----------------------------------------------------------------------------------------------
@@ -153,34 +157,27 @@ class SiteWhy:
                 )
 
     async def _way(self, here: SourceHere) -> Diagnosis:
-        answer, refusal = await self._ask(here.site, here.name, here.module)
-        mine = (here.kind.value, here.module)
-        there = next(
-            (s for s in answer.sources if (s.kind, s.module) == mine and s.node in (here.node, "")),
-            None,
-        )
+        ways, refusal = await self._ask(here.site, here.name, here.module)
+        mine = _KINDS[here.kind], here.module
+        there = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (here.node, "")), None)
         stages = [
             self._site_stage(here.site),
-            *there_stages(
-                here.site,
-                here.module,
-                here.name,
-                there,
-                refusal,
-                wanted_here=bool(here.report and here.report.get("wanted")),
-            ),
+            *_told(here.site, here.module, here.name, there, refusal),
             *here_stages(self._site, here),
         ]
+        unheard = next((at for at, stage in enumerate(stages) if stage.name == DEMAND_THERE), None)
+        if unheard is not None and stages[unheard].level is not OK and here.report and here.report.get("wanted"):
+            text = f"a node here subscribes, and the gateway of {here.site} hears of none: a router keeps it back"
+            stages[unheard] = Check("router", FAIL, text, ROUTER)
         return self._diagnosis(here.here or here.name, f"{here.site}/{here.module}", here.node, here.kind, stages)
 
     async def _no_way(self, name: str, site: str, module: str, kinds: list[SourceKind]) -> Diagnosis:
         """A site is named that has nothing of that name, as it is seen here; of kinds that the asker may have."""
         service = SourceKind.TOPIC not in kinds
-        answer, refusal = await self._ask(site, name, module, service=service)
-        wanted = [each for each in answer.sources if SourceKind(each.kind) in kinds]
-        there = wanted[0] if wanted else None
-        stages = [self._site_stage(site), *there_stages(site, module, name, there, refusal)]
-        if there is not None and not there.refused:
+        ways, refusal = await self._ask(site, name, module, service=service)
+        there = next((way for way in ways if way.kind in [_KINDS[kind] for kind in kinds]), None)
+        stages = [self._site_stage(site), *_told(site, module, name, there, refusal)]
+        if there is not None and there.flows:
             text = f"site {site} offers it, and the offer has not come here"
             remedy = "in a moment? else routers that do not reach each other, or too many sources: `rmpa site info`"
             stages.append(Check("offer", FAIL, text, remedy))
@@ -194,10 +191,19 @@ class SiteWhy:
         )
 
     def _site_stage(self, site: str) -> Check:
-        catalogue = self._sites.catalogue
-        known = site in catalogue.sites
-        away = self._history.since_ago(site) if site in self._history.away else None
-        return site_stage(site, len(catalogue.gateways(site)), away, known=known)
+        gateways = len(self._sites.catalogue.gateways(site))
+        if site not in self._sites.catalogue.sites:
+            if site in self._history.away:
+                text = f"site {site} is unreachable since {self._history.since_ago(site) or 0:.0f} s"
+                return Check(
+                    "site", FAIL, text, "is its gateway on, and its way to the router? `rmpa site list` there"
+                )
+            text = f"no gateway of a site {site} is at the routers that this site's gateway reaches"
+            return Check("site", FAIL, text, "`rmpa site list` shows the sites; gateway.connect of both must meet")
+        if not gateways:
+            text = f"there is no gateway at site {site} any more, and what it announced is about to go"
+            return Check("site", FAIL, text, f"start `rmpa gateway --site {site}` there")
+        return Check("site", OK, f"site {site} is joined by {gateways} gateway{'s' if gateways > 1 else ''}")
 
     def _diagnosis(self, name: str, peer: str, node: str, kind: SourceKind, stages: list[Check]) -> Diagnosis:
         return Diagnosis.of(
@@ -206,46 +212,50 @@ class SiteWhy:
 
     # --- what goes out ----------------------------------------------------------------------------------------------
 
-    def _leaving(self, name: str, asker: str, *, service: bool) -> Iterator[Diagnosis]:
-        for source, there, to in self._out(""):
-            own = source.module == asker and source.name == name if asker else source.here == name
-            if not own or (service and source.kind is not SourceKind.SERVICE):
-                continue
-            stages = [Check("gateway", OK, f"{self._gateway} of site {self._site} sees it, as {source.here}")]
-            if there.refused:
-                stages.append(refused_stage("here", there.refused, self._site))
-            else:
-                stages.append(Check("rule here", OK, there.rule))
-                if there.kind == SourceKind.TOPIC.value:
-                    stages += sent_stages(self._site, there, no_demand=FAIL)
-            yield Diagnosis.of(
-                until_failure(stages),
-                kind=_KINDS[source.kind],
-                name=name,
-                peer=source.module,
-                to=f"site {to}" if to else "other sites",
-                node=source.node,
-            )
-
-    def _out(self, asking: str) -> Iterator[tuple[MeshSource, SourceThere, str]]:
-        """All sources of this site, as they are for another site (empty: for any), and the site that they are for."""
-        reports = self._reports("out")
-        exports, hidden = self._sites.exports, set()
+    def _leaving(self, meant: Callable[[MeshSource], bool], asking: str = "") -> Iterator[Diagnosis]:
+        """The ways of sources of this site to the one that is ``asking``; empty: for its own module, to all."""
+        reports, exports, hidden = self._reports("out"), self._sites.exports, set()
         for entry in exports.entries:
             source, to = entry.source, entry.announced.to
-            access = ACCESS[source.kind]
-            refused = self._rules.refusal(asking, source.module, source.name, access) if asking else ""
+            if not meant(source):
+                continue
+            refused = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
             if asking and to not in ("", asking):
                 if not refused or source in hidden:
                     continue  # another entry is the one for the site that asks
                 hidden.add(source)
-            report = reports.get((source.kind, self._site, source.module, source.node, source.name, to), {})
             rule = self._rules.outgoing(source.kind, source.module, source.name, source.type, source.node).why
             if to:
                 rule = self._rules.outgoing_to(to, source.module, source.name).why
-            yield source, _there(source, rule, refused, report), to
+            report = reports.get((source.kind, self._site, source.module, source.node, source.name, to), {})
+            yield self._way_out(source, asking, to, rule, refused, report)
         for source, why in exports.refusals():
-            yield source, _there(source, "", why, {}), ""
+            if meant(source):
+                yield self._way_out(source, asking, "", "", why, {})
+
+    def _way_out(
+        self, source: MeshSource, asking: str, to: str, rule: str, refused: str, report: dict[str, Any]
+    ) -> Diagnosis:
+        where = "there" if asking else "here"
+        text = f"{source.node} of {source.module} at {self._site} has it: {source.type}"
+        stages = [Check(f"source {where}", OK, text)]
+        if refused:
+            stages.append(refused_stage(where, refused, self._site))
+        else:
+            stages.append(Check(f"rule {where}", OK, rule or "it may go out"))
+            if source.kind is SourceKind.TOPIC:
+                if problem := report.get("problem"):
+                    remedy = f"`rmpa why {source.name}` at {self._site}"
+                    stages.append(Check(f"publisher {where}", FAIL, str(problem), remedy))
+                stages += sent_stages(self._site, report, asked=bool(asking))
+        return Diagnosis.of(
+            until_failure(stages),
+            kind=_KINDS[source.kind],
+            name=source.name if asking else source.here,
+            peer=source.module,
+            to=f"site {asking or to}" if asking or to else "other sites",
+            node=source.node,
+        )
 
     def _reports(self, way: str) -> dict[_ReportKey, dict[str, Any]]:
         """What the parts report of each source."""
@@ -260,20 +270,23 @@ class SiteWhy:
 
     # --- the other gateway --------------------------------------------------------------------------------------
 
-    async def _ask(self, site: str, name: str, module: str, *, service: bool = False) -> tuple[WhyAnswer, str]:
+    async def _ask(
+        self, site: str, name: str, module: str, *, service: bool = False
+    ) -> tuple[tuple[Diagnosis, ...], str]:
+        """What the gateway of a site tells, and why it does not."""
         if site not in self._sites.catalogue.sites:
-            return WhyAnswer(), "it is not there"
+            return (), "it is not there"
         question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module, service=service))
         replies = await self._session.get(why_key(site), question, timeout=limits.SITE_ASK_TIMEOUT, all_complete=True)
         problem = "it does not answer; is it of an earlier release?"
         for reply in replies:
             try:
                 if reply.ok:
-                    return WhyAnswer.parse(reply.payload), ""
+                    return parse_ways(reply.payload), ""
                 problem = reply.payload.decode(errors="replace")
             except RemoteProtocolError as error:
                 problem = str(error)
-        return WhyAnswer(), problem
+        return (), problem
 
     def _take(self, query: ZenohQuery) -> None:
         if not self._sites.leads:
@@ -286,36 +299,30 @@ class SiteWhy:
             return
         kinds = (SourceKind.SERVICE,) if question.service else tuple(ACCESS)
         denials = {kind: self._rules.denial(question.site, question.name, ACCESS[kind]) for kind in kinds}
-        sources = [
-            there
-            for source, there, _ in self._out(question.site)
-            if source.name == question.name
-            and question.module in ("", source.module)
-            and not denials.get(source.kind, "")
-        ]
+
+        def meant(source: MeshSource) -> bool:
+            named = source.name == question.name and question.module in ("", source.module)
+            return named and not denials.get(source.kind, "")
+
+        ways = list(self._leaving(meant, question.site))
         if denial := denials[kinds[0]]:
             # Whether or not it is there: that is not told.
-            sources.append(SourceThere(kind=kinds[0].value, module=question.module, node="", refused=denial))
-        modules = tuple(sorted({module.name for module in self._sites.exports.modules}))
-        query.reply(query.key, msgspec.json.encode(WhyAnswer(sources=tuple(sources), modules=modules)))
+            stages = [refused_stage("there", denial, self._site)]
+            ways.append(self._diagnosis(question.name, question.module, "", kinds[0], stages))
+        query.reply(query.key, msgspec.json.encode(ways))
         query.finish()
 
 
-def _there(source: MeshSource, rule: str, refused: str, report: dict[str, Any]) -> SourceThere:
-    return SourceThere(
-        kind=source.kind.value,
-        module=source.module,
-        node=source.node,
-        type=source.type,
-        rule=rule,
-        refused=refused,
-        wanted=bool(report.get("wanted")),
-        messages=int(report.get("messages", report.get("calls", 0))),
-        waiting=int(report.get("waiting", 0)),
-        dropped=int(report.get("dropped", report.get("failed", 0))),
-        limited=int(report.get("limited", 0)),
-        problem=str(report.get("problem", "")) if source.kind is SourceKind.TOPIC else "",
-    )
+def _told(site: str, module: str, name: str, there: Diagnosis | None, refusal: str) -> tuple[Check, ...]:
+    """The stages of the exporting site, as its gateway tells them."""
+    if refusal:
+        return (Check("source there", UNKNOWN, f"the gateway of {site} does not tell: {refusal}"),)
+    if there is None:
+        whose = f"{module} at {site}" if module else f"a module at {site}"
+        text = f"no node of {whose} has {name}, as the gateway there sees it"
+        remedy = f"start it there; or the [bridge] or [services] of {whose} keeps it at home: `rmpa why {name}` there"
+        return (Check("source there", FAIL, text, remedy),)
+    return there.stages
 
 
 def _meant(there: SiteSource, site: str, module: str) -> bool:
