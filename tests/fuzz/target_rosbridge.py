@@ -51,7 +51,6 @@ SEEDS: list[bytes] = [
         {"op": "fragment", "id": "f", "data": '{"op": "status"', "num": 0, "total": 2},
         {"op": "fragment", "id": "f", "data": "}", "num": 1, "total": 2},
         decoded(encode_png(b'{"op": "status"}')),
-        {"op": "send_action_goal", "action": "/a", "action_type": "actionlib/Test", "args": [1]},
     ),
     b"B" + cbor2.dumps({"op": "publish", "topic": "/typed", "msg": {"data": cbor2.CBORTag(85, bytes(8))}}),
     b"M\x00\x05\x00\x00\x00hello",

@@ -12,7 +12,7 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, ReceivedMessage, Request
 from rmpa.web.rosbridge.encodings import PublishFrames
-from rmpa.web.rosbridge.session import RosbridgeSession, Verify
+from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
     from rmpa.web.rosbridge.protocol import RosbridgeFrame
@@ -52,12 +52,10 @@ class Types:
 class Client:
     """One client with its session; `now` is the clock of all calls."""
 
-    def __init__(self, frames: PublishFrames | None = None, verify: Verify | None = None) -> None:
+    def __init__(self, frames: PublishFrames | None = None) -> None:
         self.now = 0.0
         self.graph = Graph()
-        self.session = RosbridgeSession(
-            Types(), self.graph, lambda: NOW_NS, frames=frames or PublishFrames(), client="test", verify=verify
-        )
+        self.session = RosbridgeSession(Types(), self.graph, lambda: NOW_NS, frames=frames or PublishFrames())
 
     def send(self, op: str, **values: Any) -> list[Request]:
         return self.send_raw(msgspec.json.encode({"op": op, **values}).decode())

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import cbor2
 import pytest
 
-from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
     Failed,
@@ -318,22 +316,6 @@ def test_levels_of_status_messages() -> None:
     assert "none, error, warning, info" in client.error()
 
 
-def test_without_authentication_nothing_is_done() -> None:
-    auth = {"mac": "m", "client": "c", "dest": "d", "rand": "r", "t": 1, "level": "l", "end": 2}
-    client = Client(verify=lambda op: op.mac == "m")
-    assert not client.send("advertise", topic="/t", type=STRING)
-    assert "authenticate first" in client.error()
-    assert client.session.refused
-    wrong = Client(verify=lambda op: op.mac == "m")
-    wrong.send("auth", **auth | {"mac": "x"})
-    assert wrong.session.refused
-    good = Client(verify=lambda op: op.mac == "m")
-    good.send("auth", **auth)
-    assert not good.session.refused
-    assert good.send("advertise", topic="/t", type=STRING)
-    assert Client().send("auth", **auth) == []
-
-
 def test_all_that_a_client_had_ends_with_it() -> None:
     client = Client()
     (subscribe,) = client.send("subscribe", topic="/t", throttle_rate=1000, queue_length=5)
@@ -376,7 +358,7 @@ def test_all_that_a_client_had_ends_with_it() -> None:
         ('{"op": "png", "data": "AAAA", "num": 0}', "'id', 'num' and 'total'"),
         ('{"op": "service_response", "service": "/s", "id": "i", "result": true}', "is not advertised"),
         ('{"op": "unadvertise_service", "service": "/s"}', "is not advertised"),
-        ('{"op": "advertise_action", "action": "/a", "type": "x/Y"}', "cannot offer an action"),
+        ('{"op": "send_action_goal", "action": "/a", "action_type": "x/Y"}', "unknown op 'send_action_goal'"),
         (b"\xff", "CBOR"),
         (b"\x9b\xff\xff\xff\xff\xff\xff\xff\xff", "CBOR"),
         (b"\x5b\x00\x00\x00\xff\xff\xff\xff\xff", "CBOR"),
@@ -418,68 +400,5 @@ def test_what_a_client_may_have_is_bounded() -> None:
 def test_every_op_is_known() -> None:
     assert OPS.keys() >= {
         "advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service",
-        "unadvertise_service", "service_response", "fragment", "png", "auth", "set_level", "status",
-        "send_action_goal", "cancel_action_goal", "advertise_action", "unadvertise_action", "action_feedback",
-        "action_result",
+        "unadvertise_service", "service_response", "fragment", "png", "set_level", "status",
     }  # fmt: skip
-
-
-# --- actions -----------------------------------------------------------------------------------------------------
-
-TEST = "actionlib/Test"
-
-
-def _goal(client: Client, **values: Any) -> tuple[dict[str, int], PublishMessage]:
-    requests = client.send("send_action_goal", action="/f", action_type=TEST, **values)
-    *begun, publish = requests
-    assert isinstance(publish, PublishMessage)
-    return {each.topic: each.handle for each in begun if isinstance(each, Subscribe | AdvertiseTopic)}, publish
-
-
-def _result(client: Client, part: str, handle: int, goal_id: str, status: int, number: int) -> None:
-    values = {"status": {"goal_id": {"id": goal_id}, "status": status}, part: {part: number}}
-    client.publish(handle, f"{TEST}Action{part.title()}", values)
-
-
-@pytest.mark.parametrize(("status", "code", "ok"), [(3, 4, True), (4, 6, False), (2, 5, False), (5, 6, False)])
-def test_a_goal_goes_to_actionlib_and_its_result_comes_back(status: int, code: int, ok: bool) -> None:
-    client = Client()
-    handles, publish = _goal(client, id="g", args={"goal": 5}, feedback=True)
-    assert handles.keys() == {"/f/result", "/f/feedback", "/f/goal", "/f/cancel"}
-    assert publish.handle == handles["/f/goal"]
-    kind = MessageType(f"{TEST}ActionGoal")
-    goal: Any = kind.to_plain(kind.deserialize(publish.payload))
-    assert goal["goal"] == {"goal": 5}
-    goal_id = goal["goal_id"]["id"]
-    _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
-    _result(client, "feedback", handles["/f/feedback"], "of another client", 1, 7)
-    (cancel,) = client.send("cancel_action_goal", id="g", action="/f")
-    assert isinstance(cancel, PublishMessage)
-    assert cancel.handle == handles["/f/cancel"]
-    assert goal_id.encode() in bytes(cancel.payload)
-    _result(client, "result", handles["/f/result"], goal_id, status, 2)
-    feedback, result = client.received()
-    assert feedback == {"op": "action_feedback", "action": "/f", "id": "g", "values": {"feedback": 1}}
-    assert result == {
-        "op": "action_result", "action": "/f", "id": "g", "values": {"result": 2}, "status": code, "result": ok,
-    }  # fmt: skip
-    _result(client, "result", handles["/f/result"], goal_id, status, 2)
-    assert not client.received()
-
-
-def test_feedback_comes_only_where_it_was_asked_for() -> None:
-    client = Client()
-    handles, publish = _goal(client, id="g", args=[5])
-    kind = MessageType(f"{TEST}ActionGoal")
-    goal_id = kind.deserialize(publish.payload).goal_id.id
-    _result(client, "feedback", handles["/f/feedback"], goal_id, 1, 1)
-    assert not client.received()
-
-
-def test_an_action_that_the_hub_refuses_ends_its_goals() -> None:
-    client = Client()
-    handles, _ = _goal(client, id="g", args={"goal": 5})
-    requests = client.answer(Failed(handles["/f/goal"], "read-only"))
-    (result,) = client.received()
-    assert (result["op"], result["id"], result["result"]) == ("action_result", "g", False)
-    assert {type(each) for each in requests} == {Unsubscribe, UnadvertiseTopic}

@@ -73,9 +73,7 @@ class RosbridgeConnection(ClientConnection):
         # The session itself delays the end of a publisher.
         super().__init__(hub, rights, priority, address, unadvertise_delay=0.0)
         graph = HubGraph(hub, rights)
-        self._session = RosbridgeSession(
-            hub.types, graph, hub.time.now_ns, frames=frames, client=f"rosbridge_{id(self):x}"
-        )
+        self._session = RosbridgeSession(hub.types, graph, hub.time.now_ns, frames=frames)
 
     def opened(self) -> None:
         """Count the client; nothing is sent first."""
@@ -85,8 +83,6 @@ class RosbridgeConnection(ClientConnection):
         """A frame of the client."""
         self._session.receive_frame(data, self._loop.time())
         self._flush()
-        if self._session.refused:
-            self.end(1008, "not authenticated", "message")
 
     def answered(self, answer: Answer) -> None:
         """An answer of the hub."""

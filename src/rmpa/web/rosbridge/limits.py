@@ -15,7 +15,7 @@ CONTAINERS_MAX: Final = 200_000
 ID_MAX: Final = 1 * KIB
 """Characters of an ``id``, which is sent back and kept."""
 NAME_MAX: Final = 1 * KIB
-"""Characters of the name of a topic, service, action or type."""
+"""Characters of the name of a topic, service or type."""
 FRAGMENTS_MAX: Final = 10_000
 """Fragments of one message, sent or received: a fragment of one character would need 100 bytes around it."""
 FRAGMENTED_MAX: Final = 16 * MIB
@@ -43,13 +43,11 @@ ADVERTISED_MAX: Final = 500
 UNADVERTISE_DELAY: Final = 10.0
 """Time until a topic is withdrawn that a client no longer advertises: many advertise it again at once."""
 CALLS_MAX: Final = 1000
-"""Calls of a client without an answer yet, goals of actions and questions of rosapi included."""
+"""Calls of a client without an answer yet, questions of rosapi included."""
 SERVED_MAX: Final = 200
 """Services that a client offers."""
 REQUESTS_MAX: Final = 1000
 """Calls to services that a client offers, without its answer yet."""
-GOALS_MAX: Final = 100
-"""Goals of actions that a client has sent and whose result is not there yet."""
 SHARED_FRAMES: Final = 64
 """Messages kept in the form in which they were sent, for further clients of the same topic."""
 SHARED_BYTES: Final = 16 * MIB

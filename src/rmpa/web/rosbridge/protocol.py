@@ -173,42 +173,6 @@ class RosbridgeStatus(Op, frozen=True, kw_only=True):
     msg: str = ""
 
 
-class Auth(Op, frozen=True, kw_only=True):
-    """Credentials (rosauth). `mac` is the SHA-512 of the secret and all other values; times are UTC seconds."""
-
-    mac: str
-    client: str
-    dest: str
-    rand: str
-    t: int
-    level: str
-    end: int
-
-
-class SendActionGoal(Op, frozen=True, kw_only=True):
-    """A goal for an action; `feedback` asks for feedback, too."""
-
-    action: str
-    action_type: str
-    args: Any = None
-    feedback: bool = False
-    fragment_size: float | None = None
-    compression: str | None = "none"
-
-
-class CancelActionGoal(Op, frozen=True, kw_only=True):
-    """The goal with this `id` is to be cancelled."""
-
-    id: str | int
-    action: str
-
-
-class ServeAction(Op, frozen=True, kw_only=True):
-    """All ops by which ROS 2 clients offer actions, and answer goals."""
-
-    action: str = ""
-
-
 OPS: Final[Mapping[str, type[Op]]] = {
     "advertise": RosbridgeAdvertise,
     "unadvertise": RosbridgeUnadvertise,
@@ -223,13 +187,6 @@ OPS: Final[Mapping[str, type[Op]]] = {
     "png": Png,
     "set_level": SetLevel,
     "status": RosbridgeStatus,
-    "auth": Auth,
-    "send_action_goal": SendActionGoal,
-    "cancel_action_goal": CancelActionGoal,
-    "advertise_action": ServeAction,
-    "unadvertise_action": ServeAction,
-    "action_feedback": ServeAction,
-    "action_result": ServeAction,
 }
 
 
@@ -298,13 +255,13 @@ def graph_name(name: str) -> str:
 
 
 def type_name(name: str) -> str:
-    """``package/Name`` of a type, from that or ``package/msg/Name`` (``srv``, ``action``).
+    """``package/Name`` of a type, from that or ``package/msg/Name`` (``srv``).
 
     Raises:
         OpError: It is no type's name.
     """
     parts = name.split("/") if len(name) <= limits.NAME_MAX else []
-    if len(parts) == 3 and parts[1] in ("msg", "srv", "action"):
+    if len(parts) == 3 and parts[1] in ("msg", "srv"):
         del parts[1]
     plain = "/".join(parts)
     if not is_type_name(plain):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core.errors import RmpaError
 from rmpa.web.hub.requests import (
@@ -18,7 +17,6 @@ from rmpa.web.hub.requests import (
     ServiceResult,
 )
 from rmpa.web.rosbridge import limits, protocol
-from rmpa.web.rosbridge.actions import Actions
 from rmpa.web.rosbridge.calls import Calls
 from rmpa.web.rosbridge.context import LEVELS, SessionContext
 from rmpa.web.rosbridge.encodings import PublishFrames, decode_png
@@ -30,9 +28,7 @@ from rmpa.web.rosbridge.served import RosbridgeServedServices
 from rmpa.web.rosbridge.subscriptions import Subscriptions
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Verify: TypeAlias = Callable[[protocol.Auth], bool]
+    from collections.abc import Callable, Mapping
 
 
 class RosbridgeSession:
@@ -46,9 +42,6 @@ class RosbridgeSession:
         graph: The snapshot of the graph.
         ros_time_ns: The present ROS time in nanoseconds: UTC, or that of ``/clock``.
         frames: Encodes messages; one for all sessions of a process.
-        client: Names the client in ids of goals; unique in the mesh.
-        verify: Checks the op ``auth``, without which all others are refused; None where the server has checked a
-            token already.
     """
 
     def __init__(
@@ -58,19 +51,13 @@ class RosbridgeSession:
         ros_time_ns: Callable[[], int],
         *,
         frames: PublishFrames,
-        client: str = "rosbridge",
-        verify: Verify | None = None,
     ) -> None:
         self._context = SessionContext(types, graph, ros_time_ns)
-        self._verify = verify
-        self.refused = False
-        """Whether the client failed to authenticate: the connection is to be closed."""
         self._fragments = Assembler()
         self._subscriptions = Subscriptions(self._context, frames)
         self._publications = Publications(self._context)
         self._calls = Calls(self._context, Rosapi(graph, types, ros_time_ns))
         self._served = RosbridgeServedServices(self._context)
-        self._actions = Actions(self._context, client)
         self._handlers: Mapping[type[protocol.Op], Callable[[Any], None]] = {
             protocol.RosbridgeUnsubscribe: self._subscriptions.unsubscribe,
             protocol.RosbridgeAdvertise: self._publications.advertise,
@@ -79,12 +66,8 @@ class RosbridgeSession:
             protocol.AdvertiseService: self._served.advertise,
             protocol.UnadvertiseService: self._served.unadvertise,
             protocol.ServiceResponse: self._served.respond,
-            protocol.SendActionGoal: self._actions.send_goal,
-            protocol.CancelActionGoal: self._actions.cancel_goal,
-            protocol.ServeAction: _refuse_to_serve_actions,
             protocol.SetLevel: self._set_level,
             protocol.RosbridgeStatus: lambda _: None,
-            protocol.Auth: lambda _: self._context.status("info", "no authentication by 'auth' is needed"),
         }
 
     # --- in -------------------------------------------------------------------------------------------------------
@@ -101,9 +84,6 @@ class RosbridgeSession:
 
     def _handle(self, values: Mapping[str, Any], now: float, depth: int) -> None:
         name, op = parse_op(values)
-        if self._verify is not None:
-            self._authenticate(op)
-            return
         try:
             if isinstance(op, protocol.Fragment | protocol.Png):
                 self._unwrap(op, now, depth)
@@ -135,14 +115,6 @@ class RosbridgeSession:
             text = decode_png(whole) if isinstance(op, protocol.Png) else whole
             self._handle(parse_frame(text), now, depth + 1)
 
-    def _authenticate(self, op: protocol.Op) -> None:
-        if isinstance(op, protocol.Auth) and self._verify is not None and self._verify(op):
-            self._verify = None
-            self._context.status("info", "authenticated", op.id)
-            return
-        self.refused = True
-        self._context.status("error", "the client must authenticate first, by the op 'auth'", op.id)
-
     def warn(self, text: str, level: str = "warning") -> None:
         """Send a status of the server's own, if the client wants those of its level."""
         self._context.status(level, text)
@@ -155,7 +127,7 @@ class RosbridgeSession:
     def receive_answer(self, answer: Answer, now: float) -> None:
         """Take what the hub answers. Answers to what has ended are ignored."""
         if isinstance(answer, ReceivedMessage):
-            _ = self._subscriptions.receive(answer, now) or self._actions.receive(answer)
+            self._subscriptions.receive(answer, now)
         elif isinstance(answer, ServiceRequest):
             self._served.request(answer)
         elif isinstance(answer, ServiceResult | ServiceFound | ParamsChanged):
@@ -163,7 +135,7 @@ class RosbridgeSession:
         elif isinstance(answer, OtherType):
             self._subscriptions.differs(answer)
         elif isinstance(answer, Failed):
-            parts = (self._subscriptions, self._publications, self._calls, self._served, self._actions)
+            parts = (self._subscriptions, self._publications, self._calls, self._served)
             any(part.fail(answer) for part in parts)
 
     # --- out ------------------------------------------------------------------------------------------------------
@@ -199,13 +171,6 @@ class RosbridgeSession:
 
     def close(self) -> None:
         """The client has gone: `requests_to_send` then ends all that it had."""
-        for part in (self._subscriptions, self._publications, self._calls, self._served, self._actions):
+        for part in (self._subscriptions, self._publications, self._calls, self._served):
             part.close()
         self._context.frames.clear()
-
-
-def _refuse_to_serve_actions(op: protocol.ServeAction) -> None:
-    problem = f"{op.action[: limits.NAME_MAX]}: a client cannot offer an action in ROS 1 by this op"
-    raise OpError(
-        problem, "advertise actionlib's topics result, feedback and status, and subscribe to goal and cancel"
-    )

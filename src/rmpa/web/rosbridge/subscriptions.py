@@ -143,12 +143,11 @@ class Subscriptions:
             self._context.ask(Unsubscribe(topic.handle))
         self._context.status("info", f"unsubscribed from {op.topic}", op.id)
 
-    def receive(self, message: ReceivedMessage, now: float) -> bool:
-        """Take a message of the hub; False if it is of no subscription here."""
+    def receive(self, message: ReceivedMessage, now: float) -> None:
+        """Take a message of the hub."""
         topic = self._by_handle.get(message.handle)
         if topic is not None:
             self._send(topic, topic.throttle.offer(message, now))
-        return topic is not None
 
     def differs(self, other: OtherType) -> None:
         """A publisher has another type: its messages do not come, and the subscription waits for others."""
