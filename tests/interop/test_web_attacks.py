@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
 
-PATHS: Final = ("/", "/static/app.js", "/metrics", "/openapi.json", "/api/v1/snapshot", "/nothing")
+PATHS: Final = ("/", "/static/app.js", "/metrics", "/api/v1/snapshot", "/nothing")
 SOCKETS: Final = {"/": (), "/rosbridge": (), "/foxglove": ("foxglove.websocket.v1",), "/monitor": (SUBPROTOCOL,)}
 """WebSocket paths, with the subprotocols that their clients offer."""
 

@@ -128,7 +128,6 @@ class Routes:
             app.router.add_get(path, self._page)
         app.router.add_get("/metrics", self._metrics)
         app.router.add_get("/healthz", self._health)
-        app.router.add_get("/openapi.json", self._openapi)
         app.router.add_get(rest.PREFIX + "/{below:.*}", self._api)
         return app
 
@@ -250,15 +249,9 @@ class Routes:
             return _response(rest.problem(503, "the agent does not answer"))
         return web.Response(text="ok\n")
 
-    async def _openapi(self, _request: web.Request) -> web.Response:
-        return _response(rest.respond("GET", rest.OPENAPI_PATH, None))
-
     async def _api(self, request: web.Request) -> web.Response:
-        path = request.rel_url.raw_path
-        if path == rest.OPENAPI_PATH:
-            return await self._openapi(request)
         reading = await self._watch.whole()
-        return _response(rest.respond("GET", path, reading.snapshot, reading.problem))
+        return _response(rest.respond(request.rel_url.raw_path, reading.snapshot, reading.problem))
 
     async def _metrics(self, request: web.Request) -> web.Response:
         accept = request.headers.get("Accept", "")
