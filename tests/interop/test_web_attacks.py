@@ -360,7 +360,7 @@ async def test_names_and_values_of_others_are_shown_as_text(
         await shows("resources", "Smart Resources", EVIL)
         await shows("resource/arm%3A%2Fevil", "/evil", EVIL, LINK)
         await shows("log", "Log", f"{EVIL} {LINK}")
-        await shows("alarms", "Alarms", "History")
+        await shows("alarms", "Alarms", "All that is wrong")
         await shows("module/base", "base", EVIL_NAME)
         await shows("", "Mesh", "Modules")
         await page.press("/")

@@ -564,14 +564,10 @@ def test_answers_that_come_too_late_are_ignored() -> None:
     assert not client.frames
 
 
-def test_a_server_says_and_withdraws_its_own_status() -> None:
+def test_a_server_says_its_own_status() -> None:
     client = Client()
     client.do([client.session.status(protocol.StatusLevel.WARNING, "slow", "slow /scan")])
-    client.do([client.session.remove_status("slow /scan")])
-    assert client.json[-2:] == [
-        {"op": "status", "level": 1, "message": "slow", "id": "slow /scan"},
-        {"op": "removeStatus", "statusIds": ["slow /scan"]},
-    ]
+    assert client.json[-1] == {"op": "status", "level": 1, "message": "slow", "id": "slow /scan"}
 
 
 def test_handles_are_never_used_again() -> None:

@@ -155,23 +155,6 @@ async def test_a_page_is_greeted_and_gets_the_state_then_its_changes(core: RosCo
         assert peer.name in page.state["modules"]
         agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=())
         await page.sees(lambda: page.state["modules"][peer.name]["state"] == "away")
-        await page.sees(lambda: page.state["recorded"])
-        [*_, last] = (await page.ask(1, "history"))["value"]
-        assert (last["module"], last["level"]) == (peer.name, "WARN")
-        assert "is away" in last["text"]
-
-
-async def test_a_link_that_is_parked_and_made_again_is_no_event(core: RosCore) -> None:
-    async with page_of(core, READ_ONLY) as (page, agent):
-        [linked, *others] = SNAPSHOT.peers
-        parked = msgspec.structs.replace(linked, state="parked", link=None)
-        for one, word in ((linked, "up"), (parked, "parked"), (linked, "up"), (parked, "parked")):
-            agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(one, *others))
-            await page.sees(lambda word=word: page.state.get("modules", {}).get(linked.name, {}).get("state") == word)
-        agent.snapshot = msgspec.structs.replace(agent.snapshot, peers=(*others,))
-        await page.sees(lambda: page.state["modules"][linked.name]["state"] == "away" and page.state["recorded"])
-        events = [each["text"] for each in (await page.ask(1, "history"))["value"] if each["module"] == linked.name]
-        assert [text.partition(": ")[2].partition(":")[0] for text in events] == ["is away"]
 
 
 async def test_a_page_is_told_when_the_agent_is_silent_and_when_it_is_back(core: RosCore) -> None:
@@ -332,7 +315,6 @@ async def test_a_smart_resource_shows_with_its_alarms_and_leaves_with_its_node(c
             await text_topic(proxy, "/arm/state", "active")
             await text_topic(proxy, "/arm/decision", json.dumps({"profile": "fine", "scores": []}))
             await status_topic(proxy, "/arm/quality", DiagnosticLevel.WARN, "adapting: rate 9 Hz")
-            await status_topic(proxy, "/arm/alarms", DiagnosticLevel.WARN, "rate is low")
             await page.sees(lambda: page.state.get("alarms", {}).get("lab:/arm"))
             seen = page.state["resources"]["lab:/arm"]
             assert (seen["module"], seen["level"], seen["description"]) == ("lab", "WARN", "picks things up")
@@ -342,8 +324,6 @@ async def test_a_smart_resource_shows_with_its_alarms_and_leaves_with_its_node(c
             await page.sees(
                 lambda: page.state["detail"].get("resource:lab:/arm", {}).get("decision", {}).get("profile") == "fine"
             )
-            history = (await page.ask(1, "history"))["value"]
-            assert [(each["resource"], each["text"]) for each in history] == [("lab:/arm", "rate is low")]
         await page.sees(lambda: not page.state["resources"])
 
 
@@ -393,10 +373,7 @@ async def test_a_broken_descriptor_is_no_resource(core: RosCore) -> None:
         assert set(page.state["resources"]) == {"/arm"}
 
 
-async def test_pages_share_what_is_asked_of_the_agent_and_little_is_asked_without_pages(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rmpa.web.monitor.limits.HISTORY_PERIOD", DEADLINE)
+async def test_pages_share_what_is_asked_of_the_agent_and_nothing_is_asked_without_pages(core: RosCore) -> None:
     agent = Agent(core.uri)
     watch = AgentWatch(agent.read)
     async with running_server(core, watch=watch) as server:

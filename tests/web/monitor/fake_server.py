@@ -5,7 +5,7 @@
 It has the real pages and the real ``MonitorSession``; the agent, the hub and all answers are made up here.
 Scenes: ``demo`` (all is well), ``killed`` (the module base was killed), ``sick`` (one of each state, and alarms),
 ``large`` (16 modules, 300 topics), ``mute`` (the agent does not answer), ``sensors`` (a laser and a camera),
-``cut`` (18,000 topics are left out, /odom is one of them).
+``cut`` (18,000 topics are left out).
 """
 
 from __future__ import annotations
@@ -286,10 +286,6 @@ class FakeServer:
         )
 
     def _details(self, kind: str, name: str) -> Tree | None:
-        if self.agent.scene == "cut" and (kind, name) == ("topic", "/odom"):
-            whole = snapshots()[0]
-            found = details(whole, {}, kind, name)
-            return found and found | {"entry": self._builder.entry(whole, kind, name)}
         return details(self._snapshot, {one.key: one for one in self.agent.facts()}, kind, name)
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
@@ -371,10 +367,6 @@ class FakeServer:
         terms = Contracts((ContractRule(("/velocity*",), (), {"max_rate": 20.0}),)).explain(args["topic"], "")
         return {key: {"value": value, "rule": rule} for key, (value, rule) in terms.items()}
 
-    def _answer_find(self, args: dict[str, Any]) -> Any:
-        found = [{"kind": "topic", "name": "/odom", "type": "nav_msgs/Odometry"}]
-        return {"found": found if str(args["text"]) in "/odom" else []}
-
     def _answer_node(self, args: dict[str, Any]) -> Any:
         known = node_detail(self._snapshot, node_key(args["peer"], args["name"]))
         if known is None:
@@ -415,14 +407,6 @@ class FakeServer:
 
     def _answer_configure(self, args: dict[str, Any]) -> Any:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
-
-    def _answer_history(self, _args: dict[str, Any]) -> Any:
-        lines = ((300, "WARN", "adapting: acceleration"), (200, "OK", "well again"))
-        now = time.time()
-        return [
-            {"at": now - ago, "level": level, "resource": "velocity:/velocity", "text": text}
-            for ago, level, text in lines
-        ]
 
 
 class _Client:

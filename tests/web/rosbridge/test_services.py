@@ -397,17 +397,6 @@ def test_details_of_types() -> None:
     assert response["fieldnames"] == ["sum"]
 
 
-def test_rosapi_in_bytes() -> None:
-    client = _robot()
-    rosapi = Rosapi(client.graph, Types(), lambda: NOW_NS)
-    assert len(rosapi.services) == 25
-    kind = ServiceType("rosapi/TopicType")
-    request = memoryview(kind.request.serialize(kind.request.make({"topic": "/b/goal"})))
-    answer = rosapi.call_bytes("/rosapi/topic_type", request)
-    assert isinstance(answer, bytes)
-    assert kind.response.to_plain(kind.response.deserialize(answer)) == {"type": "std_msgs/String"}
-
-
 def test_the_answer_of_rosapi_in_cbor() -> None:
     client = _robot()
     client.send("call_service", service="/rosapi/services", compression="cbor")

@@ -185,10 +185,6 @@ class FoxgloveSession:
         """A status message of the server's own: it says, for example, what a slow client misses."""
         return protocol.FoxgloveStatus(level=level, message=message, id=identity).frame()
 
-    def remove_status(self, *identities: str) -> FoxgloveFrame:
-        """Withdraws status messages of the server's own."""
-        return protocol.RemoveStatus(status_ids=identities).frame()
-
     def close(self) -> list[requests.Request]:
         """End everything that the hub does for this client, which is gone."""
         out: list[requests.Request] = [requests.Unsubscribe(handle) for handle in self._by_handle]

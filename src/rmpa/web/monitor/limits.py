@@ -53,12 +53,6 @@ SERVICES_SHOWN: Final = 2000
 """Services in a state; further ones are counted."""
 NODES_SHOWN: Final = 2000
 """Nodes in a state; further ones are counted."""
-LEFT_OUT_NAMES: Final = 256
-"""Topics and services beyond these that the agent is asked for at one time, because pages look at them."""
-NAMES_FOUND: Final = 40
-"""Names of topics and services that a search of the server finds: as many as a page lists."""
-SEARCH_CHARACTERS: Final = 512
-"""Characters of a search; a name has no more."""
 PARAMETER_NAMES_SHOWN: Final = 5000
 """Names of parameters that a search is given."""
 MODULES_SHOWN: Final = 256
@@ -67,8 +61,6 @@ RING_MODULES: Final = 64
 """From so many modules on, the ring shows those that are not parked: the names of more overlap."""
 FLOW_TOPICS: Final = 8
 """Topics that a flow names; the busiest first."""
-ALARMS_KEPT: Final = 200
-"""Alarms in the history."""
 LOG_LINES: Final = 500
 """Lines of the log that are kept for a page that opens it."""
 LOG_CHARACTERS: Final = 1024
@@ -83,8 +75,6 @@ Heartbeats come every 5 s; in a large mesh they are rarer, and probes come."""
 AGENT_SETTLES: Final = 10.0
 """Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
-LOSS_STANDS: Final = 1.5
-"""Time for which a link must be lost before the history says so: an agent that ends loses its links first."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster keeps its place in the ring."""
 STEADY: Final = 0.03
@@ -115,7 +105,3 @@ DECISION_DEPTH: Final = 32
 """Objects and arrays within each other in what a Smart Resource says of its decision; a deeper one is not shown."""
 STATE_PAUSE_MAX: Final = 0.5
 """The longest pause between two snapshots."""
-HISTORY_PERIOD: Final = 2.0
-"""Time between two snapshots while no page is open: the history tells the changes of links."""
-HISTORY_PERIOD_MAX: Final = 10.0
-"""The same in a large mesh, where it is twenty times as long as a snapshot takes."""

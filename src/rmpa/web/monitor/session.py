@@ -42,11 +42,9 @@ if TYPE_CHECKING:
 
 QUESTIONS: Mapping[str, str] = {
     "why": "",
-    "history": "",
     "describe": "",
     "agent": "",
     "contract": "",
-    "find": "",
     "node": "",
     "param_names": "read_params",
     "params": "read_params",

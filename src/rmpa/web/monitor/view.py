@@ -140,7 +140,6 @@ class StateBuilder:
         snapshot: Snapshot,
         resources: Sequence[ResourceFacts] = (),
         alarms: Sequence[Tree] = (),
-        recorded: int = 0,
         parameters: int = 0,
     ) -> Tree:
         """The state of ``snapshot``.
@@ -150,7 +149,6 @@ class StateBuilder:
             resources: The Smart Resources of all modules.
             alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
                 ``text`` and ``at``.
-            recorded: How many entries the history has had.
             parameters: How often the parameters of this module's core have changed.
         """
         taken = snapshot.taken
@@ -178,7 +176,6 @@ class StateBuilder:
                 if alarm.get("module") not in lost
             },
             "parked": sum(peer.state == "parked" for peer in snapshot.peers),
-            "recorded": recorded,
             "parameters": parameters,
             "notes": [
                 *snapshot.notes[:100],
@@ -195,14 +192,6 @@ class StateBuilder:
         state["hidden"] = {kind: count for kind, count in hidden.items() if count > 0}
         self._steady.sweep()
         return self._shared(state)
-
-    def entry(self, snapshot: Snapshot, kind: str, name: str) -> Tree | None:
-        """What the state would say of a topic or service that it leaves out."""
-        if kind == "topic":
-            topic = next((topic for topic in snapshot.topics if topic.name == name), None)
-            return self._topic(topic, None).entry if topic is not None else None
-        service = next((each for each in snapshot.services if service_key(each) == name), None)
-        return _service(service) if service is not None else None
 
     def unreachable(self, since: float, error: str, remedy: str) -> Tree:
         """The state while the agent does not answer: what was last known, marked as such."""

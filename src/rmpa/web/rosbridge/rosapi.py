@@ -1,7 +1,7 @@
 """The services of rosapi, computed from a snapshot of the graph in memory: no question goes to a master.
 
 Names, requests and responses are those of rosbridge_suite's package rosapi (branch ros1). They are answered here,
-whether or not they are also offered as ROS services (`Rosapi.call_bytes`).
+and not offered as ROS services.
 """
 
 from __future__ import annotations
@@ -170,12 +170,6 @@ class Rosapi:
         # Once to bytes and back: each field is there, and of its type.
         request = codec.json_values(memoryview(codec.write_arguments(arguments, 0).payload))
         return answer(request)
-
-    def call_bytes(self, service: str, request: memoryview) -> bytes | Todo:
-        """Answer a call of a ROS service; as `call`, in ROS 1 bytes."""
-        types = ServiceType(self.services[service])
-        values = self.call(service, codec_for(types.request).json_values(request))
-        return self.response_codec(service).write(values, 0).payload if isinstance(values, dict) else values
 
     def response_codec(self, service: str) -> MessageCodec:
         """Converts a service's responses."""

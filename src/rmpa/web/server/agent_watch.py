@@ -7,7 +7,6 @@ import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError, UnreachableError
@@ -17,7 +16,7 @@ from rmpa.observe.snapshot_decoder import SnapshotDecoder
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from rmpa.observe.snapshot import Snapshot
 
@@ -48,7 +47,6 @@ class AgentWatch:
         read: Asks the agent; may block, and raises ``RmpaError`` where it does not answer.
         clock: Monotonic seconds.
         read_whole: Asks for a snapshot of which nothing is left out, where ``read`` may leave out what is not used.
-        read_named: Asks for a snapshot of some topics and services, likewise.
     """
 
     def __init__(
@@ -56,10 +54,8 @@ class AgentWatch:
         read: Callable[[], Snapshot],
         clock: Callable[[], float] = time.monotonic,
         read_whole: Callable[[], Snapshot] | None = None,
-        read_named: Callable[[Sequence[str], Sequence[str]], Snapshot] | None = None,
     ) -> None:
         self._read = read
-        self._read_named = read_named
         self._read_whole = read_whole
         self._whole: Reading | None = None
         self._pending_whole: asyncio.Task[Reading] | None = None
@@ -94,15 +90,6 @@ class AgentWatch:
                 self._pending_whole = asyncio.create_task(self._ask_whole(read), name="agent watch, whole")
             whole = await asyncio.shield(self._pending_whole)
         return whole
-
-    async def named(self, topics: Sequence[str], services: Sequence[str]) -> Reading:
-        """The topics and services of these names, also where the usual reading leaves them out; no peers."""
-        if self._read_named is None:
-            return await self.reading()
-        read = partial(self._read_named, topics, services)
-        snapshot, problem = await asyncio.get_running_loop().run_in_executor(self._thread, self._read_safely, read)
-        self.reads += 1
-        return Reading(self.reads, self._clock(), snapshot, problem)
 
     async def _ask_whole(self, read: Callable[[], Snapshot]) -> Reading:
         try:
@@ -184,12 +171,6 @@ class ControlReader:
         """Ask for a snapshot of which nothing is left out; raises as a call."""
         with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
             return self._checked(client.snapshot())
-
-    def read_named(self, topics: Sequence[str], services: Sequence[str]) -> Snapshot:
-        """Ask for a snapshot of these topics and services alone; raises as a call."""
-        with ControlClient(choose_agent(self._environ, self._name).path, limits.WEB_WHOLE_TIMEOUT) as client:
-            figures = "newest" if self.figures else False
-            return self._checked(client.snapshot(topics=topics, services=services, peers=False, figures=figures))
 
     def _read(self, **args: object) -> Snapshot:
         began = time.monotonic()

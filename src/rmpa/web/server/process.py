@@ -185,7 +185,7 @@ async def serve(
     web = setup.settings.web
     trust = TrustWatch(os.environ, agent, setup.fits)
     reader = ControlReader(os.environ, agent, trust.check)
-    watch = AgentWatch(reader, read_whole=reader.read_whole, read_named=reader.read_named)
+    watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
 
     def watched(is_open: bool) -> None:

@@ -1,11 +1,10 @@
 // Search over all that has a name, and the list of keys.
 
 import { html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
-import { entries, section } from "./state.js";
+import { entries } from "./state.js";
 import { href } from "./parts.js";
 
 const MOST = 40;
-const PAUSE = 150; // ms after the last letter before the server is asked
 const KINDS = [["modules", "module", "module"], ["topics", "topic", "topic"], ["services", "service", "service"], ["nodes", "node", "node"], ["resources", "resource", "resource"]];
 
 export function find(state, text, parameters = []) {
@@ -43,19 +42,7 @@ export function Search({ state, connection, onClose }) {
   useEffect(() => { if (connection.may("read_params")) connection.ask("param_names").then((value) => setParameters(value.names), () => {}); }, []);
   const [text, setText] = useState("");
   const [at, setAt] = useState(0);
-  // Of very many topics and services the state leaves some out; the server knows all names.
-  const [others, setOthers] = useState([]);
-  const hidden = section(state, "hidden"), cut = Boolean(hidden.topics || hidden.services);
-  useEffect(() => {
-    setOthers([]);
-    if (!cut || !text.trim()) return;
-    let wanted = true;
-    const timer = setTimeout(() => connection.ask("find", { text }).then((value) => wanted && setOthers(value.found), () => {}), PAUSE);
-    return () => { wanted = false; clearTimeout(timer); };
-  }, [text, cut]);
-  const listed = find(state, text, parameters);
-  const known = new Set(listed.map((one) => one.to));
-  const found = [...listed, ...others.map((one) => ({ kind: one.kind, name: one.name, to: href(one.kind, one.name), about: one.type })).filter((one) => !known.has(one.to))].slice(0, 2 * MOST);
+  const found = find(state, text, parameters);
   const chosen = Math.min(at, found.length - 1);
   useEffect(() => document.getElementById(`found-${chosen}`)?.scrollIntoView({ block: "nearest" }), [chosen]);
   const go = (one) => { if (one) { location.hash = one.to; onClose(); } };

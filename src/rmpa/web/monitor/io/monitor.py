@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Monitor:
-    """Follows the mesh for all pages. The history of alarms and the log are kept from ``start`` on.
+    """Follows the mesh for all pages. The log is kept from ``start`` on.
 
     Args:
         hub: Subscribes, and calls services.
@@ -50,7 +50,7 @@ class Monitor:
         )
 
     def start(self) -> None:
-        """Begin to keep alarms and lines of the log; the hub has an event loop by now."""
+        """Begin to keep lines of the log; the hub has an event loop by now."""
         self._hub.start()
         self.resources.start()
         self.log.start()

@@ -52,7 +52,7 @@ class Answers:
 
     Args:
         hub: Calls services, and has this module's parameters.
-        resources: Has the history of alarms.
+        resources: Knows the Smart Resources.
         environ: Says where the agents' sockets are.
         agent: Returns the agent's name; empty for the only one.
     """
@@ -67,11 +67,9 @@ class Answers:
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
         self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
             "why": self._why,
-            "history": self._history,
             "describe": self._describe,
             "agent": self._agent_of,
             "contract": self._contract,
-            "find": self._find,
             "node": self._node,
             "param_names": self._param_names,
             "params": self._params,
@@ -115,29 +113,6 @@ class Answers:
     async def _contract(self, args: Args) -> Any:
         return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
-    async def _find(self, args: Args) -> Any:
-        """Topics and services with all words of ``text`` in their name or type, also those that the state leaves out.
-
-        Names that end with the last word go first, then short ones.
-        """
-        words = _text(args, "text")[: limits.SEARCH_CHARACTERS].lower().split()
-        topics, services = list(self._hub.graph.topics.values()), list(self._hub.graph.services.values())
-
-        def find() -> list[Args]:
-            entries = [
-                *(("topic", each.name, each.name, " ".join(each.types)) for each in topics),
-                *(("service", each.name, _service_key(each), each.type) for each in services),
-            ]
-            found = []
-            for kind, name, key, type_ in entries if words else ():
-                about = f"{kind} {key} {type_}".lower()
-                if all(word in about for word in words):
-                    found.append((not name.lower().endswith(words[-1]), len(name), key, kind, type_))
-            first = sorted(found)[: limits.NAMES_FOUND]
-            return [{"kind": kind, "name": key, "type": type_} for _, _, key, kind, type_ in first]
-
-        return {"found": await asyncio.get_running_loop().run_in_executor(self._threads, find)}
-
     async def _node(self, args: Args) -> Any:
         """The facts about a node, with names of nodes as pages have them."""
         name, peer = _name(args, "name"), _text(args, "peer")
@@ -157,9 +132,6 @@ class Answers:
                 return client.call(op, object, **args)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
-
-    async def _history(self, _args: Args) -> Any:
-        return list(self._resources.history)
 
     async def _describe(self, args: Args) -> Any:
         kind = await self._type_of(self._service(args))

@@ -1,10 +1,9 @@
-"""The Smart Resources of all modules, and their alarms, from the topics that they publish about themselves."""
+"""The Smart Resources of all modules, from the topics that they publish about themselves."""
 
 from __future__ import annotations
 
 import itertools
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
     from rmpa.web.monitor.patch import Tree
 
 _TEXT: Final = "std_msgs/String"
-_ALWAYS: Final = {DESCRIPTOR: _TEXT, "alarms": ARRAY_TYPE}
-"""Topics below each resource, with their types, that are followed for the history of alarms."""
+_ALWAYS: Final = {DESCRIPTOR: _TEXT}
+"""Topics below each resource, with their types, that are always followed."""
 _SHOWN: Final = {"state": _TEXT, "profile": _TEXT, "context": _TEXT, "quality": ARRAY_TYPE}
 """Those that are followed while pages are open."""
 _LOOKED_AT: Final = {"decision": _TEXT, "responses": ARRAY_TYPE, "parameter_updates": CONFIG_TYPE}
@@ -78,11 +77,6 @@ class ResourceWatch:
         self._since: dict[str, tuple[str, float]] = {}
         self._heard: dict[str, ResourceFacts] = {}
         """By key, those included whose descriptor has not come yet."""
-        self.history: deque[dict[str, Any]] = deque(maxlen=limits.ALARMS_KEPT)
-        """Alarms and changes of links since the server started, oldest first: ``at``, ``level``, ``text``, and the
-        key of a ``resource`` or the name of a ``module``."""
-        self.recorded = 0
-        """How many the history has had, those included that are no longer kept."""
 
     @property
     def facts(self) -> dict[str, ResourceFacts]:
@@ -137,11 +131,6 @@ class ResourceWatch:
             lasted = facts.quality(LEVEL_FOR) or 0.0
             before = self._since[key] = facts.level, self._now() - max(0.0, lasted)
         return before[1]
-
-    def record(self, level: str, text: str, at: float, **whose: str) -> None:
-        """Add to the history: of a ``resource``, by its key, or of a ``module``, by its name."""
-        self.recorded += 1
-        self.history.append({"at": round(at, 3), "level": level, "text": text, **whose})
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -215,17 +204,10 @@ class ResourceWatch:
             facts = self._heard.get(key) or ResourceFacts(name=name, peer=peer)
             if topic == DESCRIPTOR:
                 self._heard[key] = msgspec.structs.replace(facts, **_described(values["data"]))
-            elif topic == "alarms":
-                self._alarm(key, values)
             else:  # latched ones may come before the descriptor
                 self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
-
-    def _alarm(self, key: str, values: Any) -> None:
-        for status in map(_status, values["status"]):
-            self._since[key] = status["level"], self._now()
-            self.record(status["level"], status["message"], self._now(), resource=key)
 
 
 def _described(text: str) -> dict[str, Any]:

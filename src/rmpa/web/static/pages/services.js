@@ -20,12 +20,12 @@ export function Services({ state }) {
     <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
     <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that." list=${shown}>
       ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//>
-    ${hidden && html`<p class="empty">${count(hidden)} more services are not listed: the search (/) finds them by name.</p>`}<//><//>`;
+    ${hidden && html`<p class="empty">${count(hidden)} more services are not listed: <code>rmpa service list</code> has them.</p>`}<//><//>`;
 }
 
 export function ServicePage({ name, state, connection }) {
   const detail = section(section(state, "detail"), `service:${name}`);
-  const service = section(state, "services")[name] || detail.entry; // of very many services, the state leaves some out
+  const service = section(state, "services")[name];
   if (!service) return html`<${Page} title=${name} kind="Service"><${Gone} kind="service" name=${name} /><//>`;
   const latency = section(detail, "latency");
   return html`<${Page} title=${service.name} kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}><div class="grid">

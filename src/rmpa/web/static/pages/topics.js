@@ -39,7 +39,7 @@ export function Topics({ state }) {
     <${Panel}><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic is like that." list=${shown}>
       ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//>
     ${filter === "data" && all.length > shown.length && !text && html`<p class="empty">${all.length - shown.length} topics of the log and of Smart Resources about themselves are left out. <button type="button" onClick=${() => setFilter("all")}>Show all</button></p>`}
-    ${hidden && html`<p class="empty">${count(hidden)} more topics are not listed: the search (/) finds them by name.</p>`}<//><//>`;
+    ${hidden && html`<p class="empty">${count(hidden)} more topics are not listed: <code>rmpa topic list</code> has them.</p>`}<//><//>`;
 }
 
 const FIGURES = [["rate", "Rate", hertz], ["p50", "Latency, median", seconds], ["p99", "Latency, 99th percentile", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth], ["lost", "Lost", count]];
@@ -49,7 +49,7 @@ const figureOf = (route, key) => (key === "p50" || key === "p99" ? section(route
 export function TopicPage({ name, state, connection }) {
   const [figure, setFigure] = useState("rate");
   const detail = section(section(state, "detail"), `topic:${name}`);
-  const topic = section(state, "topics")[name] || detail.entry; // of very many topics, the state leaves some out
+  const topic = section(state, "topics")[name];
   if (!topic) return html`<${Page} title=${name} kind="Topic"><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"><${Why} connection=${connection} kind="topic" name=${name} /><//><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
