@@ -12,7 +12,7 @@ from rmpa.web.foxglove.session import FoxgloveSession, Output
 from rmpa.web.hub import requests
 from rmpa.web.hub.rights import Rights
 
-ALL = Rights(publish=True, call_services=True, read_parameters=True, set_parameters=True, fetch_assets=True)
+ALL = Rights(view=True, control=True)
 SEEDS: list[bytes] = [
     b'{"op":"subscribe","subscriptions":[{"id":0,"channelId":1},{"id":1,"channelId":5}]}',
     b'{"op":"unsubscribe","subscriptionIds":[0,1]}',

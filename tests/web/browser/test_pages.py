@@ -548,7 +548,7 @@ async def test_the_gravest_stands_first_and_a_lost_module_above_what_follows_fro
 
 
 async def test_who_may_only_look_sees_no_way_to_change_anything(site: Site) -> None:
-    site.server.rights = Rights(read_parameters=True)
+    site.server.rights = Rights(view=True)
     page = await site.open("params")
     await page.wait_text("noetic")
     assert await page.run("document.querySelectorAll('main button.field, main button.primary').length") == 0

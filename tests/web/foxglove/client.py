@@ -14,7 +14,7 @@ from rmpa.web.hub import requests
 from rmpa.web.hub.requests import GraphService, GraphTopic
 from rmpa.web.hub.rights import Rights
 
-ALL = Rights(publish=True, call_services=True, read_parameters=True, set_parameters=True, fetch_assets=True)
+ALL = Rights(view=True, control=True)
 CHATTER = GraphTopic("/chatter", ("std_msgs/String",), ("/talker",), ("/listener",))
 SET_BOOL = GraphService("/set_bool", "std_srvs/SetBool", ("/server",))
 

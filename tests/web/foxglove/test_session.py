@@ -498,7 +498,7 @@ def test_a_client_without_the_right_is_refused_and_told(forbidden: Any) -> None:
 
 
 def test_a_client_that_may_read_parameters_cannot_set_them() -> None:
-    client = Client(Rights(read_parameters=True))
+    client = Client(Rights(view=True))
     client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]})
     assert client.errors
     assert not any(isinstance(each, requests.SetParam) for each in client.asked)

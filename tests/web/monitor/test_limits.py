@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from rmpa.core.sizes import KIB
 from rmpa.web import limits as web_limits
-from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import limits, messages, session
 
 PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
@@ -29,8 +27,8 @@ def test_each_state_is_of_a_new_snapshot() -> None:
 def test_the_page_has_each_question_and_message() -> None:
     for what in session.QUESTIONS:
         assert f"`{what}`" in PAGE
-    for permission in session.permissions(replace(FULL, drive=True)):
-        assert f"`{permission}`" in PAGE
+    for right in session.RIGHTS:
+        assert f"`{right}`" in PAGE
     for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.AskQuestion, messages.Log):
         assert f"`{kind.__struct_config__.tag}`" in PAGE
     assert f"`{messages.SUBPROTOCOL}`" in PAGE

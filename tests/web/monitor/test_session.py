@@ -383,8 +383,8 @@ def test_the_log_is_left_out_for_a_slow_page() -> None:
 
 
 def test_the_first_message_says_what_the_page_may_do() -> None:
-    page = Page(Rights(call_services=True))
-    assert page.take(page.session.open("pc"))[0]["may"] == ["call"]
+    page = Page(Rights(control=True))
+    assert page.take(page.session.open("pc"))[0]["may"] == ["control"]
 
 
 def test_a_page_gets_signs_of_life_while_nothing_changes() -> None:

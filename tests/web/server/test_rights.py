@@ -152,10 +152,7 @@ def test_clients_may_what_the_settings_say() -> None:
 
     assert rights(TokenAccess(), control=True) is READ_ONLY
     assert rights(control=True) == FULL
-    readers = rights(control=False)
-    assert readers.read_parameters
-    assert (readers.publish, readers.call_services, readers.set_parameters, readers.serve_services) == (False,) * 4
-    assert not readers.drive
+    assert rights(control=False) == Rights(view=True)
     assert rights(control=False, drive=True).drive
     assert not rights(TokenAccess(), control=True, drive=True).drive
 

@@ -86,7 +86,7 @@ class FoxgloveSession:
         self._handles = itertools.count(1)
         self._opened = False
         self._errors = TokenBucket(limits.FOXGLOVE_STATUS_RATE, limits.FOXGLOVE_STATUS_BURST)
-        self._channels = ChannelTable(self._next_handle, services=rights.call_services)
+        self._channels = ChannelTable(self._next_handle, services=rights.control)
         self._parameters = ParameterRequests(self._next_handle)
         self._by_id: dict[int, _Subscription] = {}
         self._by_channel: dict[int, _Subscription] = {}
@@ -106,13 +106,13 @@ class FoxgloveSession:
         """What the client is told that it may do."""
         rights = self._rights
         offered = (
-            (Capability.CLIENT_PUBLISH, rights.publish),
-            (Capability.PARAMETERS, rights.read_parameters),
-            (Capability.PARAMETERS_SUBSCRIBE, rights.read_parameters),
-            (Capability.SERVICES, rights.call_services),
+            (Capability.CLIENT_PUBLISH, rights.control),
+            (Capability.PARAMETERS, rights.view),
+            (Capability.PARAMETERS_SUBSCRIBE, rights.view),
+            (Capability.SERVICES, rights.control),
             (Capability.TIME, self._sim_time),
             (Capability.CONNECTION_GRAPH, True),
-            (Capability.ASSETS, rights.fetch_assets),
+            (Capability.ASSETS, rights.view),
         )
         return tuple(capability for capability, given in offered if given)
 
@@ -210,7 +210,7 @@ class FoxgloveSession:
             case protocol.FoxgloveUnsubscribe():
                 yield from (each for number in message.subscription_ids for each in self._unsubscribe(number))
             case protocol.ClientAdvertise():
-                self._check(self._rights.publish, "publish")
+                self._check(self._rights.control, "publish")
                 yield from (self._advertise(channel) for channel in message.channels)
             case protocol.ClientUnadvertise():
                 yield from (self._unadvertise(number) for number in message.channel_ids)
@@ -231,9 +231,9 @@ class FoxgloveSession:
         | protocol.UnsubscribeParameterUpdates,
     ) -> list[requests.Request]:
         if isinstance(message, protocol.SetParameters):
-            self._check(self._rights.set_parameters, "set parameters")
+            self._check(self._rights.control, "set parameters")
             return self._parameters.set(message)
-        self._check(self._rights.read_parameters, "read parameters", READ_REMEDY)
+        self._check(self._rights.view, "read parameters", READ_REMEDY)
         if isinstance(message, protocol.GetParameters):
             return self._parameters.get(message)
         if isinstance(message, protocol.SubscribeParameterUpdates):
@@ -243,7 +243,7 @@ class FoxgloveSession:
     def _binary(self, message: protocol.ClientBinary) -> list[Output]:
         if isinstance(message, protocol.ServiceCallRequest):
             return [self._call(message)]
-        self._check(self._rights.publish, "publish")
+        self._check(self._rights.control, "publish")
         handle = self._published.get(message.channel_id)
         if handle is None:
             raise SessionError(f"channel {message.channel_id} is not advertised; advertise it before its messages")
@@ -304,7 +304,7 @@ class FoxgloveSession:
     def _call(self, message: protocol.ServiceCallRequest) -> Output:
         call = _Call(message.service_id, message.call_id)
         service = self._channels.services.get(message.service_id)
-        if not self._rights.call_services:
+        if not self._rights.control:
             return _call_failure(call, f"this client may not call services; {CONTROL_REMEDY}")
         if service is None:
             return _call_failure(call, f"there is no service {message.service_id}; it may be gone")
@@ -327,7 +327,7 @@ class FoxgloveSession:
     def _asset_problem(self, uri: str) -> str:
         scheme, _, path = uri.partition("://")
         parts = path.split("/")
-        if not self._rights.fetch_assets:
+        if not self._rights.view:
             return f"this client may not fetch assets; {READ_REMEDY}"
         if scheme != "package" or len(parts) < 2 or not all(parts) or not uri.isprintable():
             return "only files of ROS packages can be fetched: package://NAME/PATH"

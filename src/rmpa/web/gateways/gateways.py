@@ -117,14 +117,15 @@ class Gateways:
             return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
         await self._hub.settled(limits.SETTLE)
         rights = self._rights
+        # Only who sends data has a use for large messages: what aiohttp gathers of one is kept until its end.
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id
             )
-            most = limits.FOXGLOVE_BINARY_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
+            most = limits.FOXGLOVE_BINARY_MAX if rights.control else limits.FOXGLOVE_TEXT_MAX
         else:
             connection = RosbridgeConnection(self._hub, rights, self._priority, address, frames=self._frames)
-            most = rosbridge_limits.FRAME_MAX if _sends_data(rights) else limits.FOXGLOVE_TEXT_MAX
+            most = rosbridge_limits.FRAME_MAX if rights.control else limits.FOXGLOVE_TEXT_MAX
         return await self._serve(request, connection, most)
 
     async def _serve(self, request: web.Request, connection: ClientConnection, most: int) -> web.StreamResponse:
@@ -174,8 +175,3 @@ class Gateways:
         clients = [each for each in self._open.values() if each.prepared]
         closing = [each.close(code=_GOING_AWAY, message=b"the server ends") for each in clients]
         await asyncio.gather(*closing, return_exceptions=True)
-
-
-def _sends_data(rights: Rights) -> bool:
-    """Whether a client has a use for large messages: what aiohttp gathers of one is kept until its end."""
-    return rights.publish or rights.call_services or rights.serve_services

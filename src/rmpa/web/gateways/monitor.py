@@ -58,7 +58,7 @@ class MonitorConnection(ClientConnection):
         monitor: Monitor,
     ) -> None:
         # The joystick publishes by the hub, whatever else the page may publish: nothing.
-        own = dataclasses.replace(rights, publish=rights.drive)
+        own = dataclasses.replace(rights, control=rights.drive)
         super().__init__(hub, own, priority, address, unadvertise_delay=limits.UNADVERTISE_DELAY)
         self._monitor = monitor
         self._session = MonitorSession(

@@ -49,7 +49,7 @@ class HubGraph:
     @property
     def params(self) -> Mapping[str, ParamValue]:
         """The tree of parameters."""
-        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.read_parameters else {}
+        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
 
 
 class RosbridgeConnection(ClientConnection):

@@ -243,7 +243,7 @@ class Hub:
             self.topics.unsubscribe((client.number, request.handle), topic)
 
     def _advertise(self, client: HubClient, request: requests.AdvertiseTopic) -> None:
-        _check(client.rights.publish, "publish")
+        _check(client.rights.control, "publish")
 
         def failed(error: RmpaError) -> None:
             client.publishers.pop(request.handle, None)
@@ -278,7 +278,7 @@ class Hub:
     # --- services ---------------------------------------------------------------------------------------------
 
     def _call(self, client: HubClient, request: requests.CallService) -> None:
-        _check(client.rights.call_services, "call services")
+        _check(client.rights.control, "call services")
         md5sum = self.types.service(request.type).md5sum if request.type else ""
 
         async def call() -> None:
@@ -325,7 +325,7 @@ class Hub:
             self.calls.forget(name)
 
     def _serve(self, client: HubClient, request: requests.ServeService) -> None:
-        _check(client.rights.serve_services, "offer services")
+        _check(client.rights.control, "offer services")
 
         def failed(error: RmpaError) -> None:
             client.services.pop(request.handle, None)
@@ -355,7 +355,7 @@ class Hub:
         self.params.updated(key, value)
 
     def _get_params(self, client: HubClient, request: requests.GetParams) -> None:
-        _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
+        _check(client.rights.view, "read parameters", READ_REMEDY)
 
         async def get() -> None:
             await self.params.loaded.wait()
@@ -365,7 +365,7 @@ class Hub:
         self._run(client, request.handle, get())
 
     def _set_param(self, client: HubClient, request: requests.SetParam) -> None:
-        _check(client.rights.set_parameters, "set parameters")
+        _check(client.rights.control, "set parameters")
 
         async def set_() -> None:
             await self.params.set(request.name, request.value)
@@ -374,7 +374,7 @@ class Hub:
         self._run(client, request.handle, set_())
 
     def _delete_param(self, client: HubClient, request: requests.DeleteParam) -> None:
-        _check(client.rights.set_parameters, "delete parameters")
+        _check(client.rights.control, "delete parameters")
 
         async def delete() -> None:
             await self.params.delete(request.name)
@@ -383,7 +383,7 @@ class Hub:
         self._run(client, request.handle, delete())
 
     def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
-        _check(client.rights.read_parameters, "read parameters", READ_REMEDY)
+        _check(client.rights.view, "read parameters", READ_REMEDY)
 
         def changed(values: Mapping[str, requests.ParamValue]) -> None:
             visible = self.link.rules.visible(values)
@@ -430,7 +430,7 @@ class Hub:
         self._run(client, request.handle, describe())
 
     def _fetch_asset(self, client: HubClient, request: requests.FetchAsset) -> None:
-        _check(client.rights.fetch_assets, "fetch assets", READ_REMEDY)
+        _check(client.rights.view, "fetch assets", READ_REMEDY)
 
         async def fetch() -> None:
             data = await asyncio.to_thread(read_asset, request.uri, request.most, self._environ)

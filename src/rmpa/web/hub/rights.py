@@ -25,24 +25,14 @@ class Rights:
     """What clients may do beyond reading topics and the graph; nothing unless it is said.
 
     Attributes:
-        publish: Publish messages.
-        call_services: Call services.
-        read_parameters: Read parameters.
-        set_parameters: Set and delete them.
-        fetch_assets: Read files of ROS packages.
-        serve_services: Offer services.
-        configure_resources: Choose the profile and the context of a Smart Resource.
+        view: Read parameters, and files of ROS packages.
+        control: Publish, call and offer services, set parameters, choose a Smart Resource's profile and context.
         drive: Command a robot by the monitor's joystick.
         command_age: Seconds that what a client publishes, calls and sets may be old; 0: any age.
     """
 
-    publish: bool = False
-    call_services: bool = False
-    read_parameters: bool = False
-    set_parameters: bool = False
-    fetch_assets: bool = False
-    serve_services: bool = False
-    configure_resources: bool = False
+    view: bool = False
+    control: bool = False
     drive: bool = False
     command_age: float = 0.0
 
@@ -143,17 +133,7 @@ def _bad_key(value: ParamValue) -> str | None:
 
 EVERYTHING = NodeRules()
 READ_ONLY = Rights()
-LOOKS = Rights(read_parameters=True, fetch_assets=True)
-"""With the token alone."""
-FULL = Rights(
-    publish=True,
-    call_services=True,
-    read_parameters=True,
-    set_parameters=True,
-    fetch_assets=True,
-    serve_services=True,
-    configure_resources=True,
-)
+FULL = Rights(view=True, control=True)
 """Everything but ``drive``, which has a setting of its own."""
 CONTROL_REMEDY = "start rmpa web with --control, and give its token"
 """For clients that want to change something."""

@@ -46,33 +46,20 @@ QUESTIONS: Mapping[str, str] = {
     "agent": "",
     "contract": "",
     "node": "",
-    "param_names": "read_params",
-    "params": "read_params",
-    "call": "call",
-    "set_param": "param",
-    "delete_param": "param",
-    "profile": "resource",
-    "context": "resource",
-    "configure": "resource",
+    "param_names": "view",
+    "params": "view",
+    "call": "control",
+    "set_param": "control",
+    "delete_param": "control",
+    "profile": "control",
+    "context": "control",
+    "configure": "control",
 }
-"""All questions, with what a page must be allowed for each (``permissions``); empty: every page may ask it."""
-_PERMISSIONS = {
-    "call": "call_services",
-    "drive": "drive",
-    "param": "set_parameters",
-    "read_params": "read_parameters",
-    "resource": "configure_resources",
-}
-
-_CHANGES = ("call", "param", "resource")
-"""Rights of orders: one that TCP kept over a cut must not act long after the page has given it up."""
+"""All questions, with the right (``Rights``) that a page needs for each; empty: every page may ask it."""
+RIGHTS = ("view", "control", "drive")
+"""What a page may have, as ``hello`` lists it."""
 _NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
 _NO_CONTROL = "this page may only look", "start rmpa web with --control"
-
-
-def permissions(rights: Rights) -> tuple[str, ...]:
-    """What a page may do beyond looking, as ``hello`` lists it, in order."""
-    return tuple(name for name, right in _PERMISSIONS.items() if getattr(rights, right))
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +147,7 @@ class MonitorSession:
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
         about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD, "fastest": fastest}
         about["at"] = self._opened
-        yield _text({"op": "hello", **about, "may": permissions(self._rights)})
+        yield _text({"op": "hello", **about, "may": [right for right in RIGHTS if getattr(self._rights, right)]})
 
     def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
         """A message of the client."""
@@ -212,9 +199,10 @@ class MonitorSession:
         needed = QUESTIONS.get(message.what)
         if needed is None:
             raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
-        if needed and needed not in permissions(self._rights):
-            yield self._failed(message.id, *(_NO_TOKEN if needed == "read_params" else _NO_CONTROL))
-        elif needed in _CHANGES and now - message.at > limits.ORDER_AGE:
+        if needed and not getattr(self._rights, needed):
+            yield self._failed(message.id, *(_NO_TOKEN if needed == "view" else _NO_CONTROL))
+        elif needed == "control" and now - message.at > limits.ORDER_AGE:
+            # One that TCP kept over a cut must not act long after the page has given it up.
             late = min(now - message.at, now - self._opened)
             text = f"the order may have come {late:.0f} s late, and is not carried out"
             yield self._failed(message.id, text, "look at what is, and repeat it")

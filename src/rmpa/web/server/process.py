@@ -18,7 +18,7 @@ from rmpa.core.errors import RmpaError, StartError
 from rmpa.trust.page_names import server_names
 from rmpa.trust.permissions import Permissions
 from rmpa.web.gateways.gateways import Gateways
-from rmpa.web.hub.rights import EVERYTHING, FULL, LOOKS, READ_ONLY, NodeRules
+from rmpa.web.hub.rights import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.io.monitor import Monitor
 from rmpa.web.server import auth
 from rmpa.web.server.agent_watch import AgentWatch, ControlReader
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.trust.status import TrustStatus
-    from rmpa.web.hub.rights import Rights
 
 _log = logging.getLogger(__name__)
 
@@ -103,7 +102,7 @@ class WebSetup:
         web = self.settings.web
         if not self.access.token:
             return READ_ONLY
-        return replace(FULL if web.control else LOOKS, drive=web.drive, command_age=web.command_age_ms / 1000)
+        return Rights(view=True, control=web.control, drive=web.drive, command_age=web.command_age_ms / 1000)
 
     @property
     def rules(self) -> NodeRules:

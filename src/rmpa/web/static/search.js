@@ -39,7 +39,7 @@ function Dialog({ label, onClose, children }) {
 
 export function Search({ state, connection, onClose }) {
   const [parameters, setParameters] = useState([]);
-  useEffect(() => { if (connection.may("read_params")) connection.ask("param_names").then((value) => setParameters(value.names), () => {}); }, []);
+  useEffect(() => { if (connection.may("view")) connection.ask("param_names").then((value) => setParameters(value.names), () => {}); }, []);
   const [text, setText] = useState("");
   const [at, setAt] = useState(0);
   const found = find(state, text, parameters);

@@ -63,34 +63,19 @@ class Answers:
         self._hub = hub
         self._resources = resources
         self._environ = environ
-        self._agent = agent
+        self._agent_name = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
-        self._handlers: Mapping[str, Callable[[Args], Awaitable[Any]]] = {
-            "why": self._why,
-            "describe": self._describe,
-            "agent": self._agent_of,
-            "contract": self._contract,
-            "node": self._node,
-            "param_names": self._param_names,
-            "params": self._params,
-            "set_param": self._set_param,
-            "delete_param": self._delete_param,
-            "call": self._call,
-            "profile": self._profile,
-            "context": self._context,
-            "configure": self._configure,
-        }
 
     async def answer(self, question: Question) -> Any:
         """The answer, as values for JSON.
 
         Args:
-            question: One that the page may ask.
+            question: One that the page may ask (``QUESTIONS``): the method of its name answers.
 
         Raises:
             RmpaError: There is none, or the rules deny it; the text says why.
         """
-        return await self._handlers[question.what](question.args)
+        return await getattr(self, f"_{question.what}")(question.args)
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -107,7 +92,7 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
 
-    async def _agent_of(self, args: Args) -> Any:
+    async def _agent(self, args: Args) -> Any:
         return await self._control_call("agent", peer=_text(args, "peer"))
 
     async def _contract(self, args: Args) -> Any:
@@ -203,7 +188,7 @@ class Answers:
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
     def _control(self) -> ControlClient:
-        agent = choose_agent(self._environ, self._agent() or None)
+        agent = choose_agent(self._environ, self._agent_name() or None)
         return ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT)
 
     # --- services and resources -------------------------------------------------------------------------------

@@ -51,8 +51,8 @@ export function Params({ name, state, connection }) {
     <div class="row filter-row"><${Choice} label="Module" value=${module} onChoose=${setModule} options=${choices} /></div>
     <${Failure} failure=${failure} />
     <${Panel}><input class="filter" type="search" placeholder="Filter by name" aria-label="Filter by name" value=${text} onInput=${(event) => setText(event.target.value)} />
-      ${values ? html`<div class="tree"><${Namespace} tree=${grow(values)} path="" text=${text.toLowerCase()} may=${connection.may("param")} ask=${ask} /></div>` : !failure && html`<p class="empty">Reading …</p>`}<//>
-    ${connection.may("param") && html`<${Panel} title="Set a parameter"><${Setter} ask=${ask} /><//>`}<//>`;
+      ${values ? html`<div class="tree"><${Namespace} tree=${grow(values)} path="" text=${text.toLowerCase()} may=${connection.may("control")} ask=${ask} /></div>` : !failure && html`<p class="empty">Reading …</p>`}<//>
+    ${connection.may("control") && html`<${Panel} title="Set a parameter"><${Setter} ask=${ask} /><//>`}<//>`;
 }
 
 const holds = (value, path, text) => path.toLowerCase().includes(text) || (isTree(value) && Object.entries(value).some(([key, inner]) => holds(inner, `${path}/${key}`, text)));

@@ -40,7 +40,7 @@ export function ServicePage({ name, state, connection }) {
 function Call({ connection, service, about }) {
   const [text, setText] = useState(JSON.stringify(about.request ?? {}, null, 2));
   const [state, set] = useState({});
-  const allowed = connection.may("call");
+  const allowed = connection.may("control");
   const call = (event) => {
     event.preventDefault();
     const { value: request, error } = json(text.trim() || "{}");
