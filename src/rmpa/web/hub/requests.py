@@ -8,8 +8,9 @@ are never reused within a session. Payloads are ROS 1 serialized messages withou
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias, Union
+
+import msgspec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,220 +26,156 @@ Payload: TypeAlias = bytes | bytearray | memoryview
 # --- from a session to the hub ---
 
 
-@dataclass(frozen=True, slots=True)
-class Subscribe:
-    """Messages of `topic`; any type where `type` is None. Latched messages of each source come first."""
+class Request(msgspec.Struct, frozen=True):
+    """What a session asks for."""
 
     handle: int
+
+
+class Subscribe(Request, frozen=True):
+    """Messages of `topic`; any type where `type` is None. Latched messages of each source come first."""
+
     topic: str
     type: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Unsubscribe:
+class Unsubscribe(Request, frozen=True):
     """No more messages for `handle`."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class AdvertiseTopic:
+class AdvertiseTopic(Request, frozen=True):
     """A publisher on `topic`; `latch` keeps its last message for newcomers."""
 
-    handle: int
     topic: str
     type: str
     latch: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class UnadvertiseTopic:
+class UnadvertiseTopic(Request, frozen=True):
     """The publisher of `handle` ends."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class PublishMessage:
+class PublishMessage(Request, frozen=True):
     """One message of the publisher `handle`."""
 
-    handle: int
     payload: Payload
 
 
-@dataclass(frozen=True, slots=True)
-class CallService:
+class CallService(Request, frozen=True):
     """One call; `type` is None where the session does not know it. `timeout` in seconds; None for the hub's own."""
 
-    handle: int
     service: str
     type: str | None
     request: Payload
     timeout: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FindService:
+class FindService(Request, frozen=True):
     """Asks for the type of a service whose type the graph does not say; answered by `ServiceFound` or `Failed`."""
 
-    handle: int
     service: str
 
 
-@dataclass(frozen=True, slots=True)
-class FindServices:
+class FindServices(Request, frozen=True):
     """Asks for the types of all services whose types the graph does not say.
 
     Answered by `ServiceFound` without a type once the graph has them; some may stay unknown.
     """
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class CancelCall:
+class CancelCall(Request, frozen=True):
     """The answer of the call `handle` is no longer wanted."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class ServeService:
+class ServeService(Request, frozen=True):
     """The session answers calls of `service` until `EndService`."""
 
-    handle: int
     service: str
     type: str
 
 
-@dataclass(frozen=True, slots=True)
-class EndService:
+class EndService(Request, frozen=True):
     """The session answers no more calls of `handle`; open calls fail."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class Respond:
+class Respond(Request, frozen=True):
     """The answer to `ServiceRequest` number `call`: serialized bytes where `ok`, else the error's text."""
 
-    handle: int
     call: int
     ok: bool
     response: Payload | str
 
 
-@dataclass(frozen=True, slots=True)
-class GetParams:
+class GetParams(Request, frozen=True):
     """Values of `names`, or of all names below `prefix` where `names` is empty ("/" for all)."""
 
-    handle: int
     names: tuple[str, ...] = ()
     prefix: str = "/"
 
 
-@dataclass(frozen=True, slots=True)
-class SetParam:
+class SetParam(Request, frozen=True):
     """Sets one parameter."""
 
-    handle: int
     name: str
     value: ParamValue
 
 
-@dataclass(frozen=True, slots=True)
-class DeleteParam:
+class DeleteParam(Request, frozen=True):
     """Deletes one parameter, with all below it."""
 
-    handle: int
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class FollowParams:
+class FollowParams(Request, frozen=True):
     """`ParamsChanged` at each change of `names`; of all parameters where `names` is empty."""
 
-    handle: int
     names: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class UnfollowParams:
+class UnfollowParams(Request, frozen=True):
     """Ends a `FollowParams`."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class FollowGraph:
+class FollowGraph(Request, frozen=True):
     """`GraphChanged` now and at each change of topics, services and their nodes."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class UnfollowGraph:
+class UnfollowGraph(Request, frozen=True):
     """Ends a `FollowGraph`."""
 
-    handle: int
 
-
-@dataclass(frozen=True, slots=True)
-class DescribeType:
+class DescribeType(Request, frozen=True):
     """Asks for the definition of a message type, or of a service type where `service`.
 
     `md5sum` asks for the version that a publisher has whose messages came; "" for the one that is known best.
     Answered by `Described`, or by `Failed` where it is not known; then by `Described` if it becomes known later.
     """
 
-    handle: int
     type: str
     service: bool = False
     md5sum: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class FetchAsset:
+class FetchAsset(Request, frozen=True):
     """Asks for a file of a ROS package, `package://NAME/PATH`, of at most `most` bytes.
 
     The answer is `AssetFetched`, or `Failed`. The hub reads only files inside that package's folder.
     """
 
-    handle: int
     uri: str
     most: int
-
-
-Request: TypeAlias = (
-    Subscribe
-    | Unsubscribe
-    | AdvertiseTopic
-    | UnadvertiseTopic
-    | PublishMessage
-    | CallService
-    | FindService
-    | FindServices
-    | CancelCall
-    | ServeService
-    | EndService
-    | Respond
-    | GetParams
-    | SetParam
-    | DeleteParam
-    | FollowParams
-    | UnfollowParams
-    | FollowGraph
-    | UnfollowGraph
-    | DescribeType
-    | FetchAsset
-)
 
 
 # --- from the hub to a session ---
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedMessage:
+class Answer(msgspec.Struct, frozen=True):
+    """What the hub answers."""
+
+    handle: int
+
+
+class ReceivedMessage(Answer, frozen=True):
     """One message for the subscription `handle`. `stamp_ns` is its time of receipt (UTC, nanoseconds).
 
     `source` is the node that published it in this module's graph; "" for a client of the hub. `md5sum` is that of
@@ -246,7 +183,6 @@ class ReceivedMessage:
     `payload` stays valid and unchanged for as long as it is referenced; all sessions share it.
     """
 
-    handle: int
     topic: str
     type: str
     payload: memoryview
@@ -256,59 +192,48 @@ class ReceivedMessage:
     md5sum: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class OtherType:
+class OtherType(Answer, frozen=True):
     """Publishers of the subscription `handle` have only another type, `type`: nothing comes from them.
 
     It is told once for each type; the subscription stays, for publishers of its type.
     """
 
-    handle: int
     topic: str
     type: str
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceResult:
+class ServiceResult(Answer, frozen=True):
     """The answer of a `CallService`: `payload` where `ok`, else `error`."""
 
-    handle: int
     ok: bool
     payload: Payload = b""
     error: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceFound:
+class ServiceFound(Answer, frozen=True):
     """The answer to `FindService`; without a type that to `FindServices`."""
 
-    handle: int
     type: str
     uri: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceRequest:
+class ServiceRequest(Answer, frozen=True):
     """A call to the service that the session serves as `handle`; answered by `Respond` with the same `call`."""
 
-    handle: int
     call: int
     payload: Payload
 
 
-@dataclass(frozen=True, slots=True)
-class ParamsChanged:
+class ParamsChanged(Answer, frozen=True):
     """Values of parameters; None for a deleted one.
 
     It answers `GetParams`, `SetParam` and `DeleteParam` (then `handle` is theirs) and follows `FollowParams`.
     """
 
-    handle: int
-    values: Mapping[str, ParamValue] = field(default_factory=dict)
+    values: Mapping[str, ParamValue] = {}
 
 
-@dataclass(frozen=True, slots=True)
-class GraphTopic:
+class GraphTopic(msgspec.Struct, frozen=True):
     """A topic with its types (more than one where publishers disagree) and the names of its nodes."""
 
     name: str
@@ -317,8 +242,7 @@ class GraphTopic:
     subscribers: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class GraphService:
+class GraphService(msgspec.Struct, frozen=True):
     """A service with its type ("" while unknown), the nodes that offer it and its URI (rosrpc://host:port)."""
 
     name: str
@@ -327,43 +251,35 @@ class GraphService:
     uri: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class GraphChanged:
+class GraphChanged(Answer, frozen=True):
     """The whole graph, as it is now, for `FollowGraph`."""
 
-    handle: int
     topics: tuple[GraphTopic, ...]
     services: tuple[GraphService, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Described:
+class Described(Answer, frozen=True):
     """The definition of a type with all that it embeds, as in a TCPROS header; of a service, of both its halves.
 
     `text` is the message type's, or that of a service's request; `response` that of a service's response. `md5sum` is
     that of the message type; "" for services.
     """
 
-    handle: int
     type: str
     text: str
     response: str = ""
     md5sum: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class AssetFetched:
+class AssetFetched(Answer, frozen=True):
     """The contents of a file that `FetchAsset` asked for."""
 
-    handle: int
     data: Payload
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
+class Failed(Answer, frozen=True):
     """The request of `handle` failed, or what it opened has ended; `remedy` says what to do."""
 
-    handle: int
     error: str
     remedy: str = ""
 
@@ -374,17 +290,3 @@ class Failed:
         if not isinstance(remedy, str):
             remedy = ""
         return cls(handle, str(error).removesuffix(f"; {remedy}") if remedy else str(error), remedy)
-
-
-Answer: TypeAlias = (
-    ReceivedMessage
-    | OtherType
-    | ServiceResult
-    | ServiceFound
-    | ServiceRequest
-    | ParamsChanged
-    | GraphChanged
-    | Described
-    | AssetFetched
-    | Failed
-)
