@@ -55,7 +55,9 @@ class Client:
     def __init__(self, frames: PublishFrames | None = None) -> None:
         self.now = 0.0
         self.graph = Graph()
-        self.session = RosbridgeSession(Types(), self.graph, lambda: NOW_NS, frames=frames or PublishFrames())
+        types: Any = Types()
+        graph: Any = self.graph
+        self.session = RosbridgeSession(types, graph, lambda: NOW_NS, frames=frames or PublishFrames())
 
     def send(self, op: str, **values: Any) -> list[Request]:
         return self.send_raw(msgspec.json.encode({"op": op, **values}).decode())

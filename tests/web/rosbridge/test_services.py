@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import Any, cast
 
 import cbor2
 import msgspec
@@ -253,7 +253,7 @@ def _ask(client: Client, service: str, /, **args: Any) -> Any:
     assert answer["result"], answer
     values = answer["values"]
     # What JSON clients get is also a valid ROS response.
-    rosapi = Rosapi(client.graph, Types(), lambda: NOW_NS)
+    rosapi = Rosapi(cast("Any", client.graph), cast("Any", Types()), lambda: NOW_NS)
     rosapi.response_codec(f"/rosapi/{service}").write(values, 0)
     return values
 
@@ -436,7 +436,7 @@ rosapi/TopicsForType 56f77ff6da756dd27c1ed16ec721072a
 
 def test_the_sums_of_rosapi_are_those_of_genmsg() -> None:
     sums = dict(line.split() for line in MD5.split("\n") if line)
-    offered = Rosapi(_robot().graph, Types(), lambda: 0).services.values()
+    offered = Rosapi(cast("Any", _robot().graph), cast("Any", Types()), lambda: 0).services.values()
     assert {name: ServiceType(name).md5sum for name in offered} == sums
     assert MessageType("rosapi/TypeDef").md5sum == "80597571d79bbeef6c9c4d98f30116a0"
     assert MessageType("rosbridge_msgs/ConnectedClients").md5sum == "d0d53b0c0aa23aa7e4cf52f49bca4b69"

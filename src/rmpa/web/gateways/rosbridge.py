@@ -2,54 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
 from rmpa.web.gateways.websocket_frames import Opcode
+from rmpa.web.rosbridge.rosapi import HubGraph
 from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, ReceivedMessage
+    from rmpa.web.hub.requests import Answer, ReceivedMessage
     from rmpa.web.hub.rights import Rights
     from rmpa.web.rosbridge.encodings import PublishFrames
     from rmpa.web.rosbridge.protocol import RosbridgeFrame
-
-
-@dataclass(frozen=True, slots=True)
-class HubGraph:
-    """The graph as one client may see it: without parameters where it may not read them."""
-
-    hub: Hub
-    rights: Rights
-
-    @property
-    def topics(self) -> Mapping[str, GraphTopic]:
-        """By name, in order of names."""
-        return self.hub.graph.topics
-
-    @property
-    def published(self) -> Mapping[str, str]:
-        """The types of the topics that clients publish, by name: the master may not have them yet."""
-        return self.hub.publishers.topics
-
-    @property
-    def services(self) -> Mapping[str, GraphService]:
-        """By name, in order of names."""
-        return self.hub.graph.services
-
-    @property
-    def nodes(self) -> Sequence[str]:
-        """In order of names."""
-        return self.hub.graph.nodes
-
-    @property
-    def params(self) -> Mapping[str, ParamValue]:
-        """The tree of parameters."""
-        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
 
 
 class RosbridgeConnection(ClientConnection):

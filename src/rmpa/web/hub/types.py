@@ -47,7 +47,7 @@ class TypeLibrary:
         self._asked = asyncio.Semaphore(limits.DESCRIBE_AT_ONCE)
         self._searches = TokenBucket(limits.SEARCH_RATE, limits.SEARCH_BURST)
 
-    # --- at once: TypeSource of the sessions ------------------------------------------------------------------
+    # --- at once, for the sessions ---------------------------------------------------------------------------
 
     def message(self, name: str) -> MessageType:
         """A message type that is known or on this machine; its first search reads files.

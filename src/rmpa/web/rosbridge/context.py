@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from rmpa.web.hub.requests import Request
-    from rmpa.web.rosbridge.rosapi import GraphView, TypeSource
+    from rmpa.web.hub.types import TypeLibrary
+    from rmpa.web.rosbridge.rosapi import HubGraph
 
 LEVELS: Final = ("none", "error", "warning", "info")
 """Each includes those before it."""
@@ -31,7 +32,7 @@ class SessionContext:
         ros_time_ns: The present ROS time in nanoseconds.
     """
 
-    def __init__(self, types: TypeSource, graph: GraphView, ros_time_ns: Callable[[], int]) -> None:
+    def __init__(self, types: TypeLibrary, graph: HubGraph, ros_time_ns: Callable[[], int]) -> None:
         self.types = types
         self.graph = graph
         self.ros_time_ns = ros_time_ns

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
 from rmpa.core.errors import RmpaError
@@ -20,8 +20,10 @@ from rmpa.web.rosbridge.typedefs import typedefs_of
 from rmpa.web.values.codec import MessageCodec, codec_for
 
 if TYPE_CHECKING:
-    from rmpa.ros.types.messages import MessageType
+    from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import GraphService, GraphTopic, ParamValue
+    from rmpa.web.hub.rights import Rights
+    from rmpa.web.hub.types import TypeLibrary
 
 Values: TypeAlias = dict[str, Any]
 NAMESPACE: Final = "/rosapi/"
@@ -32,42 +34,37 @@ _SERVER_TOPICS: Final = ("feedback", "result", "status")
 _STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
 
 
-class GraphView(Protocol):
-    """A snapshot of the mesh as the local core shows it. Names are global."""
+@dataclass(frozen=True, slots=True)
+class HubGraph:
+    """The graph as one client may see it: without parameters where it may not read them."""
+
+    hub: Hub
+    rights: Rights
 
     @property
     def topics(self) -> Mapping[str, GraphTopic]:
         """By name, in order of names."""
+        return self.hub.graph.topics
 
     @property
     def published(self) -> Mapping[str, str]:
         """The types of the topics that clients publish, by name: the master may not have them yet."""
+        return self.hub.publishers.topics
 
     @property
     def services(self) -> Mapping[str, GraphService]:
         """By name, in order of names."""
+        return self.hub.graph.services
 
     @property
     def nodes(self) -> Sequence[str]:
         """In order of names."""
+        return self.hub.graph.nodes
 
     @property
     def params(self) -> Mapping[str, ParamValue]:
-        """The tree of parameters: dictionaries within dictionaries; the root's keys have no slash."""
-
-
-class TypeSource(Protocol):
-    """Finds definitions: those that rmpa brings, this machine's, and those that peers described."""
-
-    def version(self, name: str, md5sum: str) -> MessageType:
-        """The version that a publisher has; errors as for ``message``."""
-        ...
-
-    def message(self, name: str) -> MessageType:
-        """A message type; raises `DefinitionError` if none is known."""
-
-    def service(self, name: str) -> ServiceType:
-        """A service type; raises `DefinitionError` if none is known."""
+        """The tree of parameters."""
+        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +108,7 @@ class Rosapi:
         ros_time_ns: The present ROS time in nanoseconds: UTC, or that of ``/clock``.
     """
 
-    def __init__(self, graph: GraphView, types: TypeSource, ros_time_ns: Callable[[], int]) -> None:
+    def __init__(self, graph: HubGraph, types: TypeLibrary, ros_time_ns: Callable[[], int]) -> None:
         self._graph = graph
         self._types = types
         self._ros_time_ns = ros_time_ns

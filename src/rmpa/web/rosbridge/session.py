@@ -23,12 +23,15 @@ from rmpa.web.rosbridge.encodings import PublishFrames, decode_png
 from rmpa.web.rosbridge.fragments import Assembler
 from rmpa.web.rosbridge.protocol import Id, OpError, Part, RosbridgeFrame, id_of, parse_frame, parse_op
 from rmpa.web.rosbridge.publications import Publications
-from rmpa.web.rosbridge.rosapi import GraphView, Rosapi, TypeSource
+from rmpa.web.rosbridge.rosapi import Rosapi
 from rmpa.web.rosbridge.served import RosbridgeServedServices
 from rmpa.web.rosbridge.subscriptions import Subscriptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from rmpa.web.hub.types import TypeLibrary
+    from rmpa.web.rosbridge.rosapi import HubGraph
 
 
 class RosbridgeSession:
@@ -46,8 +49,8 @@ class RosbridgeSession:
 
     def __init__(
         self,
-        types: TypeSource,
-        graph: GraphView,
+        types: TypeLibrary,
+        graph: HubGraph,
         ros_time_ns: Callable[[], int],
         *,
         frames: PublishFrames,
@@ -149,11 +152,6 @@ class RosbridgeSession:
         """The requests for the hub since the last call."""
         requests, self._context.requests = self._context.requests, []
         return requests
-
-    @property
-    def dropped(self) -> int:
-        """Messages that throttles dropped, of the present subscriptions."""
-        return self._subscriptions.dropped
 
     # --- time -----------------------------------------------------------------------------------------------------
 

@@ -75,11 +75,6 @@ class Subscriptions:
         self._by_handle: dict[int, _Topic] = {}
         self._queued = QueuedBytes()
 
-    @property
-    def dropped(self) -> int:
-        """Messages that throttles dropped, of the present subscriptions."""
-        return sum(each.throttle.dropped for each in self._topics.values())
-
     def subscribe(self, op: protocol.RosbridgeSubscribe, now: float) -> None:
         """Begin a subscription, or change that of the same id.
 

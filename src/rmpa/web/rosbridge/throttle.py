@@ -32,8 +32,6 @@ class Throttle:
     def __init__(self, total: QueuedBytes) -> None:
         self.interval = 0.0
         self.length = 0
-        self.dropped = 0
-        """Messages that were not sent."""
         self._total = total
         self._queue: deque[ReceivedMessage] = deque()
         self._bytes = 0
@@ -53,14 +51,11 @@ class Throttle:
             self._free_at = now + self.interval
             return [message]
         if not self.length:
-            self.dropped += 1
             return []
         size = len(message.payload)
         while self._queue and (len(self._queue) >= self.length or self._bytes + size > limits.QUEUE_BYTES_MAX):
             self._drop_oldest()
-        if self._total.used and self._total.used + size > limits.QUEUES_BYTES_MAX:
-            self.dropped += 1
-        else:
+        if not self._total.used or self._total.used + size <= limits.QUEUES_BYTES_MAX:
             self._queue.append(message)
             self._count(size)
         return self.due(now)
@@ -86,7 +81,6 @@ class Throttle:
 
     def _drop_oldest(self) -> None:
         self._count(-len(self._queue.popleft().payload))
-        self.dropped += 1
 
     def _count(self, size: int) -> None:
         self._bytes += size
