@@ -14,9 +14,7 @@ from rmpa.ros.wire.tcpros import TopicDescription
 _MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 SEEDS: list[bytes] = [
     b"",
-    TopicHeader(
-        TopicDescription("std_msgs/String", _MD5, "string data\n", True), "/n", 7, 5, 1, 2, 3, 2**60
-    ).serialize(),
+    TopicHeader(TopicDescription("std_msgs/String", _MD5, "string data\n", True), "/n", 7, 5, 1).serialize(),
     msgspec.json.encode(WhyQuestion(site="hall", name="/scan", module="arm")),
     msgspec.json.encode(
         [Diagnosis.of((Check("sent", OK, "3 messages"),), name="/scan", peer="arm", to="site hall", node="/n")]

@@ -15,7 +15,7 @@ from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph
-from rmpa.gateway.joining import make_neighbours, open_gateway_session
+from rmpa.gateway.zenoh.trust import open_trusted_session
 from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
@@ -46,12 +46,12 @@ class Gateway:
         realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
         *,
-        open_session: Callable[[Settings], Awaitable[OwnedSession]],
-        make_neighbours: Callable[[AgentGraph, OwnedSession, Settings], Mapping[str, Neighbour]],
+        open_session: Callable[[Settings], Awaitable[OwnedSession]] = open_trusted_session,
+        make_neighbours: Callable[[AgentGraph, OwnedSession, Settings], Mapping[str, Neighbour]] | None = None,
     ) -> None:
         self._settings = replace(settings, relay=True)
         self._open_session = open_session
-        self._make_neighbours = make_neighbours
+        self._make_neighbours = make_neighbours or _make_neighbours
         self.agent = Agent(self._settings, realtime, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
@@ -249,13 +249,32 @@ async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
         await (await opening).close()
 
 
+def _make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings) -> dict[str, Neighbour]:
+    """Make the neighbours that the settings ask for, by their names; they are not started.
+
+    Raises:
+        ConfigError: A setting of one is wrong.
+    """
+    neighbours: dict[str, Neighbour] = {}
+    gateway = settings.gateway
+    if gateway.site:
+        from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
+
+        neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
+    if gateway.ros2.enabled:
+        from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
+
+        neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
+    return neighbours
+
+
 async def _main(
     settings: Settings,
     realtime: tuple[str, ...],
     load: Callable[[], Loaded] | None,
     check: Callable[[], None],
 ) -> None:
-    gateway = Gateway(settings, realtime, load, open_session=open_gateway_session, make_neighbours=make_neighbours)
+    gateway = Gateway(settings, realtime, load)
     await serve(gateway.start, gateway.close, gateway.agent.reloader, lambda: _keep_checking(check))
 
 

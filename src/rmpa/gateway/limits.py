@@ -152,8 +152,6 @@ RESUMED_WITHIN: Final = 10.0
 lost meanwhile is counted. roscpp's and rospy's nodes are back within two."""
 INTERRUPTED_TOPICS_MAX: Final = 1024
 """Topics whose counts are kept while their site is away; of more, the oldest begin anew."""
-LATENCIES_KEPT: Final = 512
-"""Latencies of one topic from which the report's percentiles are computed."""
 ROS2_CALL_TIMEOUT: Final = 600.0
 """Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
 server that dies ends its calls at once."""

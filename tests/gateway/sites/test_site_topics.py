@@ -259,7 +259,7 @@ async def test_a_module_that_goes_takes_its_topics_with_it() -> None:
         await until(lambda: topic.messages == [b"back"])
 
 
-async def test_the_report_tells_site_module_and_latency_and_whose_clock() -> None:
+async def test_the_report_tells_site_and_module() -> None:
     async with site_bed() as bed:
         yard, hall = await bed.pair()
         source = yard.graph.add("/scan", described())
@@ -270,10 +270,6 @@ async def test_the_report_tells_site_module_and_latency_and_whose_clock() -> Non
         sites = report["sites"]
         assert isinstance(sites, dict)
         assert [module["name"] for module in sites["yard"]["modules"]] == ["arm"]
-        latency = hall.topics("in")[0]["latency"]
-        assert isinstance(latency, dict)
-        assert -1 < latency["median"] < 1
-        assert "yard" in latency["clock"]
 
 
 async def _second_gateway(bed: SiteBed) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rmpa.gateway.neighbour import ForeignSource, MeshSource
@@ -41,23 +41,24 @@ class SiteImport:
     announced: SiteSource
 
 
-class SitePart(Protocol):
+class SitePart:
     """One part of the neighbour "other sites"; called only while this gateway leads its site, in the event loop.
 
-    A gateway that stops leading withdraws and hides everything, and says of all modules that they are gone.
+    A gateway that stops leading withdraws and hides everything, and says of all modules that they are gone. What a
+    part does not override it ignores.
     """
 
-    name: str
+    name = ""
     """The key of its report."""
 
     def export(self, entry: SiteExport) -> None:
-        """Offer a source of this site: declare what its messages or calls need. Other kinds are ignored."""
+        """Offer a source of this site: declare what its messages or calls need."""
 
     def withdraw(self, entry: SiteExport) -> None:
         """Take back what ``export`` made."""
 
     def show(self, entry: SiteImport) -> None:
-        """Put a source of another site into the graph. Other kinds are ignored."""
+        """Put a source of another site into the graph."""
 
     def renew(self, old: SiteImport, new: SiteImport) -> None:
         """A source that is shown is now of another run of its module, or its way was interrupted: ask it anew."""
@@ -69,38 +70,8 @@ class SitePart(Protocol):
         """A module came or went; one of this site has this site's name."""
 
     def report(self) -> dict[str, object]:
-        """What ``rmpa site`` shows of it, as JSON values."""
-
-    async def close(self) -> None:
-        """End it: everything was withdrawn and hidden before."""
-
-
-class PassivePart:
-    """A ``SitePart`` that ignores everything; parts override what they need."""
-
-    name = ""
-
-    def export(self, entry: SiteExport) -> None:
-        """Ignore a source of this site."""
-
-    def withdraw(self, entry: SiteExport) -> None:
-        """Ignore that it goes."""
-
-    def show(self, entry: SiteImport) -> None:
-        """Ignore a source of another site."""
-
-    def renew(self, old: SiteImport, new: SiteImport) -> None:
-        """Ignore that it is of another run."""
-
-    def hide(self, entry: SiteImport) -> None:
-        """Ignore that it goes."""
-
-    def module_changed(self, module: SiteModule, there: bool) -> None:
-        """Ignore a module."""
-
-    def report(self) -> dict[str, object]:
-        """Nothing."""
+        """What ``rmpa why`` and ``rmpa site`` are answered from, as JSON values."""
         return {}
 
     async def close(self) -> None:
-        """Nothing is to be closed."""
+        """End it: everything was withdrawn and hidden before."""

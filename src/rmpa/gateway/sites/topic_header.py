@@ -3,8 +3,7 @@ r"""The answer of a gateway to the question for a publisher's header (``…/d/t/
 ::
 
     {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "latching": false,
-     "definition": "string data\n", "node": "/talker", "run": 17, "sequence": 42, "waiting": 0, "dropped": 0,
-     "limited": 0, "time": 1700000000000000000}
+     "definition": "string data\n", "node": "/talker", "run": 17, "sequence": 42, "waiting": 0}
 
 The question's parameters are ``node`` (one publisher of several; without it any) and ``site`` (the site that asks).
 """
@@ -43,9 +42,6 @@ class TopicHeader:
         run: The run of its exporter, by which sequence numbers are told apart.
         sequence: The number of the last message that was taken for the other sites.
         waiting: Messages that wait there for a slow link.
-        dropped: Messages that its queue dropped.
-        limited: Messages that a rule's limit kept back.
-        time: The wall clock there, nanoseconds since 1970.
     """
 
     description: TopicDescription
@@ -53,9 +49,6 @@ class TopicHeader:
     run: int = 0
     sequence: int = 0
     waiting: int = 0
-    dropped: int = 0
-    limited: int = 0
-    time: int = 0
 
     def serialize(self) -> bytes:
         """The JSON of it."""
@@ -82,7 +75,7 @@ class TopicHeader:
             raise RemoteProtocolError(f"another site names the type {type_name[:80]!r}")
         if len(md5sum) != 32 or not _HEX.issuperset(md5sum):
             raise RemoteProtocolError(f"another site names the md5 sum {md5sum[:80]!r}")
-        numbers = {key: _number(fields, key) for key in ("run", "sequence", "waiting", "dropped", "limited", "time")}
+        numbers = {key: _number(fields, key) for key in ("run", "sequence", "waiting")}
         description = TopicDescription(type_name, md5sum, definition, fields.get("latching") is True)
         return cls(description, node, **numbers)
 

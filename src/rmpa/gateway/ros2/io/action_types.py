@@ -96,15 +96,6 @@ class JoinedAction(Generic[_Goals]):
         for each in self._declared:
             each.close()
 
-    def report(self) -> dict[str, object]:
-        """Its state, as JSON values."""
-        return {
-            "action": self.here,
-            "ros2_type": "" if self._goals is None else self._goals.pair.name,
-            "node": self._server,
-            "goals": 0 if self._goals is None else self._goals.active,
-        }
-
     def tell_ros1(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 1."""
         if topic in self._topics:

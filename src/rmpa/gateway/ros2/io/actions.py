@@ -84,9 +84,8 @@ class Ros2Actions:
         self._shown.clear()
 
     def report(self) -> dict[str, object]:
-        """The actions that are joined."""
-        out = [each.report() for each in self._offered.values()]
-        return {"actions": [*out, *(each.report() for each in self._shown.values())]}
+        """Nothing: what is wrong with one is among the problems."""
+        return {}
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -113,8 +112,7 @@ class Ros2Actions:
             return
         result = whole[0]["result"]
         ros1 = action_name(result.type, "ActionResult")
-        out = context.crossing.outgoing(SourceKind.TOPIC, result.module, result.name, result.type, result.node)
-        if out.allowed and ros1:
+        if context.crossing.outgoing(result.module, result.name).allowed and ros1:
             self._offered[name] = OfferedAction(context, name, ros1, whole[0])
             self._offered[name].start()
 

@@ -109,10 +109,8 @@ class Ros2Neighbour:
         context = self.context
         shown: dict[str, object] = {
             "domain": context.settings.ros2.domain,
-            "distribution": context.settings.ros2.distribution,
             "nodes": sorted(context.ros2.nodes),
             "endpoints": len(context.ros2),
-            "own_nodes": context.nodes.names,
             "standing_by": dict(self._standing_by),
             "ignored_tokens": dict(context.ros2.ignored),
             "problems": dict(self._problems),

@@ -252,10 +252,6 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         for topic in self._topics.values():
             topic.close()
 
-    def report(self) -> dict[str, object]:
-        """Its state, as JSON values."""
-        return {"direction": "out", **super().report()}
-
     def tell_ros2(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 2."""
         publisher, gid = self._publishers[topic]

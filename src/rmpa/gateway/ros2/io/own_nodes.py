@@ -66,11 +66,6 @@ class OwnRos2Nodes:
         self._nodes: dict[str, tuple[Ros2Node, Declared]] = {}
         self._uses: dict[str, int] = {}
 
-    @property
-    def names(self) -> list[str]:
-        """The full names of the nodes that are declared."""
-        return sorted(self._nodes)
-
     def declare(
         self, node: str, kind: EntityKind, name: str, type_name: str, type_hash: str, qos: Ros2Qos
     ) -> OwnEndpoint:

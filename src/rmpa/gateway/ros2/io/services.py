@@ -36,7 +36,7 @@ class Ros2Services:
             return False
         if not there:
             self._withdraw(source)
-        elif self._context.crossing.goes_out(source.module, source.name):
+        elif self._context.crossing.outgoing(source.module, source.name).allowed:
             services = self._offered.setdefault(source.here, [])
             services.append(OfferedService(self._context, source, self._counts))
             services[0].start()
@@ -69,7 +69,6 @@ class Ros2Services:
     def report(self) -> dict[str, object]:
         """The services that are joined, and counts of calls, errors and refusals."""
         return {
-            "services_out": {name: each[0].type for name, each in self._offered.items() if each[0].type},
             "services_in": {name: each.server.type for name, each in self._shown.items()},
             "service_calls": dict(self._counts),
         }

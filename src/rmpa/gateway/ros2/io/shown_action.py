@@ -250,11 +250,6 @@ class ShownAction(JoinedAction[GoalsToRos2]):
             topic.close()
         self._topics.clear()
 
-    def report(self) -> dict[str, object]:
-        """Its state, as JSON values."""
-        clients = sum(tap is not None for tap in self._clients.values())
-        return {"direction": "in", **super().report(), "clients": clients}
-
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         """Call a service of the server, and tell the goals what comes of it."""
         if not self._closed:

@@ -137,7 +137,6 @@ class Ros2TopicExport:
             "node": self.source.node,
             "type": self.source.type,
             "ros2_type": "" if endpoint is None else endpoint.type,
-            "type_hash": "" if endpoint is None else endpoint.type_hash,
             "latched": endpoint is not None and endpoint.qos.latched,
             "wanted": self._wanted,
             "rule": self._why,

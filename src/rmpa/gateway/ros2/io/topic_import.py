@@ -183,10 +183,8 @@ class Ros2TopicImport:
             "here": self._decision.name,
             "type": self._ros1_type,
             "ros2_type": self.type,
-            "type_hash": self.type_hash,
             "rule": self._decision.why,
             "lost": self._sequences.lost,
-            "repeated": self._sequences.repeated,
             "unheard": self._unheard,
             "unconverted": self._failed,
         }

@@ -84,7 +84,7 @@ class Ros2Topics:
         self._refused.pop(refused, None)
         if not there:
             return True
-        decision = context.crossing.outgoing(source.kind, source.module, source.name, source.type, source.node)
+        decision = context.crossing.outgoing(source.module, source.name)
         if not valid_name(source.here) or not valid_name(source.proxy):
             self._refuse(refused, "ROS 2 allows no such name: a part of it begins with a digit, or it is too long")
         elif not decision.allowed:

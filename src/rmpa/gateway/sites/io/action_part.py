@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.topics.audience import is_watched
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.sites.part import PassivePart
+from rmpa.gateway.sites.part import SitePart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _STATUS: Final = "actionlib_msgs/GoalStatusArray"
 
 
-class SiteActions(PassivePart):
+class SiteActions(SitePart):
     """Names the action servers of other sites to clients of this one: a ``SitePart``.
 
     Args:
@@ -73,15 +73,6 @@ class SiteActions(PassivePart):
         """It has gone."""
         if self._servers.pop(entry.source, None) is not None:
             self._leave(lambda _, server: server == entry.source)
-
-    def report(self) -> dict[str, object]:
-        """The pairs of a client here and a server at another site."""
-        return {
-            "joined": [
-                {"action": _action(client.here), "client": client.proxy, "site": server.site, "module": server.module}
-                for client, server in self._listening
-            ]
-        }
 
     async def close(self) -> None:
         """Listen no more."""

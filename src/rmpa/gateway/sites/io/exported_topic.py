@@ -317,9 +317,6 @@ class ExportedTopic:
             self._run,
             self._sequence,
             self._waiting(),
-            self.dropped,
-            self._limits.dropped,
-            self._clock.wall_ns(),
         )
         query.reply(query.key, header.serialize())
         query.finish()

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.stats import SampleRing, SampleSummary
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT
 from rmpa.gateway.sites.sequence import SequenceCounter
@@ -78,16 +77,11 @@ class ImportedTopic:
         self.wanted = False
         """Whether its key is subscribed to for it."""
         self._description: TopicDescription | None = None
-        self._header: TopicHeader | None = None
         self._problem = ""
         self._held: deque[tuple[bytes, str]] = deque()
         self._sequence = SequenceCounter() if interrupted is None else interrupted.sequence
         self._traffic = SiteTraffic(clock.now()) if interrupted is None else interrupted.traffic
         self._resumes_until = 0.0 if interrupted is None else clock.now() + limits.RESUMED_WITHIN
-        # Made with the first message: most topics of a large site are never subscribed to.
-        self._latencies: SampleRing | None = None
-        self._clock_offset: float | None = None
-        self._clock_error = float("inf")
         self._check_at = float("inf")
         self._check_pause = limits.IDLE_CHECK
         self._fresh = False
@@ -109,15 +103,12 @@ class ImportedTopic:
         """Why its messages do not come, or are not understood; empty for nothing."""
         return self._problem or self._topic.problem
 
-    def take(self, payload: bytes, sequence: int, stamp: int, source: MessageSource) -> None:
+    def take(self, payload: bytes, sequence: int, source: MessageSource) -> None:
         """Take a message of this publisher, with what its attachment says."""
         if not self._sequence.take(source.run, sequence):
             return
         self._fresh = True
         self._traffic.add(len(payload))
-        if self._latencies is None:
-            self._latencies = SampleRing(limits.LATENCIES_KEPT)
-        self._latencies.add((self._clock.wall_ns() - stamp) / 1e9)
         if source.latched:
             renewed, self._run = source.run != self._run, source.run
             if renewed and payload == self._last_latched:
@@ -157,11 +148,9 @@ class ImportedTopic:
             self._ask()
 
     def report(self) -> dict[str, object]:
-        """What ``rmpa site info`` shows of it, as JSON values; times are in seconds."""
+        """What ``rmpa site info`` shows of it, as JSON values."""
         self._traffic.read(self._clock.now())
-        source, announced, traffic, header = self.entry.source, self.entry.announced, self._traffic, self._header
-        offset = self._clock_offset or 0.0
-        delays = SampleSummary.of(self._latencies or ())
+        source, announced, traffic = self.entry.source, self.entry.announced, self._traffic
         return {
             "site": source.site,
             "module": source.module,
@@ -177,16 +166,8 @@ class ImportedTopic:
             "rate": round(traffic.rate, 2),
             "bandwidth": round(traffic.bandwidth),
             "lost": self._sequence.lost,
-            "old": self._sequence.old,
             "mismatched": self._mismatched,
             "dropped": self._dropped + self._held_dropped,
-            "dropped_there": header.dropped if header is not None else 0,
-            "limited_there": header.limited if header is not None else 0,
-            "latency": {
-                "median": round(delays.p50 + offset, 6) if delays.count else None,
-                "p99": round(delays.p99 + offset, 6) if delays.count else None,
-                "clock": self._clock_text(),
-            },
             "problem": self.problem,
         }
 
@@ -264,13 +245,11 @@ class ImportedTopic:
         """Ask for the header; return whether it need not be asked again."""
         announced = self.entry.announced
         key = f"{ROOT}/{announced.module.site}/{announced.module.name}/d/t{announced.name}"
-        before = self._clock.wall_ns()
         replies = await self._session.get(
             f"{key}?node={announced.node};site={self._site}",
             timeout=limits.HEADER_TIMEOUT,
             priority=ZenohPriority.INTERACTIVE_HIGH,
         )
-        after = self._clock.wall_ns()
         if not replies:
             self._problem = f"site {announced.module.site} does not answer the question for its header"
             return False
@@ -287,12 +266,10 @@ class ImportedTopic:
         except RemoteProtocolError as error:
             self._problem = str(error)
             return False
-        self._compare_clocks(before, after, header.time)
         self._described(header)
         return True
 
     def _described(self, header: TopicHeader) -> None:
-        self._header = header
         self._problem = ""
         self._sequence.announced(header.run, header.sequence - header.waiting)
         if header.waiting:
@@ -321,18 +298,3 @@ class ImportedTopic:
     def _check_soon(self) -> None:
         self._check_pause = limits.IDLE_CHECK
         self._check_at = self._clock.now() + limits.IDLE_CHECK
-
-    # --- clocks ---------------------------------------------------------------------------------------------------
-
-    def _compare_clocks(self, before: int, after: int, there: int) -> None:
-        """Estimate the other gateway's clock from a question and its answer, as NTP does (RFC 5905, section 8)."""
-        error = (after - before) / 2e9
-        if there and 0 <= error < self._clock_error:
-            self._clock_offset = (there - (before + after) / 2) / 1e9
-            self._clock_error = error
-
-    def _clock_text(self) -> str:
-        site = self.entry.source.site
-        if self._clock_offset is None:
-            return f"stamped by the gateway of {site}, read by this machine's clock; not compared"
-        return f"stamped by the gateway of {site}; its clock compared over the link, within {self._clock_error:.6f} s"

@@ -107,17 +107,9 @@ class SiteNeighbour:
 
     def report(self) -> dict[str, object]:
         """Sites, modules, what crosses and what does not, as JSON values."""
-        leader = self._leader
         return {
             "site": self._own.site,
-            "leads": self._active,
-            "leader": {"rank": leader.leader.rank, "instance": leader.leader.instance}
-            if leader is not None
-            else None,
-            "rank": self._own.rank,
-            "instance": self._own.instance,
             "sites": sites_report(self.catalogue, self.imports),
-            "offered": len(self.exports.sources),
             "refused": refusals_report(self.exports, self.imports),
             "counters": site_counts(self.catalogue.counters),
             "parts": {part.name: part.report() for part in self._parts},

@@ -26,7 +26,7 @@ from rmpa.gateway.sites.params import (
     refused_one,
     to_json,
 )
-from rmpa.gateway.sites.part import PassivePart
+from rmpa.gateway.sites.part import SitePart
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ _NEEDS = Needs(
 )
 
 
-class SiteParamExports(PassivePart):
+class SiteParamExports(SitePart):
     """The parameters of this site's modules, as queryables: a ``SitePart``.
 
     Args:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.io.service_exports import SiteServiceExports
 from rmpa.gateway.sites.io.service_imports import SiteServiceImports
-from rmpa.gateway.sites.part import PassivePart
+from rmpa.gateway.sites.part import SitePart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh_api import ZenohSession
 
 
-class SiteServices(PassivePart):
+class SiteServices(SitePart):
     """Services between sites: a ``SitePart``.
 
     Args:

@@ -9,7 +9,7 @@ from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.io.site_why import ACCESS
-from rmpa.gateway.sites.part import PassivePart
+from rmpa.gateway.sites.part import SitePart
 from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
 from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 
 
-class SiteAnswers(PassivePart):
+class SiteAnswers(SitePart):
     """A ``SiteAnswerer``, and a ``SitePart`` to be closed.
 
     Args:

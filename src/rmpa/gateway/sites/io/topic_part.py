@@ -16,6 +16,7 @@ from rmpa.gateway.sites.attachment import AttachmentReader
 from rmpa.gateway.sites.io.exported_topic import ExportedTopic
 from rmpa.gateway.sites.io.imported_topic import ImportedTopic, InterruptedTopic
 from rmpa.gateway.sites.keys import ROOT
+from rmpa.gateway.sites.part import SitePart
 from rmpa.gateway.sites.report import site_counts
 from rmpa.gateway.sites.topic_header import REFUSED
 
@@ -37,11 +38,11 @@ class _Subscription:
     declared: Declared
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
     """By node."""
-    latched: dict[str, tuple[bytes, int, int, MessageSource]] = field(default_factory=dict)
+    latched: dict[str, tuple[bytes, int, MessageSource]] = field(default_factory=dict)
     """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
-class SiteTopics:
+class SiteTopics(SitePart):
     """Topics between sites: a ``SitePart``.
 
     Args:
@@ -167,12 +168,9 @@ class SiteTopics:
     def report(self) -> dict[str, object]:
         """The topics that go out and come in, as far as they are or were used."""
         out = [topic for nodes in self._exported.values() for topic in nodes.values()]
-        into = list(self._imported.values())
         return {
             "out": [topic.report() for topic in out if topic.used],
-            "in": [topic.report() for topic in into if topic.used],
-            "offered": len(out),
-            "shown": len(into),
+            "in": [topic.report() for topic in self._imported.values() if topic.used],
             "counters": site_counts(self.counters),
         }
 
@@ -208,7 +206,7 @@ class SiteTopics:
 
     def _on_sample(self, key: str, sample: ZenohSample) -> None:
         try:
-            sequence, stamp, source = self._reader.read(sample.attachment)
+            sequence, _, source = self._reader.read(sample.attachment)
         except RemoteProtocolError:
             self.counters.add("site.message.malformed")
             return
@@ -220,7 +218,7 @@ class SiteTopics:
             return
         topic = subscription.topics.get(source.node)
         if topic is not None:
-            topic.take(sample.payload, sequence, stamp, source)
+            topic.take(sample.payload, sequence, source)
             return
         self.counters.add("site.message.unwanted_node")
         known = subscription.latched
@@ -229,7 +227,7 @@ class SiteTopics:
             if others + len(sample.payload) > limits.HELD_BYTES:
                 self.counters.add("site.message.unkept")
             else:
-                known[source.node] = sample.payload, sequence, stamp, source
+                known[source.node] = sample.payload, sequence, source
 
     def _check_later(self) -> None:
         if self._check_timer is None and self._subscriptions:
