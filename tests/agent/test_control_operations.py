@@ -15,7 +15,7 @@ from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.graph_changes import GraphRevision, TopicRow
 from rmpa.observe.io.control_client import ControlClient
-from rmpa.observe.io.control_operations import OPERATIONS
+from rmpa.observe.io.control_operations import REPLIES
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
@@ -55,10 +55,7 @@ async def test_each_operation_replies_with_its_type(settings: Callable[..., Sett
 
         def ask() -> dict[str, object]:
             with ControlClient(tmp_path / "a.sock") as client:
-                return {
-                    each.name: client.call(each.name, cast("Any", each.reply), **ARGS[each.name])
-                    for each in OPERATIONS
-                }
+                return {name: client.call(name, cast("Any", reply), **ARGS[name]) for name, reply in REPLIES.items()}
 
         replies = await asyncio.to_thread(ask)
     assert replies.keys() == ARGS.keys()
@@ -139,11 +136,11 @@ async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callab
         assert peer.link is not None
         assert [lane.name for lane in peer.link.lanes] == ["express", "bulk"]
         assert peer.link.lanes[0].bytes_in > 0
-        (why,) = await a.operations.why({"module": "b"})
+        (why,) = await a.why.answer({"module": "b"})
         assert (why.kind, why.flows) == ("module", True)
         assert [stage.name for stage in why.stages][:4] == ["peer", "link", "lanes", "answer"]
         b.bridge.rpc._handlers.pop("agent.info")  # as an agent of an earlier release
-        (why,) = await a.operations.why({"module": "b"})
+        (why,) = await a.why.answer({"module": "b"})
         assert [stage.level.value for stage in why.stages if stage.name == "answer"] == ["unknown"]
 
 

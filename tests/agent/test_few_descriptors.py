@@ -217,7 +217,7 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
             await until(lambda: any(at.proxies.problems for at in b.bridge.sessions.linked()))
             await until(lambda: len(routes(b)) == 5)
             assert all("no file descriptor is left for its proxy" in route.problem for route in routes(b))
-            (found,) = await b.operations.why({"peer": "a", "name": "/t1"})
+            (found,) = await b.why.answer({"peer": "a", "name": "/t1"})
             assert found.failed is not None
             assert found.failed.name == "graph"
             assert "LimitNOFILE=" in found.failed.remedy

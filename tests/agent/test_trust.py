@@ -83,7 +83,7 @@ class Fleet:
         await self.agents.pop(name).close()
 
     async def command(self, agent: str, what: str, **args: object) -> object:
-        return await self.agents[agent].operations.trust({"what": what, **args})
+        return await self.agents[agent].trust_commands.answer_command({"what": what, **args})
 
     async def token(self, **args: object) -> Token:
         reply = await self.command("base", "invite", **args)

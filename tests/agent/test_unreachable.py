@@ -71,7 +71,7 @@ async def registered_by_name(agent: Agent) -> AsyncIterator[None]:
 
 
 async def why(agent: Agent, peer: str, name: str) -> Diagnosis:
-    (found,) = await agent.operations.why({"name": name, "peer": peer})
+    (found,) = await agent.why.answer({"name": name, "peer": peer})
     return found
 
 

@@ -28,7 +28,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def ask(agent: Agent, name: str, peer: str | None = None) -> tuple[Diagnosis, ...]:
-    return await agent.operations.why({"name": name, "peer": peer})
+    return await agent.why.answer({"name": name, "peer": peer})
 
 
 async def flowing(agent: Agent, name: str, peer: str | None = None) -> Diagnosis:
@@ -161,7 +161,7 @@ async def test_policy_for_single_peers(settings: Callable[..., Settings]) -> Non
 async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F811
     deny = ServiceSettings(deny=("/kept",))
     async with running(replace(settings("a"), services=deny), settings("b")) as (a, b), node("server", a) as server:
-        stage, text = stopped_at(await b.operations.why({"name": "/ask", "peer": "a", "service": True}))
+        stage, text = stopped_at(await b.why.answer({"name": "/ask", "peer": "a", "service": True}))
         assert (stage, text) == ("server", "no node of a provides /ask")
 
         def answer(_: object) -> dict[str, object]:

@@ -25,12 +25,12 @@ from rmpa.bridge.io.node_requests import NodeRequests
 from rmpa.bridge.io.twin_watch import TwinWatch
 from rmpa.bridge.naming import Names
 from rmpa.bridge.params.io.part import Params
+from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.counters import Counters
 from rmpa.discovery.io.interfaces import list_interfaces
-from rmpa.observe.io.agent_requests import AgentRequests
 from rmpa.observe.io.control_operations import ControlOperations
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
@@ -40,6 +40,7 @@ from rmpa.observe.io.peer_credentials import control_access
 from rmpa.observe.io.runtime_dir import runtime_dir
 from rmpa.observe.io.site_requests import SiteRequests
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
+from rmpa.observe.peer_agent import INFO
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
 from rmpa.runtime.free_memory import FreeMemory
@@ -161,26 +162,26 @@ class Agent:
             trust=self.trust.status if self.trust is not None else lambda: None,
         )
         self.snapshots = SnapshotBuilder(settings, sources)
-        AgentRequests(self.bridge.rpc, self.snapshots)
+        needs = Needs((), "figures of the agent, none of the module's graph")
+        self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
         self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
         """Answers questions about other sites; a gateway answers them itself."""
-        self._why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots, self.sites)
+        self.why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(
-            settings.name,
-            self.bridge,
-            self.params,
-            self.snapshots,
-            self._why,
-            self.reloader.reload,
-            GraphRevisions(self.core, rows=settings.core_mode == "embedded"),
-            self._trust_operations(),
-            self._nodes,
-            self.sites,
+            settings.name, self.bridge, self.params, self.snapshots, self._nodes, self.sites
         )
+        self.trust_commands = self._trust_operations()
+        handlers: dict[str, Handler] = {
+            **self.operations.handlers(),
+            "why": self.why.answer,
+            "reload": lambda args: self.reloader.reload(check=args.get("check") is True),
+            "graph": GraphRevisions(self.core, rows=settings.core_mode == "embedded").after,
+            "trust": self.trust_commands.answer_command,
+        }
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
             settings.name,
-            self.operations.handlers(),
+            handlers,
             counters=counters,
             access=control_access(settings.control_group),
         )
@@ -266,7 +267,7 @@ class Agent:
         if not before.allows_direct:
             self._warn_of_stale_connections()
         logging.getLogger().setLevel(settings.log_level.upper())
-        for part in (self.bridge, self.snapshots, self._why, self._nodes):
+        for part in (self.bridge, self.snapshots, self.why, self._nodes):
             part.reload(settings)
         self.reloaded()
 

@@ -42,7 +42,7 @@ class ControlRequest(msgspec.Struct, frozen=True):
     """A client's request.
 
     Attributes:
-        op: The name of an operation (``control_operations.OPERATIONS``).
+        op: The name of an operation (``control_operations.REPLIES``).
         args: Its arguments, by name.
     """
 

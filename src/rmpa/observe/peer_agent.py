@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
+
+INFO: Final = "agent.info"
+"""The request for what an agent tells of itself."""
 
 
 class PeerAgent(msgspec.Struct, kw_only=True, frozen=True):

@@ -153,7 +153,7 @@ async def test_the_snapshot_and_why_tell_of_the_gateway(settings: Callable[..., 
         assert (site.state, site.via, site.topics_in) == ("relayed", "g", 1)
         shown.publish(string("one"))
         await until(lambda: sink.count(1))
-        (found,) = await a.operations.why({"name": "/scan"})
+        (found,) = await a.why.answer({"name": "/scan"})
         assert (found.peer, found.node) == ("warehouse", PROXY)
         assert found.failed is None, found
         assert any("g passes on" in stage.text for stage in found.stages)

@@ -91,7 +91,7 @@ class ControlClient:
         """Send a request, and wait for the reply.
 
         Args:
-            op: The name of the operation (``control_operations.OPERATIONS``).
+            op: The name of the operation (``control_operations.REPLIES``).
             type: The type of its value.
             args: Its arguments.
 

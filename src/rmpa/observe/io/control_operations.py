@@ -1,11 +1,9 @@
-"""The operations of the control socket: ``OPERATIONS`` has them all. A new operation is one method and one row."""
+"""The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -19,8 +17,8 @@ from rmpa.core.names import is_global_name
 from rmpa.observe import limits
 from rmpa.observe.contract_term import ContractTerm
 from rmpa.observe.graph_changes import GraphRevision
-from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
 from rmpa.observe.io.site_requests import PARAM as SITE_PARAM
+from rmpa.observe.peer_agent import INFO as AGENT_INFO
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.reload_reply import ReloadReply
 from rmpa.observe.sites import read_site_module
@@ -29,27 +27,17 @@ from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection
+    from collections.abc import Awaitable, Collection
 
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.io.node_requests import NodeRequests
     from rmpa.bridge.params.io.part import Params
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.observe.io.control_server import Handler
-    from rmpa.observe.io.graph_revision import GraphRevisions
     from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
-    from rmpa.observe.why.io.why import WhyService
 
 Args = dict[str, object]
-
-
-class TrustCommands(Protocol):
-    """Answers the commands of ``rmpa trust``: ``agent.trust_operations`` has them."""
-
-    async def answer_command(self, args: Args, /) -> object:
-        """The reply to one command; an ``RmpaError`` is the client's error."""
-        ...
 
 
 class ControlOperations:
@@ -60,10 +48,6 @@ class ControlOperations:
         bridge: Its bridge.
         params: The bridge's part for parameters.
         snapshots: Builds its snapshots.
-        why: Answers ``why``.
-        reload: Reads the settings again; with ``check`` it changes nothing.
-        graph: Counts the changes of the local graph.
-        trust: Answers the commands of ``rmpa trust``.
         nodes: Knows the nodes of this module.
         sites: Answers questions about other sites.
     """
@@ -74,10 +58,6 @@ class ControlOperations:
         bridge: Bridge,
         params: Params,
         snapshots: SnapshotBuilder,
-        why: WhyService,
-        reload: Callable[..., Awaitable[ReloadReply]],
-        graph: GraphRevisions,
-        trust: TrustCommands,
         nodes: NodeRequests,
         sites: SiteRequests,
     ) -> None:
@@ -85,16 +65,21 @@ class ControlOperations:
         self._bridge = bridge
         self._params = params
         self._snapshots = snapshots
-        self._why = why
-        self._reload = reload
-        self._graph = graph
-        self._trust = trust
         self._nodes = nodes
         self._sites = sites
 
     def handlers(self) -> dict[str, Handler]:
-        """The handler of each operation, for ``ControlServer``."""
-        return {operation.name: partial(operation.handler, self) for operation in OPERATIONS}
+        """The handlers of the operations of this class, for ``ControlServer``."""
+        return {
+            "snapshot": self.snapshot_or_figures,
+            "ping": self.ping,
+            "param": self.param,
+            "followed": self.followed,
+            "agent": self.agent,
+            "contract": self.contract,
+            "site": self._sites.answer,
+            "node": self.node,
+        }
 
     def snapshot(self, args: Args) -> Snapshot:
         """A snapshot, or a part of it.
@@ -135,14 +120,6 @@ class ControlOperations:
         times = [await link.ping() for _ in range(count)]
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
-
-    async def why(self, args: Args) -> tuple[Diagnosis, ...]:
-        """The arguments of ``WhyService.answer``."""
-        return await self._why.answer(args)
-
-    async def reload(self, args: Args) -> ReloadReply:
-        """``check``: whether to say only what would change."""
-        return await self._reload(check=args.get("check") is True)
 
     async def param(self, args: Args) -> Any:
         """Pass a request about parameters on to a peer: ``peer``, ``what`` and the ``args`` of that request.
@@ -214,18 +191,6 @@ class ControlOperations:
             raise ConfigError("topic", f"{topic!r} is not a topic", "write /name")
         return self._snapshots.contract(topic, type_name)
 
-    async def graph(self, args: Args) -> GraphRevision:
-        """The arguments of ``GraphRevisions.after``."""
-        return await self._graph.after(args)
-
-    async def trust(self, args: Args) -> object:
-        """``what``: the command, with its own arguments."""
-        return await self._trust.answer_command(args)
-
-    async def site(self, args: Args) -> Any:
-        """The arguments of ``SiteRequests.answer``."""
-        return await self._sites.answer(args)
-
     def _session(self, name: object) -> PeerSession:
         """The linked or parked peer of a name or GUID.
 
@@ -277,33 +242,18 @@ def _request(args: Args, known: Collection[str]) -> str:
     return what
 
 
-@dataclass(frozen=True, slots=True)
-class Operation:
-    """One row of ``OPERATIONS``.
-
-    Args:
-        name: As clients call it.
-        handler: Gets the request's arguments; an ``RmpaError`` becomes the client's error.
-        reply: The type of its value; ``object`` where that depends on the arguments, as said beside it.
-    """
-
-    name: str
-    handler: Callable[[ControlOperations, Args], Awaitable[object] | object]
-    reply: object
-
-
-OPERATIONS: Final = (
-    Operation("snapshot", ControlOperations.snapshot_or_figures, Snapshot),
-    Operation("ping", ControlOperations.ping, PingReply),
-    Operation("why", ControlOperations.why, tuple[Diagnosis, ...]),
-    Operation("reload", ControlOperations.reload, ReloadReply),
-    Operation("param", ControlOperations.param, object),  # the value that the peer replies
-    Operation("graph", ControlOperations.graph, GraphRevision),
-    Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
-    Operation("trust", ControlOperations.trust, object),  # TrustStatus, or as the command says (trust.status)
-    Operation("agent", ControlOperations.agent, PeerAgent),
-    Operation("contract", ControlOperations.contract, dict[str, ContractTerm]),
-    Operation("site", ControlOperations.site, object),  # as the questions of observe.io.site_requests say
-    Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
-)
-"""All operations of the control socket."""
+REPLIES: Final[dict[str, object]] = {
+    "snapshot": Snapshot,
+    "ping": PingReply,
+    "why": tuple[Diagnosis, ...],
+    "reload": ReloadReply,
+    "param": object,  # the value that the peer replies
+    "graph": GraphRevision,
+    "followed": tuple[FollowedInfo, ...],
+    "trust": object,  # TrustStatus, or as the command says (trust.status)
+    "agent": PeerAgent,
+    "contract": dict[str, ContractTerm],
+    "site": object,  # as the questions of observe.io.site_requests say
+    "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
+}
+"""All operations of the control socket, with the type of the value; ``object``: it depends on the arguments."""

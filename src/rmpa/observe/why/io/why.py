@@ -16,8 +16,8 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
-from rmpa.observe.io.agent_requests import INFO as AGENT_INFO
 from rmpa.observe.io.site_requests import WHY as WHY_SITES
+from rmpa.observe.peer_agent import INFO as AGENT_INFO
 from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.why.diagnosis import PERMISSION_THERE, BothEnds, Diagnosis, TopicAtPublisher, without_rules
 from rmpa.observe.why.direct_stages import connected_directly
