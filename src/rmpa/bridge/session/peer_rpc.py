@@ -43,7 +43,7 @@ class PeerRpc(Part):
     """Sends requests to the peers, and responds to theirs.
 
     Args:
-        counters: Counts ``ask.refused``, ``ask.failed`` and ``ask.late``.
+        counters: Counts ``ask.failed`` and ``ask.late``.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -183,7 +183,6 @@ class PeerRpc(Part):
             return
         tasks = self._answering.setdefault(session.peer, set())
         if len(tasks) >= limits.ASKS_AT_ONCE:
-            self._counters.add("ask.refused")
             self._send(session, Response(ask.number, ok=False, error="too many questions at once"))
             return
         task = asyncio.create_task(self._respond(session, ask), name=f"answer {ask.what} of {session.link.name}")

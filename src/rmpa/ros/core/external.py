@@ -67,7 +67,7 @@ class ExternalCore(Core):
         own_node: The agent's own node, which asks the master.
         node_host: The address at which the agent's nodes listen.
         node_address: The address of the agent's nodes that is registered.
-        counters: ``master.looks``, ``master.writes``, ``master.lost``, ``node.dead``.
+        counters: ``master.looks``, ``node.dead``.
     """
 
     def __init__(
@@ -306,7 +306,6 @@ class ExternalCore(Core):
                 return
             self._refused(batch[0], error)
             return
-        self.counters.add("master.writes", len(batch))
         for write, answer in zip(yielding_to_data(batch), answers, strict=False):
             match answer:
                 case [value]:
@@ -415,7 +414,6 @@ class ExternalCore(Core):
     def _lost(self, error: RmpaError) -> None:
         problem = str(error)
         if not self._problem or self._task is None:
-            self.counters.add("master.lost")
             _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self._uri, problem)
         self._problem = problem
         self._drop_writes(error)

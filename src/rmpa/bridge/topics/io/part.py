@@ -410,8 +410,8 @@ class Topics(Part):
         self.direct_exports.reconcile(state.subscribers)
         for topics in list(self._peers.values()):
             yield_to_data()
-            if compared and (again := topics.reconcile(state.publishers)):
-                self._counters.add("proxy.registered_again", again)
+            if compared:
+                topics.reconcile(state.publishers)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         session = self._sessions.get(peer)

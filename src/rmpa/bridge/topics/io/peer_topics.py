@@ -313,16 +313,11 @@ class PeerTopics:
         if publication is not None:
             publication.forget_latched()
 
-    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> int:
-        """Register publications again that are missing from the local graph; return their number."""
-        missing = [
-            published
-            for published in yielding_to_data(list(self._published.values()))
-            if publishers.get(published.publication.topic, {}).get(published.node.name) != published.node.uri
-        ]
-        for published in missing:
-            self._register(published)
-        return len(missing)
+    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> None:
+        """Register publications again that are missing from the local graph."""
+        for published in yielding_to_data(list(self._published.values())):
+            if publishers.get(published.publication.topic, {}).get(published.node.name) != published.node.uri:
+                self._register(published)
 
     def close(self) -> None:
         """End all flows, and remember the histories of the reliable ones; the publications go with the proxies."""
