@@ -24,13 +24,12 @@ from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.messages import Advertise, TopicOffer, encode
 from rmpa.bridge.policy import Policy
 from rmpa.config.settings import PolicySettings
-from rmpa.core.counters import Counters
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh.io.lane import LaneSender
 from rmpa.ros.core.embedded import RosCore
+from rmpa.runtime import garbage_collector
 from rmpa.runtime.event_loop import AgentLoop
-from rmpa.runtime.garbage_collector import GarbageCollector
 
 if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
@@ -131,8 +130,7 @@ async def _measure(peers: int, topics: int) -> GraphCost:
     await core.start()
     bridge = Bridge(core, Policy(PolicySettings()), rng=random.random)
     await bridge.start()
-    collector = GarbageCollector(lambda: 0, Counters())
-    collector.start()
+    garbage_collector.take_over()
     empty, holds = _rss(), Holds(loop)
     links = [cast("PeerLink", _Link(number)) for number in range(peers)]
     begun = time.process_time()
@@ -158,7 +156,7 @@ async def _measure(peers: int, topics: int) -> GraphCost:
         await asyncio.sleep(0)
     await _until(core, (peers - peers // 3) * topics)
     removed = time.process_time() - begun
-    collector.close()
+    garbage_collector.give_back()
     await bridge.close()
     await core.close()
     figures = (seconds, 1e3 * hold, empty, rss, 1e3 * compared, 100 * rest, removed)

@@ -38,7 +38,6 @@ from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.runtime import event_loop as loop_module
-from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.event_loop import AgentLoop, DirectSelector, yield_to_data
 
 if TYPE_CHECKING:
@@ -126,9 +125,6 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(asyncio.Handle, "_run", remember)
     monkeypatch.setattr(loop_module, "DirectSelector", Watched)
-    # Where no data flows a full collection may take its time; here data is only imagined.
-    monkeypatch.setattr(runtime_limits, "COLLECT_GROWTH", sys.maxsize)
-    monkeypatch.setattr(runtime_limits, "COLLECT_GROWTH_MAX", sys.maxsize)
 
 
 class World:

@@ -104,41 +104,36 @@ async def test_no_collection_runs_while_messages_flow(
         await asyncio.sleep(0.5)
         gc.collect(0)
         collections.clear()
-        made = gc.get_count()[0]
         await send(MESSAGES)
         assert collections == []
-        assert gc.get_count()[0] - made < runtime_limits.COLLECT_YOUNG
         assert gc.collect() < 200  # keepalives and timers; the messages left nothing
-        assert not gc.isenabled()
 
 
 async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
     pair: tuple[Agent, Agent], collections: list[int]
 ) -> None:
-    a, b = pair
+    a, _ = pair
     gc.collect()
     collections.clear()
     objects = len(gc.get_objects())
-    for _ in range(10):
-        for _ in range(100):
-            await call_api(a.core.uri, "getPid", "/somebody")  # a connection each: a cycle of asyncio's own
-        await asyncio.sleep(runtime_limits.COLLECT_LOOK_AGAIN)
-    await until(lambda: len(gc.get_objects()) < objects + 5 * runtime_limits.COLLECT_YOUNG)
-    assert 2 <= len(collections) < 40
-    assert set(collections) == {0}
-    # Both live on one loop here, and either one's collector may come first.
-    assert sum(agent.snapshots.build().counters.get("collector.young", 0) for agent in (a, b)) >= 1
+    for _ in range(1000):
+        await call_api(a.core.uri, "getPid", "/somebody")  # a connection each: a cycle of asyncio's own
+    assert len(gc.get_objects()) < objects + 3 * runtime_limits.COLLECT_THRESHOLDS[0]
+    assert len(collections) >= 2
+    assert 2 not in collections
 
 
 async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
     settings: Callable[[str], Settings],
 ) -> None:
-    assert gc.isenabled()
+    before = gc.get_threshold()
     agent = Agent(settings("a"))
     await agent.start()
-    assert not gc.isenabled()
+    assert gc.get_threshold() == runtime_limits.COLLECT_THRESHOLDS
+    assert gc.get_freeze_count()
     await agent.close()
     assert gc.isenabled()
+    assert gc.get_threshold() == before
     assert gc.get_freeze_count() == 0
 
 

@@ -43,8 +43,7 @@ from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.peer_agent import INFO
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
-from rmpa.runtime.free_memory import FreeMemory
-from rmpa.runtime.garbage_collector import GarbageCollector
+from rmpa.runtime import garbage_collector
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections
 from rmpa.trust.page_names import host_names, page_hosts
@@ -145,8 +144,6 @@ class Agent:
         """What else the snapshot's notes tell: of parts that the agent does not make itself."""
         counters = Counters()
         # Memory that is locked stays; and what is returned would have to be read in again in the midst of data.
-        free_memory = None if settings.realtime.enabled else FreeMemory()
-        self._collector = GarbageCollector(self._bytes_carried, counters, free_memory)
         self._clocks = PeerClocks(self.bridge)
         sources = SnapshotSources(
             core=self.core,
@@ -216,8 +213,8 @@ class Agent:
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self._control.start()
-            self._collector.start()
-            undo.callback(self._collector.close)
+            garbage_collector.take_over()
+            undo.callback(garbage_collector.give_back)
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
 
@@ -239,10 +236,6 @@ class Agent:
     async def close(self) -> None:
         """Close every part: the goodbye comes first, then the proxies leave the local graph, the core is last."""
         await self._undo.aclose()
-
-    def _bytes_carried(self) -> int:
-        links = (session.link for session in self.bridge.sessions.linked())
-        return sum(link.bytes_in + link.bytes_out for link in links)
 
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)

@@ -34,8 +34,6 @@ _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _MAX_EVENTS: Final = 64
-_YIELDS_PER_HOOK: Final = 8
-"""Yields from one call of the hook to the next; a call at each yield would be too expensive."""
 _ITEMS_PER_YIELD: Final = 64
 """Steps of long work between two yields; a step takes a microsecond or less."""
 _SORTED_RUN: Final = 256
@@ -212,10 +210,8 @@ class AgentLoop(asyncio.SelectorEventLoop):
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
         self._poll_data = self._direct_selector.poll_data
-        self._yield_hook: Callable[[], None] | None = None
-        self._yields = 0
         # asyncio takes each ready callback from this queue, and only from it.
-        self._ready: deque[asyncio.Handle] = _ReadyQueue(self.yield_to_data)
+        self._ready: deque[asyncio.Handle] = _ReadyQueue(self._poll_data)
 
     @property
     def previous_poll_at(self) -> float:
@@ -228,19 +224,6 @@ class AgentLoop(asyncio.SelectorEventLoop):
     def yield_to_data(self) -> None:
         """Handle the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``."""
         self._poll_data()
-        if self._yield_hook is not None and not self._direct_selector.in_direct_call:
-            self._yields += 1
-            if self._yields >= _YIELDS_PER_HOOK:
-                self._yields = 0
-                self._yield_hook()
-
-    def set_yield_hook(self, hook: Callable[[], None] | None) -> None:
-        """Call ``hook`` at every few yields; ``None`` ends this.
-
-        It is for work that must not wait for the end of long control work, but may wait for data. A call without work
-        to do must return within microseconds.
-        """
-        self._yield_hook = hook
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, but called by the selector itself; ``remove_reader`` ends it.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.sizes import KIB
 
 # --- process ----------------------------------------------------------------------------------------------------
 OPEN_FILES: Final = 1_048_576
@@ -31,31 +31,10 @@ ACCEPT_PAUSE: Final = 0.5
 THREAD_SWITCH: Final = 1e-4
 """The interpreter's switch interval (``sys.setswitchinterval``). While another thread parses XML, the loop is 3 ms
 late (p50) with Python's default of 5 ms, and 0.16 ms late with this value."""
-COLLECT_LOOK: Final = 0.25
-"""Time from the moment at which many objects are noticed to the check for cyclic garbage."""
-COLLECT_LOOK_IDLE: Final = 5.0
-"""Period of these checks while few objects survive: only the growth of the heap is then to be noticed."""
-COLLECT_LOOK_AGAIN: Final = 0.02
-"""Interval after a check that found many objects. Messages in transit are freed by then, and several small
-collections pause the loop less than one large collection."""
-COLLECT_YOUNG: Final = 300
-"""Objects that survived since the last collection, from which on a collection is due: those of 40 XML-RPC calls,
-which take some 0.1 ms to collect."""
-COLLECT_BURST: Final = 1000
-"""Objects made since the last collection, from which on a collection is due at a yield of long work; it takes some
-0.1 ms."""
-COLLECT_GROWTH: Final = 50_000
-"""Growth of the heap in memory blocks, some 5 MB, that makes a full collection due while no data flows."""
-COLLECT_GROWTH_MAX: Final = 500_000
-"""Growth of the heap in memory blocks, some 50 MB, that makes a full collection due even while data flows (10 ms)."""
-COLLECT_REST: Final = 2.0
-"""Seconds without data and with few new objects, after which all objects may be scanned (0.1 s at 20,000 topics)."""
-TRIM_GROWTH: Final = 8 * MIB
-"""Growth of resident memory after which free memory is returned to the kernel at rest (19 MB took 3 ms)."""
-TRIM_FREED: Final = 20_000
-"""Memory blocks freed, some 2 MB, after which free memory is returned too: a hundred links that were parked."""
-COLLECT_QUIET_BYTES: Final = 16 * KIB
-"""Bytes a second, over all links, below which the agent counts as idle: keepalives or very slow streams."""
+COLLECT_THRESHOLDS: Final = (1000, 5, 100)
+"""Objects made and not freed since the last collection of young garbage, from which on another one is due: 1 ms at
+most, mostly 0.1 ms. Every fifth takes the next generation too; all objects but the frozen ones are scanned after
+500,000, if a quarter of them is new (20 ms at 5,000 topics)."""
 
 # --- the kernel's TCP sockets -----------------------------------------------------------------------------------
 SOCK_DIAG_BUFFER: Final = 64 * KIB
