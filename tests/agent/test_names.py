@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.settings import PeerRule, PolicySettings, Remap, Settings
+from rmpa.config.settings import PeerRule, PolicySettings, Settings
 from rmpa.core.contract import ContractRule
 from tests.agent.test_agent import Sink, node, running, settings, until
 
@@ -111,8 +111,8 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         for number in range(20):
             talker.publish(talker.make({"data": str(number)}))
         agent, prefix = (robot, "/") if far else (pc, "/robot/")
-        near_rule = replace(PREFIX[0], remap_in=(Remap("/named", "/robot/other"),))
-        far_rule = PeerRule("pc", "", (), (Remap("/named", "/other"),))
+        near_rule = replace(PREFIX[0], remap_in=(("/named", "/robot/other"),))
+        far_rule = PeerRule("pc", "", (), (("/named", "/other"),))
         agent.apply_settings(
             replace(
                 agent._settings,

@@ -40,7 +40,7 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.remote_topic import RouteState
-from rmpa.config.settings import PeerRule, PolicySettings, Remap
+from rmpa.config.settings import PeerRule, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 
 TYPE = "a/B"
@@ -170,7 +170,7 @@ def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
             exports.opened(peer, OpenRoute(route, topic, "/n"))
     for topic in ("/a", "/b", "/c"):
         exports.described(Source(topic, "/n"), ABOUT)
-    rule = PeerRule("robot*", "", (), (Remap("/b", "/bee"),), PolicySettings(deny=("/c",)))
+    rule = PeerRule("robot*", "", (), (("/b", "/bee"),), PolicySettings(deny=("/c",)))
     new = Side(rule)
     actions = exports.apply_rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
     assert [(a.peer, a.source.topic) for a in actions if isinstance(a, RemoveRoute)] == [(1, "/b"), (1, "/c")]
@@ -251,7 +251,7 @@ def test_policy_types_and_contracts_go_by_the_name_here() -> None:
 
 
 def test_of_two_topics_with_one_local_name_the_first_is_shown() -> None:
-    imports = Side(PeerRule("p", "/p", (Remap("/x", "/p/y"),))).imports()
+    imports = Side(PeerRule("p", "/p", (("/x", "/p/y"),))).imports()
     imports.link_up(1, "p")
     assert learn(imports, "/x", "/y") == [Publish(1, Source("/x", "/n"), TYPE, "/p/y")]
     entry = imports.get(1, Source("/y", "/n"))
@@ -272,7 +272,7 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
         imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
         imports.opened(1, RouteOpened(route, ABOUT), 0.0)
     b, c = Source("/b", "/n"), Source("/c", "/n")
-    new = Side(PeerRule("p", "", (Remap("/b", "/bee"),)), policy=PolicySettings(deny=("/c",)))
+    new = Side(PeerRule("p", "", (("/b", "/bee"),)), policy=PolicySettings(deny=("/c",)))
     assert changed(imports, new) == [
         Send(1, CloseRoute(2)),
         Detach(1, b, 2),
@@ -313,8 +313,8 @@ NODES = ("/n", "/m")
 SIDES = (
     (),
     (PeerRule("p", "/p"),),
-    (PeerRule("p", "", (Remap("/a", "/b"),), (Remap("/b", "/a"),)),),
-    (PeerRule("*", "/q", (Remap("/p/**", "/**"),), (), PolicySettings(deny=("/b",))),),
+    (PeerRule("p", "", (("/a", "/b"),), (("/b", "/a"),)),),
+    (PeerRule("*", "/q", (("/p/**", "/**"),), (), PolicySettings(deny=("/b",))),),
 )
 
 
@@ -450,9 +450,9 @@ class World:
         far, near = (Side(*rules) for rules in self.rules)
         found = set()
         for source in self.local:
-            wire = far.names.wire_name("p", source.topic, TYPE)
+            wire = far.names.wire_name("p", source.topic)
             if far.policy.judge_for("p", source.topic, TYPE, wire).allowed:
-                topic = near.names.local_name("p", wire, TYPE)
+                topic = near.names.local_name("p", wire)
                 if near.policy.judge_for("p", topic, TYPE, wire).allowed:
                     found.add((topic, source.node))
         return found

@@ -105,7 +105,6 @@ def test_schema_accepts_the_files_of_the_documentation(validate: Any) -> None:
         "[[contract]]\ntopics = []",
         "[[contract]]\ntopics = ['/a']\nreliability = 'reliabel'",
         "[[peer]]\nprefix = '/a'",
-        "[[peer]]\nname = 'a'\n[[peer.remap]]\nfrom = '/a'\nto = '/b'",
         "[[peer]]\nname = 'a'\nremap_in = {'/a' = 1}",
         "[[service]]\ntimeout = 1",
         "[[param]]\nkey = '/a'",

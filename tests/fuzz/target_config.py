@@ -51,7 +51,6 @@ SEEDS: list[bytes] = [
     b"[[contract]]\ntopics = ['/**']\nlifespan = '86401 s'\n",
     b'[[param]]\nkey = "/a/b"\nfrom = "base"\nto = "/c"\n[[param]]\nkey = "c/d"\nfrom = "arm"\n[time]\nfollow = ""\n',
     b'[[peer]]\nname = "robot*"\nprefix = "/{peer}"\nremap_in = {"/tf" = "/tf", "/arm/**" = "/{peer}/left/**"}\n',
-    b'[[peer]]\nname = "a"\n[[peer.remap]]\ndirection = "out"\nfrom = "/a"\nto = "/b"\ntypes = ["a/*"]\n',
     b'[[peer]]\nname = "*"\nallow = ["/{peer}/**"]\nremap_out = {"/a" = "/b", "/b" = "/a"}\n',
     b'[[peer]]\nname = "*"\n[peer.remap_in]\n"/**" = "/a/**"\n"/b/**" = "/**"\n',
     b'[gateway]\nsite = "a"\nconnect = ["tls/a:7447"]\n[gateway.ros2]\nenabled = true\nmapping = ["a.yaml"]\n',

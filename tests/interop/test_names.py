@@ -27,14 +27,8 @@ PC = """
 [[peer]]
 name = "robot*"
 prefix = "/{peer}"
-remap_in = { "/left/**" = "/{peer}/arm/**" }
+remap_in = { "/left/**" = "/{peer}/arm/**", "/both" = "/{peer}/text" }
 deny = ["/**/private"]
-
-[[peer.remap]]
-direction = "in"
-from = "/both"
-to = "/{peer}/text"
-types = ["std_msgs/String"]
 """
 
 
@@ -72,8 +66,8 @@ def test_one_computer_works_with_two_identical_robots(lab: Lab, agent: AgentFact
     nodes = pc.ros.tool("rosnode", "list").split()
     assert {f"/rmpa/{robot.name}/{node}" for robot in robots for node in ("base", "arm", "counter")} <= set(nodes)
     topics = pc.topics()
-    assert {"/robot1/text", "/robot2/both"} <= topics
-    assert not {"/robot2/text", "/robot1/both", "/odom", "/left/joints"} & topics
+    assert {"/robot1/text", "/robot2/text"} <= topics
+    assert not {"/robot1/both", "/robot2/both", "/odom", "/left/joints"} & topics
     assert not [topic for topic in topics if "private" in topic]
 
     # What the computer says to one of them reaches that one alone.

@@ -22,7 +22,7 @@ from rmpa.core.names import matches
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.config.settings import PeerRule, Remap
+    from rmpa.config.settings import PeerRule
 
 
 class PeerNames:
@@ -36,8 +36,8 @@ class PeerNames:
     def __init__(self, peer: str, rules: Iterable[PeerRule] = ()) -> None:
         mine = [rule for rule in rules if matches(rule.name, peer)]
         prefix = next((rule.prefix for rule in mine if rule.prefix), "").replace(PEER, peer)
-        self._in = [(remap, *_ends(remap, peer)) for rule in mine for remap in rule.remap_in]
-        self._out = [(remap, *_ends(remap, peer)) for rule in mine for remap in rule.remap_out]
+        self._in = [_filled(each, peer) for rule in mine for each in rule.remap_in]
+        self._out = [_filled(each, peer) for rule in mine for each in rule.remap_out]
         self.prefix: Final = prefix
         """The prefix of the peer's names in the local graph, such as ``/robot1``, or empty."""
 
@@ -46,44 +46,37 @@ class PeerNames:
         """Whether no rule renames anything of this peer."""
         return not (self.prefix or self._in or self._out)
 
-    def local_name(self, wire: str, type_name: str = "") -> str:
-        """The local name of a peer's topic or service.
-
-        Args:
-            wire: Its wire name.
-            type_name: The message type of a topic; rules with ``types`` fit only topics of these types.
-        """
+    def local_name(self, wire: str) -> str:
+        """The local name of a peer's topic or service."""
         if wire == CLOCK:
             return wire  # nodes read the time from no other topic
-        for remap, source, target in self._in:
-            if (new := _renamed(wire, type_name, remap, source, target)) is not None:
+        for source, target in self._in:
+            if (new := _renamed(wire, source, target)) is not None:
                 return new
         return self.prefix + wire
 
-    def wire_name(self, local: str, type_name: str = "") -> str:
-        """The wire name, for this peer, of a local topic or service; see ``local_name`` for the arguments."""
+    def wire_name(self, local: str) -> str:
+        """The wire name, for this peer, of a local topic or service."""
         if local == CLOCK:
             return local
-        for remap, source, target in self._out:
-            if (new := _renamed(local, type_name, remap, source, target)) is not None:
+        for source, target in self._out:
+            if (new := _renamed(local, source, target)) is not None:
                 return new
         if self.prefix and local.startswith(self.prefix + "/"):
             return local[len(self.prefix) :]
         return local
 
     def wires_of(self, local: str) -> tuple[str, ...]:
-        """The wire names that may become this local name, best first; rules with ``types`` may not fit all."""
-        names = [old for _, source, target in self._in if (old := _undone(local, source, target)) is not None]
+        """The wire names that become this local name, best first."""
+        names = [old for source, target in self._in if (old := _undone(local, source, target)) is not None]
         names.append(local if not self.prefix else local.removeprefix(self.prefix))
-        typed = any(remap.types for remap, _, _ in self._in)
-        return tuple(n for n in dict.fromkeys(names) if n and (typed or self.local_name(n) == local))
+        return tuple(n for n in dict.fromkeys(names) if n and self.local_name(n) == local)
 
     def locals_of(self, wire: str) -> tuple[str, ...]:
-        """The local names that may become this wire name, best first; rules with ``types`` may not fit all."""
-        names = [old for _, source, target in self._out if (old := _undone(wire, source, target)) is not None]
+        """The local names that become this wire name, best first."""
+        names = [old for source, target in self._out if (old := _undone(wire, source, target)) is not None]
         names += [self.prefix + wire, wire]
-        typed = any(remap.types for remap, _, _ in self._out)
-        return tuple(n for n in dict.fromkeys(names) if typed or self.wire_name(n) == wire)
+        return tuple(n for n in dict.fromkeys(names) if self.wire_name(n) == wire)
 
 
 class Names:
@@ -106,13 +99,18 @@ class Names:
             known = self._known[peer] = PeerNames(peer, self._rules)
         return known
 
-    def local_name(self, peer: str, wire: str, type_name: str = "") -> str:
-        """The local name of a peer's topic or service; see ``PeerNames.local_name``."""
-        return self.of(peer).local_name(wire, type_name)
+    def local_name(self, peer: str, wire: str) -> str:
+        """The local name of a peer's topic or service."""
+        return self.of(peer).local_name(wire)
 
-    def wire_name(self, peer: str, local: str, type_name: str = "") -> str:
-        """The wire name of a local topic or service for a peer; see ``PeerNames.wire_name``."""
-        return self.of(peer).wire_name(local, type_name)
+    def wire_name(self, peer: str, local: str) -> str:
+        """The wire name of a local topic or service for a peer."""
+        return self.of(peer).wire_name(local)
+
+
+def _filled(renaming: tuple[str, str], peer: str) -> tuple[str, str]:
+    source, target = renaming
+    return source.replace(PEER, peer), target.replace(PEER, peer)
 
 
 def _undone(name: str, source: str, target: str) -> str | None:
@@ -125,14 +123,8 @@ def _undone(name: str, source: str, target: str) -> str | None:
     return source[:-3] + name[len(stem) :] or None
 
 
-def _ends(remap: Remap, peer: str) -> tuple[str, str]:
-    return remap.source.replace(PEER, peer), remap.target.replace(PEER, peer)
-
-
-def _renamed(name: str, type_name: str, remap: Remap, source: str, target: str) -> str | None:
+def _renamed(name: str, source: str, target: str) -> str | None:
     """The name as one rule renames it; ``None`` if the rule does not fit."""
-    if remap.types and not any(matches(glob, type_name) for glob in remap.types):
-        return None
     if not source.endswith("/**"):
         return target if name == source else None
     stem = source[:-3]

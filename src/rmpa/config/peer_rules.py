@@ -1,15 +1,14 @@
 """The tables ``[[peer]]`` of ``rmpa.toml``: names and policy for single peers (docs/names.md).
 
-Rules that cannot be meant are refused: names that no topic can have or that never cross, two names that would become
-one (which service would be called?), and names that lead back to themselves.
+Names that no topic can have, or that never cross, are refused. What two names do that become one shows at run time:
+the first stays, and the other one says why it is hidden.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
@@ -20,16 +19,14 @@ from rmpa.config.values import (
     TYPE_GLOB,
     BadValue,
     JsonSchema,
-    Place,
     RuleKey,
     ValueType,
-    did_you_mean,
     list_of,
     read_at,
     read_keys,
     read_text,
     read_topic_glob,
-    table_schema,
+    tables_of,
 )
 from rmpa.core.names import NEVER_CROSSING, is_global_name, matches
 
@@ -39,7 +36,8 @@ if TYPE_CHECKING:
 PEER: Final = "{peer}"
 """Stands for the peer's name in a rule."""
 _SOME_PEER: Final = "peer"
-_DIRECTIONS: Final = ("in", "out")
+Renames = tuple[tuple[str, str], ...]
+"""Names before and after, or namespaces ``/namespace/**``; ``{peer}`` in them is the peer's name."""
 
 
 def _read_peer_topic_glob(raw: object) -> str:
@@ -57,21 +55,6 @@ _PEER_TOPIC_GLOB: Final = ValueType(_read_peer_topic_glob, {"type": "string", "e
 
 
 @dataclass(frozen=True, slots=True)
-class Remap:
-    """One name, or a namespace, that has another name at a peer.
-
-    Args:
-        source: The name before, or ``/namespace/**``; ``{peer}`` in it is the peer's name.
-        target: The name after, likewise.
-        types: Globs over message types, one of which must fit; empty: topics of any type, and services.
-    """
-
-    source: str
-    target: str
-    types: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class PeerRule:
     """One ``[[peer]]``: what holds for the peers whose name fits. All rules that fit a peer apply, in order.
 
@@ -85,62 +68,17 @@ class PeerRule:
 
     name: str
     prefix: str = ""
-    remap_in: tuple[Remap, ...] = ()
-    remap_out: tuple[Remap, ...] = ()
+    remap_in: Renames = ()
+    remap_out: Renames = ()
     policy: PolicySettings = field(default_factory=PolicySettings)
 
 
-@dataclass(frozen=True, slots=True)
-class _Placed:
-    """A remap and where it is written; its names with some peer's name filled in."""
-
-    remap: Remap
-    at: Place
-    source: str
-    target: str
-
-    def below(self, key: str | int) -> _Placed:
-        """This renaming with a place that is one level deeper in the file."""
-        return replace(self, at=(key, *self.at))
-
-
-def _read_rules(raw: object) -> tuple[PeerRule, ...]:
-    """Every ``[[peer]]`` of a file; ``BadValue.at`` says which rule, key and element is wrong."""
-    if not isinstance(raw, list | tuple):
-        raise BadValue(f"{raw!r} is not a list")
-    rules: list[PeerRule] = []
-    remaps: list[dict[str, list[_Placed]]] = []
-    for index, table in enumerate(raw):
-        rule, placed = read_at((index,), _read_rule, table)
-        rules.append(rule)
-        remaps.append({direction: [p.below(index) for p in found] for direction, found in placed.items()})
-    for index, rule in enumerate(rules):
-        together = [i for i in range(index + 1) if i == index or _meet(rules[i].name, rule.name)]
-        for direction in _DIRECTIONS:
-            _check([placed for i in together for placed in remaps[i][direction]])
-    return tuple(rules)
-
-
-def _meet(one: str, other: str) -> bool:
-    """Whether two globs over peers' names surely fit a peer in common."""
-    return one == other or matches(one, other) or matches(other, one)
-
-
-def _read_rule(table: Mapping[str, object]) -> tuple[PeerRule, dict[str, list[_Placed]]]:
+def _read_rule(table: Mapping[str, object]) -> PeerRule:
     if "name" not in table:
         raise BadValue("a rule without a name", 'name = "robot*" makes it one for those peers, "*" for all')
     values = read_keys(table, _KEYS)
-    placed: dict[str, list[_Placed]] = {direction: [] for direction in _DIRECTIONS}
-    for direction, remap in values.pop("remap", ()):
-        placed[direction].append(remap.below("remap"))
-    for direction, found in placed.items():
-        key = f"remap_{direction}"
-        found += [remap.below(key) for remap in values.pop(key, ())]
-        if len(found) > limits.REMAPS_MAX:
-            raise BadValue(f"{len(found)} rules", f"at most {limits.REMAPS_MAX}; rename namespaces", at=(key,))
-    incoming, outgoing = (tuple(p.remap for p in placed[direction]) for direction in _DIRECTIONS)
-    name, prefix = values.pop("name"), values.pop("prefix", "")
-    return PeerRule(name, prefix, incoming, outgoing, PolicySettings(**values)), placed
+    own = {key: values.pop(key) for key in ("prefix", "remap_in", "remap_out") if key in values}
+    return PeerRule(values.pop("name"), **own, policy=PolicySettings(**values))
 
 
 def _read_prefix(raw: object) -> str:
@@ -153,41 +91,14 @@ def _read_prefix(raw: object) -> str:
     return prefix
 
 
-def _read_remap(table: Mapping[str, object]) -> tuple[str, _Placed]:
-    known = [key.name for key in _REMAP_KEYS]
-    for key in table:
-        if key not in known:
-            near = did_you_mean(key, known)
-            raise BadValue(
-                "an unknown key", f"did you mean {near}?" if near else f"known here: {', '.join(known)}", at=(key,)
-            )
-    example = 'one has direction = "in", from = "/odom" and to = "/robot1/odom"'
-    values = read_keys(table, _REMAP_KEYS, example)
-    placed = read_at(("to",), partial(_placed, values["from"], types=values.get("types", ())), values["to"])
-    return values["direction"], placed
-
-
-def _read_remaps(raw: Sequence[Mapping[str, object]]) -> list[tuple[str, _Placed]]:
-    """Every ``[[peer.remap]]`` of a rule: its direction, and what it renames."""
-    found = []
-    for index, table in enumerate(raw):
-        direction, placed = read_at((index,), _read_remap, table)
-        found.append((direction, placed.below(index)))
-    return found
-
-
-def _read_renames(raw: Mapping[str, str]) -> list[_Placed]:
+def _read_renames(raw: Mapping[str, str]) -> Renames:
     """A table ``remap_in`` or ``remap_out``: the name after, by the name before."""
-    return [read_at((source,), partial(_placed, source), target).below(source) for source, target in raw.items()]
+    if len(raw) > limits.REMAPS_MAX:
+        raise BadValue(f"{len(raw)} rules", f"at most {limits.REMAPS_MAX}; rename namespaces")
+    return tuple(read_at((source,), partial(_renaming, source), target) for source, target in raw.items())
 
 
-def _read_direction(raw: object) -> str:
-    if raw not in _DIRECTIONS:
-        raise BadValue(f"{raw!r} is not a direction", '"in" renames what they have, "out" what we have')
-    return str(raw)
-
-
-def _placed(source: str, target: object, types: tuple[str, ...] = ()) -> _Placed:
+def _renaming(source: str, target: object) -> tuple[str, str]:
     """A renaming whose two ends fit each other."""
     before, after = _read_end(source), _read_end(target)
     if before.endswith("/**") is not after.endswith("/**"):
@@ -195,8 +106,7 @@ def _placed(source: str, target: object, types: tuple[str, ...] = ()) -> _Placed
             f"{before} and {after} do not fit each other",
             "a namespace becomes a namespace: both end with /**, or none",
         )
-    remap = Remap(before, after, types)
-    return _Placed(remap, (), before.replace(PEER, _SOME_PEER), after.replace(PEER, _SOME_PEER))
+    return before, after
 
 
 def _read_end(raw: object) -> str:
@@ -227,22 +137,6 @@ def _check_name(name: str) -> None:
 
 # --- the keys of the tables -----------------------------------------------------------------------------------------
 
-_NAME_OR_NAMESPACE: Final = ValueType(_read_end, {"type": "string", "examples": ["/odom", "/arm/**"]})
-_REMAP_KEYS: Final = (
-    RuleKey(
-        "direction",
-        ValueType(_read_direction, {"type": "string", "enum": list(_DIRECTIONS)}),
-        "in renames what they have, out what this module has.",
-        required=True,
-    ),
-    RuleKey("from", _NAME_OR_NAMESPACE, "The name before, or a namespace with /** behind it.", required=True),
-    RuleKey("to", _NAME_OR_NAMESPACE, "The name after, likewise.", required=True),
-    RuleKey(
-        "types",
-        list_of(TYPE_GLOB, if_empty="leave types out, or name some"),
-        "Only topics of these message types; without it: any, and services.",
-    ),
-)
 _RENAMES: Final[JsonSchema] = {"type": "object", "additionalProperties": {"type": "string"}}
 _KEYS: Final = (
     RuleKey(
@@ -256,11 +150,6 @@ _KEYS: Final = (
         ValueType(_read_prefix, {"type": "string", "examples": [f"/{PEER}"]}),
         "A namespace for their names here; {peer} is the peer's name.",
     ),
-    RuleKey(
-        "remap",
-        ValueType(_read_remaps, {"type": "array", "items": table_schema(_REMAP_KEYS)}),
-        "Single renamings, which may be for some message types only.",
-    ),
     RuleKey("remap_in", ValueType(_read_renames, _RENAMES), "Their names, and what they are here."),
     RuleKey("remap_out", ValueType(_read_renames, _RENAMES), "Our names, and what they are there."),
     RuleKey("allow", list_of(_PEER_TOPIC_GLOB), "Topics that may cross, on top of [bridge], by their names here."),
@@ -268,76 +157,7 @@ _KEYS: Final = (
     RuleKey("allow_types", list_of(TYPE_GLOB), "Message types that may cross."),
     RuleKey("deny_types", list_of(TYPE_GLOB), "Message types that stay home."),
 )
-PEER_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
-
-
-# --- whether the rules of one direction fit each other --------------------------------------------------------------
-
-
-def _check(rules: Sequence[_Placed]) -> None:
-    for rule in rules:
-        _check_end(rules, rule)
-    for one, other in combinations(rules, 2):
-        if not (one.remap.types and other.remap.types and set(one.remap.types).isdisjoint(other.remap.types)):
-            _check_pair(rules, one, other)
-
-
-def _check_end(rules: Sequence[_Placed], rule: _Placed) -> None:
-    """Refuse names that lead back to themselves: which of them is meant cannot be known."""
-    way = [_sample(rule.source)]
-    for _ in range(len(rules) + 1):
-        _, name = _first_fit(rules, way[-1])
-        if name in {None, way[-1]}:
-            return
-        assert name is not None  # noqa: S101 - as just seen
-        if name in way:
-            shown = ", which becomes ".join([*way[way.index(name) + 1 :], name])
-            problem = f"these rules undo each other: {name} becomes {shown}"
-            raise BadValue(problem, "a name is renamed once; leave one of them out", at=rule.at)
-        way.append(name)
-
-
-def _check_pair(rules: Sequence[_Placed], one: _Placed, other: _Placed) -> None:
-    """Refuse two names that would become the same."""
-    longer, shorter = (one, other) if len(_stem(one.target)) >= len(_stem(other.target)) else (other, one)
-    target = _sample(longer.target)
-    sources = [_before(rule, target) for rule in (longer, shorter)]
-    if None in sources or sources[0] == sources[1]:
-        return
-    if all(
-        _first_fit(rules, str(name)) == (rule, target) for rule, name in zip((longer, shorter), sources, strict=True)
-    ):
-        ends = f"{one.remap.source} and {other.remap.source}"
-        problem = f"{ends} would both become {target.removesuffix('/x') if longer.target.endswith('/**') else target}"
-        raise BadValue(problem, "two topics or services of one name cannot be told apart", at=other.at)
-
-
-def _stem(end: str) -> str:
-    return end.removesuffix("/**")
-
-
-def _sample(end: str) -> str:
-    """A name that fits: of ``/a/**`` the name ``/a/x``."""
-    return end[:-3] + "/x" if end.endswith("/**") else end
-
-
-def _before(rule: _Placed, target: str) -> str | None:
-    """The name that a rule renames to ``target``; ``None`` if there is none."""
-    if not rule.target.endswith("/**"):
-        return rule.source if target == rule.target else None
-    stem = _stem(rule.target)
-    return _stem(rule.source) + target[len(stem) :] if target == stem or target.startswith(stem + "/") else None
-
-
-def _first_fit(rules: Sequence[_Placed], name: str) -> tuple[_Placed | None, str | None]:
-    """The first rule that renames a name, and the name after."""
-    for rule in rules:
-        if not rule.source.endswith("/**"):
-            if name == rule.source:
-                return rule, rule.target
-        elif name == (stem := _stem(rule.source)) or name.startswith(stem + "/"):
-            return rule, _stem(rule.target) + name[len(stem) :]
-    return None, None
+PEER_RULES: Final = tables_of(_KEYS, _read_rule)
 
 
 def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[ConfigWarning]:

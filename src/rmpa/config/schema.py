@@ -186,6 +186,8 @@ def settings_of(
 
 
 REMOVED: Final = {
+    "peer.remap": 'write remap_in = { "FROM" = "TO" } for direction = "in", remap_out = { "FROM" = "TO" } for "out"; '
+    "it holds for topics of all types",
     "web_token": "use the one token; control and drive of [web] say what clients may do with it",
     "core.fresh": 'write keep = "never" in place of true',
     "RMPA_FRESH": "set RMPA_KEEP=never in its place",

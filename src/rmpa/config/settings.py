@@ -13,7 +13,7 @@ from rmpa.config import limits
 from rmpa.config.contract_rules import CONTRACT_RULES
 from rmpa.config.gateway_rules import CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.config.param_rules import PARAM_RULES, FollowRule
-from rmpa.config.peer_rules import PEER, PEER_RULES, PeerRule, Remap
+from rmpa.config.peer_rules import PEER, PEER_RULES, PeerRule
 from rmpa.config.permission_rules import (
     MODULE_GROUPS,
     PERMISSION_DEFAULT,
@@ -81,7 +81,6 @@ __all__ = [
     "PermissionRule",
     "PolicySettings",
     "RealtimeSettings",
-    "Remap",
     "Ros2Settings",
     "ServiceRule",
     "ServiceSettings",

@@ -194,9 +194,8 @@ def test_names_here_are_made_by_the_peers_rules() -> None:
 
 
 def test_two_of_one_peer_that_would_have_one_name_here() -> None:
-    from rmpa.config.settings import Remap
 
-    made = ServiceImports(rules(peers=(PeerRule("robot", remap_in=(Remap("/a", "/b"),)),)))
+    made = ServiceImports(rules(peers=(PeerRule("robot", remap_in=(("/a", "/b"),)),)))
     made.link_up(1, "robot", 1)
     assert made.advertised(1, offer("/a", "/b", full=True)) == [Provide(1, "/b", "/n")]
     second = [remote for _, remote in made if not remote.shown]

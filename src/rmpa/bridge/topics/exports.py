@@ -359,7 +359,7 @@ class Exports:
             return None
         if not known.judged:
             return TopicOffer(source.topic, source.node, local.type, local.origin)
-        wire = self._names.wire_name(known.name, source.topic, local.type)
+        wire = self._names.wire_name(known.name, source.topic)
         if not is_crossing_name(wire):
             return None
         if not self._policy.judge_for(known.name, source.topic, local.type, wire).allowed:

@@ -209,7 +209,7 @@ class Imports:
             return []
         known = self._peers[peer]
         actions: list[Action] = []
-        topic = self._names_of(known, entry.origin).local_name(source.topic, entry.type)
+        topic = self._names_of(known, entry.origin).local_name(source.topic)
         if topic != entry.topic:
             actions += self._hide(peer, source, entry) if entry.shown else []
             self._unlist(known, source, entry)
@@ -398,7 +398,7 @@ class Imports:
             name = self._peers[peer].name
             self._peers[peer].refuse(source, offer)
             return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self.limit_settings.topics))]
-        topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
+        topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic)
         entry = known[source] = RemoteTopic(self._shared(offer.type), topic, origin=offer.origin)
         self._peers[peer].topics.setdefault(topic, {})[source] = None
         if offer.origin is not None:

@@ -141,11 +141,9 @@ class TopicEvidence:
             return TopicAtPublisher(permitted=False)
         await self._snapshots.sampler.settle(topics)
         for topic in topics:
-            kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
-            if names.wire_name(topic, kind) == wire:
-                sources += [self._report(session, Source(topic, node), wire) for node in nodes]
-                subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+            sources += [self._report(session, Source(topic, node), wire) for node in nodes]
+            subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
         return TopicAtPublisher(
             sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
@@ -161,7 +159,7 @@ class TopicEvidence:
         """The topic of this module whose name on the wire is most like this one; empty if none is."""
         names, state = self._bridge.topics.names.of(asker), self._core.state()
         known = {
-            names.wire_name(topic, state.types.get(topic, ""))
+            names.wire_name(topic)
             for topic, nodes in yielding_to_data(list(state.publishers.items()))
             if not all(map(is_own, nodes)) and self._may_know(asker, topic)
         }

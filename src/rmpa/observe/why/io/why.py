@@ -273,7 +273,7 @@ class WhyService:
         if session is None or session.link.name != to:
             stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
             return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
-        question = {"topic": self._bridge.topics.names.wire_name(to, topic, self._core.type_of(topic))}
+        question = {"topic": self._bridge.topics.names.wire_name(to, topic)}
         try:
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], observe_limits.WHY_TIMEOUT)
             if not found:
