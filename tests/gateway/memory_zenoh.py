@@ -1,4 +1,4 @@
-"""Zenoh in memory: sessions of one network, for tests of what speaks through ``ZenohSession``."""
+"""Zenoh in memory: sessions of one network, for tests of what speaks through ``OpenSession``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from rmpa.gateway.zenoh_api import ZenohReply, ZenohSample
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos, ZenohQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 
@@ -188,7 +189,7 @@ class MemorySession:
         return declared
 
     def queryable(
-        self, key: str, on_query: Callable[[ZenohQuery], None], _needs: object = None, *, complete: bool = True
+        self, key: str, on_query: Callable[[ArrivedQuery], None], _needs: object = None, *, complete: bool = True
     ) -> MemoryDeclared:
         del complete
         return MemoryDeclared(self.network.queryables, Entry(self, key, on_query))

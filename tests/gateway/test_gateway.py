@@ -6,7 +6,7 @@ import asyncio
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import Neighbour
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 __all__ = ["pytest_asyncio_loop_factories", "settings"]
 CONNECT = GatewaySettings(site="here", connect=("tcp/127.0.0.1:7447",))
@@ -73,20 +73,20 @@ class Bed:
     def __init__(self, settings: Settings, gateway: GatewaySettings, failures: int = 0) -> None:
         self.events: list[str] = []
         self.failures = failures
-        self.sessions: list[OpenedSession] = []
+        self.sessions: list[Any] = []
         self.rules: list[tuple[CrossingRule, ...]] = []
         """Of each time that the neighbours were made."""
         self.settings = replace(settings, gateway=gateway)
-        self.gateway = Gateway(self.settings, open_session=self._open, make_neighbours=self._make)
+        self.gateway = Gateway(self.settings, open_session=cast("Any", self._open), make_neighbours=self._make)
 
-    async def _open(self, _settings: Settings) -> OpenedSession:
+    async def _open(self, _settings: Settings) -> Any:
         if self.failures:
             self.failures -= 1
             raise StartError("zenoh", "no router answers")
         self.sessions.append(OpenedSession(self.events))
         return self.sessions[-1]
 
-    def _make(self, graph: AgentGraph, _session: ZenohSession, settings: Settings) -> Mapping[str, Neighbour]:
+    def _make(self, graph: AgentGraph, _session: OpenSession, settings: Settings) -> Mapping[str, Neighbour]:
         self.rules.append(settings.gateway.rules)
         return {"sites": RecordedNeighbour(graph, self.events)}
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
     from rmpa.gateway.neighbour import Neighbour
-    from rmpa.gateway.zenoh_api import OwnedSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 _log = logging.getLogger(__name__)
 
@@ -46,8 +46,8 @@ class Gateway:
         realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
         *,
-        open_session: Callable[[Settings], Awaitable[OwnedSession]] = open_trusted_session,
-        make_neighbours: Callable[[AgentGraph, OwnedSession, Settings], Mapping[str, Neighbour]] | None = None,
+        open_session: Callable[[Settings], Awaitable[OpenSession]] = open_trusted_session,
+        make_neighbours: Callable[[AgentGraph, OpenSession, Settings], Mapping[str, Neighbour]] | None = None,
     ) -> None:
         self._settings = replace(settings, relay=True)
         self._open_session = open_session
@@ -57,7 +57,7 @@ class Gateway:
         self.agent.bridge.add(self.graph)
         self.agent.add_operations({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
-        self.session: OwnedSession | None = None
+        self.session: OpenSession | None = None
         """The session; ``None`` until it is open."""
         self.neighbours: dict[str, Neighbour] = {}
         """The neighbours by their names; empty until the session is open."""
@@ -91,7 +91,7 @@ class Gateway:
             await self.close()
             raise
 
-    async def _began(self, opening: asyncio.Future[OwnedSession]) -> None:
+    async def _began(self, opening: asyncio.Future[OpenSession]) -> None:
         try:
             session = await opening
         except StartError as error:
@@ -198,7 +198,7 @@ class Gateway:
         elif self.session is not None and self._settings.gateway.connect and not self.session.endpoints:
             yield f"gateway: no router is connected; it is to be at {', '.join(self._settings.gateway.connect)}"
 
-    def _join(self, session: OwnedSession) -> None:
+    def _join(self, session: OpenSession) -> None:
         self.session = session
         self._problem = ""
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
@@ -229,7 +229,7 @@ class Gateway:
         if self._reopen:
             self._begin_rejoin()
 
-    def _try_to_join(self, session: OwnedSession) -> None:
+    def _try_to_join(self, session: OpenSession) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
         try:
             self._join(session)
@@ -243,13 +243,13 @@ def _rules(settings: Settings) -> tuple[object, ...]:
     return settings.gateway.rules, settings.policy, settings.peers, settings.services, settings.contracts
 
 
-async def _discard(opening: asyncio.Future[OwnedSession]) -> None:
+async def _discard(opening: asyncio.Future[OpenSession]) -> None:
     """Closes a session that is not needed any more, once it is open."""
     with contextlib.suppress(StartError):
         await (await opening).close()
 
 
-def _make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Settings) -> dict[str, Neighbour]:
+def _make_neighbours(graph: AgentGraph, session: OpenSession, settings: Settings) -> dict[str, Neighbour]:
     """Make the neighbours that the settings ask for, by their names; they are not started.
 
     Raises:
@@ -260,7 +260,7 @@ def _make_neighbours(graph: AgentGraph, session: OwnedSession, settings: Setting
     if gateway.site:
         from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
 
-        neighbours["sites"] = make_site_neighbour(graph, session, settings, graph.agent)
+        neighbours["sites"] = make_site_neighbour(graph, session, settings)
     if gateway.ros2.enabled:
         from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rmpa.core.contract import Contracts
 from rmpa.gateway.neighbour import MeshSource, SourceKind
@@ -152,8 +152,9 @@ class SiteBed:
         graph = graph if graph is not None else SiteGraph()
         own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
         crossing = CrossingRules(rules)
-        topics = SiteTopics(name, graph, session, crossing, Contracts(contracts), SystemClock())
-        site = Site(SiteNeighbour(graph, session, own, crossing, [topics]), graph, session, topics)
+        shown: Any = graph
+        topics = SiteTopics(name, shown, session, crossing, Contracts(contracts), SystemClock())
+        site = Site(SiteNeighbour(shown, session, own, crossing, [topics]), graph, session, topics)
         self.opened.append(site)
         site.neighbour.start()
         return site

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
@@ -34,7 +36,7 @@ class _Listening:
 
 async def test_goals_and_cancellations_are_listened_to_under_the_servers_name() -> None:
     heard: set[tuple[str, str]] = set()
-    part = SiteActions(lambda source, foreign: _Listening(heard, (source.here, foreign.name)))
+    part = SiteActions(cast("Any", lambda source, foreign: _Listening(heard, (source.here, foreign.name))))
     goal, cancel = client("/move/goal", "arm_msgs/MoveActionGoal"), client("/move/cancel", "actionlib_msgs/GoalID")
     part.export(goal)
     part.export(client("/move/other", "std_msgs/String"))

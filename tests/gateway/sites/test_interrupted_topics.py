@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core.contract import Contracts
 from rmpa.gateway import limits
@@ -22,7 +22,6 @@ from tests.gateway.sites.site_bed import MD5
 if TYPE_CHECKING:
     import pytest
 
-    from rmpa.gateway.zenoh_api import ZenohPublisher
 
 QOS = ZenohQos()
 ARM = SiteModule("yard", "arm", "0" * 32)
@@ -38,12 +37,11 @@ class Hall:
     def __init__(self) -> None:
         network = MemoryZenoh()
         self.graph = MemoryGraph()
-        self.topics = SiteTopics(
-            "hall", self.graph, network.session(), CrossingRules(()), Contracts(()), SystemClock()
-        )
+        graph, session = cast("Any", self.graph), cast("Any", network.session())
+        self.topics = SiteTopics("hall", graph, session, CrossingRules(()), Contracts(()), SystemClock())
         yard = network.session()
         self.wanted = asyncio.Event()
-        self.yard: ZenohPublisher = yard.publisher(ENTRY.announced.key(), QOS, self._matching)
+        self.yard = yard.publisher(ENTRY.announced.key(), QOS, self._matching)
 
     def _matching(self, there: bool) -> None:
         (self.wanted.set if there else self.wanted.clear)()

@@ -15,8 +15,8 @@ from tests.gateway.zenoh_bed import ZenohBed, bed, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
-    from rmpa.gateway.zenoh_api import ZenohQuery
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -96,7 +96,7 @@ async def test_messages_and_queries_with_giant_attachments_are_dropped_and_count
     got: list[bytes] = []
     asked: list[bytes] = []
 
-    def answer(query: ZenohQuery) -> None:
+    def answer(query: ArrivedQuery) -> None:
         asked.append(query.attachment)
         query.finish()
 
@@ -142,7 +142,7 @@ async def test_a_client_that_asks_and_does_not_read_fills_no_memory(
     victim = await net.session()
     taken: list[int] = []
 
-    def answer(query: ZenohQuery) -> None:
+    def answer(query: ArrivedQuery) -> None:
         for number in range(200):
             query.reply("q/q", bytes(200_000))
             taken.append(number)

@@ -16,7 +16,8 @@ from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import bed, free_port, until
 
 if TYPE_CHECKING:
-    from rmpa.gateway.zenoh_api import ZenohQuery, ZenohSample
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh_api import ZenohSample
 
 pytest.importorskip("zenoh")
 
@@ -88,7 +89,7 @@ async def test_queries_are_answered_refused_left_without_an_answer_and_not_asked
     async with bed() as net:
         server, client = await net.session(), await net.session()
 
-        def answer(query: ZenohQuery) -> None:
+        def answer(query: ArrivedQuery) -> None:
             if query.payload == b"fail":
                 query.reply_error("no such bone")
             elif query.payload == b"twice":
@@ -117,7 +118,7 @@ async def test_queries_are_answered_refused_left_without_an_answer_and_not_asked
 async def test_a_query_that_is_never_answered_ends_with_its_time_out_and_no_answers() -> None:
     async with bed() as net:
         server, client = await net.session(), await net.session()
-        kept: list[ZenohQuery] = []
+        kept: list[ArrivedQuery] = []
         server.queryable("s", kept.append)
         asked = asyncio.create_task(client.get("s", timeout=0.3))
         assert await asked == []
@@ -129,7 +130,7 @@ async def test_all_complete_asks_each_server() -> None:
         client = await net.session()
 
         def server_of(number: int) -> None:
-            def answer(query: ZenohQuery) -> None:
+            def answer(query: ArrivedQuery) -> None:
                 query.reply("s", b"%d" % number)
                 query.finish()
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.config.permission_rules import PermissionRule
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
-    from rmpa.gateway.zenoh_api import ZenohQuery
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -72,7 +72,7 @@ async def test_the_rules_of_permission_hold_in_a_router(fleet: Fleet) -> None:
     scan.put(b"scan")
     await until(lambda: got["b"])
 
-    def stop(query: ZenohQuery) -> None:
+    def stop(query: ArrivedQuery) -> None:
         query.reply(query.key, b"stopped")
         query.finish()
 
@@ -94,7 +94,7 @@ async def test_headers_and_parameters_are_answered_for_the_names_that_are_permit
     )
     a, b, c = await fleet.gateway("a"), await fleet.gateway("b"), await fleet.gateway("c")
 
-    def answer(query: ZenohQuery) -> None:
+    def answer(query: ArrivedQuery) -> None:
         query.reply(query.key, b"told")
         query.finish()
 

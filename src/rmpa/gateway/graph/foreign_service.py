@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 class ProxiedService(ProxiedSource):
-    """A foreign service; see ``neighbour.ForeignService``.
+    """A foreign service in the gateway's graph; calls under way get an error once it is closed.
 
     A graph has one server of each service: while another node has its name, it waits, and ``problem`` says so.
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class ProxiedTopic(ProxiedSource):
-    """A foreign topic; see ``neighbour.ForeignTopic``.
+    """A foreign topic in the gateway's graph; until ``describe`` its subscribers wait.
 
     Args:
         source: The topic.

@@ -1,4 +1,4 @@
-"""The gateway's own graph, for its neighbours: an implementation of ``gateway.neighbour.OwnGraph``.
+"""The gateway's own graph, for its neighbours. All is called in the event loop, callbacks too.
 
 ::
 
@@ -97,7 +97,7 @@ class AgentGraph(Part):
             taps=self._connections,
         )
 
-    # --- neighbour.OwnGraph -----------------------------------------------------------------------------------
+    # --- for neighbours ---------------------------------------------------------------------------------------
 
     @property
     def agent(self) -> Agent:
@@ -127,7 +127,16 @@ class AgentGraph(Part):
         *,
         listener: str = "",
     ) -> TopicTap:
-        """Subscribe to a local topic; see ``neighbour.OwnGraph.tap``."""
+        """Subscribe to a local topic.
+
+        Args:
+            source: The topic.
+            on_message: ``(body)``: without its length; the view is valid during the call only.
+            on_described: The publisher's header, at each connection, before its first message.
+            on_lost: ``(reason)``: the connection ended or was refused; it is tried again while the source is there.
+            listener: The node that the publisher sees; by default one of the gateway. Clients of actions want the one
+                that publishes the status.
+        """
         tap = TopicTap(
             source,
             listener or TAP_NODE,
@@ -162,7 +171,12 @@ class AgentGraph(Part):
         return await self._pool(source).describe()
 
     async def call(self, source: MeshSource, request: Buffer, timeout: float) -> bytes | bytearray:  # noqa: ASYNC109
-        """Call a local service; see ``neighbour.OwnGraph.call``."""
+        """Call a local service; return the serialized response, within ``timeout`` seconds for all.
+
+        Raises:
+            PeerRefused: The server answered with an error; its text is the error's.
+            RmpaError: The server could not be reached, or did not answer in time.
+        """
         answer: asyncio.Future[tuple[bool, Buffer]] = asyncio.get_running_loop().create_future()
 
         def done(ok: bool, body: Buffer) -> None:
@@ -182,7 +196,12 @@ class AgentGraph(Part):
         return body if isinstance(body, bytes | bytearray) else bytes(body)
 
     def show_topic(self, source: ForeignSource, on_demand: Callable[[bool], None]) -> ProxiedTopic:
-        """Put a foreign topic into the graph; see ``neighbour.OwnGraph.show_topic``."""
+        """Put a foreign topic into the graph, with its own proxy node and origin.
+
+        Args:
+            source: The topic.
+            on_demand: ``(wanted)``: a first node or module has subscribed, or the last one has left.
+        """
         site, key = self._place(source)
         shown = ProxiedTopic(
             source,
@@ -203,7 +222,13 @@ class AgentGraph(Part):
         serve: Callable[[bytes], Awaitable[bytes]],
         describe: Callable[[], Awaitable[ServiceDescription]],
     ) -> ProxiedService:
-        """Put a foreign service into the graph; see ``neighbour.OwnGraph.show_service``."""
+        """Put a foreign service into the graph.
+
+        Args:
+            source: The service.
+            serve: Awaited with each request for its response; an ``RmpaError`` is the client's error.
+            describe: Awaited once a client or a module asks for its type; an ``RmpaError`` is the client's error.
+        """
         site, key = self._place(source)
         shown = ProxiedService(
             source,

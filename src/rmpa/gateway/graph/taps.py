@@ -19,7 +19,7 @@ _PREFIX = LENGTH.size
 
 
 class TopicTap:
-    """A subscription to one topic of one node; see ``neighbour.OwnGraph.tap``.
+    """A subscription to one topic of one node; it reconnects until it is closed or the source is gone.
 
     Args:
         source: The topic.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.permission_gate import Needs
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh_api import ZenohQos, ZenohQuery, ZenohReply
+    from rmpa.gateway.zenoh_api import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
@@ -184,7 +184,7 @@ class OpenSession:
         *,
         history: bool = False,
     ) -> Declaration:
-        """Subscribe to a key expression; see ``zenoh_api``."""
+        """Subscribe to a key expression; ``history``: ask publishers with a cache for what they keep."""
         self._check(key)
         fixed = None if _WILD.intersection(key) else key
         queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
@@ -232,7 +232,12 @@ class OpenSession:
         return Declaration(self._declarations, self._kept, declare, queue)
 
     def queryable(
-        self, key: str, on_query: Callable[[ZenohQuery], None], _needs: Needs | None = None, *, complete: bool = True
+        self,
+        key: str,
+        on_query: Callable[[ArrivedQuery], None],
+        _needs: Needs | None = None,
+        *,
+        complete: bool = True,
     ) -> Declaration:
         """Answer queries."""
         self._check(key)

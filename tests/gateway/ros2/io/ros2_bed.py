@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.config.gateway_rules import GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.attachment import Ros2Attachment
@@ -84,7 +84,7 @@ class Ros2TopicBed:
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules, ros2=ros2 or Ros2Settings())
         self.neighbour = Ros2Neighbour(
-            self.graph, self.network.session(), settings, [Ros2Topics(find_none)], contracts
+            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Topics(find_none)], contracts
         )
         self.types = Ros2Types(settings.ros2.distribution)
         self._numbers = iter(range(1, 1000))

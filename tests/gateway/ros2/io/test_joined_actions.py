@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -65,7 +65,7 @@ class Bed:
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
         own = self.network.session()
-        self.neighbour = Ros2Neighbour(self.graph, own, GatewaySettings(), [Ros2Actions()])
+        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", own), GatewaySettings(), [Ros2Actions()])
 
     def endpoints(self, node: str) -> set[str]:
         tokens = [parse_token(each) for each in self.network.token_keys]

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -90,7 +90,7 @@ async def program(net: ZenohBed) -> AsyncIterator[SdkProgram]:
 @contextlib.asynccontextmanager
 async def gateway(net: ZenohBed) -> AsyncIterator[tuple[MemoryGraph, Ros2Neighbour]]:
     graph = MemoryGraph()
-    neighbour = Ros2Neighbour(graph, await net.session(), GatewaySettings(), [Ros2Topics(find_none)])
+    neighbour = Ros2Neighbour(cast("Any", graph), await net.session(), GatewaySettings(), [Ros2Topics(find_none)])
     neighbour.start()
     try:
         yield graph, neighbour

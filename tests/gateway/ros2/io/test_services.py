@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -40,7 +40,9 @@ class Bed:
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules)
-        self.neighbour = Ros2Neighbour(self.graph, self.network.session(), settings, [Ros2Services()])
+        self.neighbour = Ros2Neighbour(
+            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Services()]
+        )
         self.types = Ros2Types("jazzy")
         self.types.service_hash(ADD, ADD_2)
         self.types.service_hash(SET_BOOL)

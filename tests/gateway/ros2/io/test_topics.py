@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
@@ -508,7 +508,11 @@ async def test_hostile_tokens_are_ignored_and_counted() -> None:
 
 async def test_of_two_gateways_of_one_mesh_one_shows_a_node_and_the_other_takes_over() -> None:
     async with topic_bed() as bed:
-        gateways = [Ros2Neighbour(bed.graph, bed.network.session(), GatewaySettings(), [Ros2Topics(find_none)])]
+        gateways = [
+            Ros2Neighbour(
+                cast("Any", bed.graph), cast("Any", bed.network.session()), GatewaySettings(), [Ros2Topics(find_none)]
+            )
+        ]
         gateways[0].start()
         source = bed.graph.publisher("/chatter", STRING)
         await eventually(lambda: len(bed.own(EntityKind.PUBLISHER)) == 1)

@@ -23,12 +23,13 @@ from rmpa.runtime.system_clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.neighbour import ForeignTopic, Tap
+    from rmpa.gateway.graph.foreign_topic import ProxiedTopic
+    from rmpa.gateway.graph.taps import TopicTap
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.mapping import ActionRule
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
-    from rmpa.gateway.zenoh_api import Declared
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.tcpros import TopicDescription
 
 _PARTS: Final = ("Goal", "Result", "Feedback")
@@ -76,8 +77,8 @@ class JoinedAction(Generic[_Goals]):
         self._clock = SystemClock()
         self._goals: _Goals | None = None
         self._timer: MachineTimer | None = None
-        self._topics: dict[str, ForeignTopic] = {}
-        self._declared: list[Declared | OwnEndpoint] = []
+        self._topics: dict[str, ProxiedTopic] = {}
+        self._declared: list[Declaration | OwnEndpoint] = []
         self._sequence = 0
         self._closed = False
 
@@ -120,7 +121,7 @@ class JoinedAction(Generic[_Goals]):
         self._declared.append(made)
         return made
 
-    def _tap(self, source: Any, part: str, changed: Callable[[object], None]) -> Tap:
+    def _tap(self, source: Any, part: str, changed: Callable[[object], None]) -> TopicTap:
         """Listen to a topic of ROS 1, as the node that publishes the others."""
         listener = f"/rmpa/{SITE}{self._shown}"
         return self._context.graph.tap(source, self._take(part), changed, changed, listener=listener)

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from rmpa.config.permission_rules import Access
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.own_graph import AgentGraph
-    from rmpa.gateway.zenoh_api import OwnedSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
-def make_ros2_neighbour(graph: AgentGraph, session: OwnedSession, settings: Settings) -> Ros2Neighbour:
+def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:
     """Make the neighbour, after that of the sites if there is one; it is not started.
 
     Raises:

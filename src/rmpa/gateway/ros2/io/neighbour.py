@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine, Sequence
 
     from rmpa.config.gateway_rules import GatewaySettings
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.part import Ros2Part
-    from rmpa.gateway.zenoh_api import Declared, ZenohSession
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.observe.why.diagnosis import Diagnosis
 
 _log: Final = logging.getLogger(__name__)
@@ -50,8 +51,8 @@ class Ros2Neighbour:
 
     def __init__(
         self,
-        graph: OwnGraph,
-        session: ZenohSession,
+        graph: AgentGraph,
+        session: OpenSession,
         settings: GatewaySettings,
         parts: Sequence[Ros2Part],
         contracts: Contracts | None = None,
@@ -82,7 +83,7 @@ class Ros2Neighbour:
             self._say,
         )
         self._parts = tuple(parts)
-        self._watch: Declared | None = None
+        self._watch: Declaration | None = None
         self._closed = False
 
     def start(self) -> None:

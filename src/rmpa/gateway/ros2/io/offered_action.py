@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.core.clock import Clock
-    from rmpa.gateway.neighbour import MeshSource, Tap
+    from rmpa.gateway.graph.taps import TopicTap
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.part import Ros2Context
-    from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.sending import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer
 
 _NODE: Final = "/action_clients"
@@ -42,10 +44,10 @@ class _Goal:
     uuid: bytes
     deadline: float
     """When the goal is given up, unless the server shows it before; afterwards, when it is forgotten."""
-    asked: ZenohQuery | None
+    asked: ArrivedQuery | None
     """The request ``send_goal`` that is not answered yet."""
     status: Ros1Status = Ros1Status.PENDING
-    waiting: list[ZenohQuery] = field(default_factory=list)
+    waiting: list[ArrivedQuery] = field(default_factory=list)
     """Requests ``get_result`` that are not answered yet."""
     result: bytes | None = None
     """The result of ROS 1 once it has come."""
@@ -83,7 +85,7 @@ class GoalsToRos1:
 
     # --- from the clients of ROS 2 --------------------------------------------------------------------------------
 
-    def send_goal(self, query: ZenohQuery) -> None:
+    def send_goal(self, query: ArrivedQuery) -> None:
         """A client calls ``send_goal``."""
         uuid, cdr = messages.split_uuid(query.payload)
         body, name, stamp = self.pair.goal.to_ros1(cdr), _name(uuid), self._clock.wall_ns()
@@ -94,7 +96,7 @@ class GoalsToRos1:
         self._goals[name] = _Goal(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
         self._out.tell_ros1("goal", messages.ros1_message(stamp, goal_id.serialize(), body))
 
-    def get_result(self, query: ZenohQuery) -> None:
+    def get_result(self, query: ArrivedQuery) -> None:
         """A client calls ``get_result``; of a goal that is not known the status is UNKNOWN, as rcl answers."""
         uuid, _ = messages.split_uuid(query.payload)
         goal = self._goals.get(_name(uuid))
@@ -107,7 +109,7 @@ class GoalsToRos1:
             if goal.ended:
                 self._give_result(goal)
 
-    def cancel_goal(self, query: ZenohQuery) -> None:
+    def cancel_goal(self, query: ArrivedQuery) -> None:
         """A client calls ``cancel_goal``: one goal, all up to a stamp, or all (action_msgs/CancelGoal)."""
         uuid, until = messages.parse_cancel_request(query.payload)
         every = uuid == messages.ALL_GOALS and until == (0, 0)
@@ -238,9 +240,9 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         self.ros1 = ros1
         self.server = dict(server)
         self._connected: set[str] = set()
-        self._taps: dict[str, Tap] = {}
+        self._taps: dict[str, TopicTap] = {}
         self._ready = asyncio.Event()
-        self._publishers: dict[str, tuple[ZenohPublisher, bytes]] = {}
+        self._publishers: dict[str, tuple[QueuedPublisher, bytes]] = {}
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back."""
@@ -257,7 +259,7 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         publisher, gid = self._publishers[topic]
         publisher.put(message, self._attachment(gid))
 
-    def answer(self, query: ZenohQuery, response: bytes) -> None:
+    def answer(self, query: ArrivedQuery, response: bytes) -> None:
         """Answer a request; its attachment is repeated, as rmw_zenoh does."""
         try:
             asked = Ros2Attachment.parse(query.attachment)
@@ -311,7 +313,7 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
     def _changed(self, _value: object) -> None:
         asyncio.get_running_loop().call_soon(self._judge_ready)
 
-    def _send_goal(self, query: ZenohQuery) -> None:
+    def _send_goal(self, query: ArrivedQuery) -> None:
         """Listen to the server from the first goal on, and pass the goal on once the server listens too."""
         for part, source in self.server.items():
             if part not in self._taps:
@@ -319,7 +321,7 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         self._judge_ready()
         self._context.spawn(self._send_when_ready(query))
 
-    async def _send_when_ready(self, query: ZenohQuery) -> None:
+    async def _send_when_ready(self, query: ArrivedQuery) -> None:
         try:
             async with asyncio.timeout(limits.ROS2_ACTION_READY):
                 await self._ready.wait()
@@ -328,7 +330,7 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
             return
         self._request("send_goal", query)
 
-    def _request(self, service: str, query: ZenohQuery) -> None:
+    def _request(self, service: str, query: ArrivedQuery) -> None:
         if self._goals is None or self._closed:
             query.reply_error("the action server of ROS 1 is gone")
             return

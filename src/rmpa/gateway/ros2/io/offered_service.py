@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
-    from rmpa.gateway.zenoh_api import Declared, ZenohQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.services import ServiceDescription
 
 _log: Final = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class OfferedService:
         self._counts = counts
         self._pair: ServicePair | None = None
         self._endpoint: OwnEndpoint | None = None
-        self._queryable: Declared | None = None
+        self._queryable: Declaration | None = None
         self._calls = 0
         self._started = False
         self._closed = False
@@ -121,7 +122,7 @@ class OfferedService:
     def _say(self, text: str) -> None:
         self._context.say(self.source.here, text)
 
-    def _query(self, query: ZenohQuery) -> None:
+    def _query(self, query: ArrivedQuery) -> None:
         if self._calls >= limits.ROS2_CALLS_MAX:
             self._counts["refused"] += 1
             query.reply_error(f"{self._calls} calls of {self.source.here} are under way")
@@ -129,7 +130,7 @@ class OfferedService:
         self._calls += 1
         self._context.spawn(self._answer(query))
 
-    async def _answer(self, query: ZenohQuery) -> None:
+    async def _answer(self, query: ArrivedQuery) -> None:
         """Call the server; a call that fails gets Zenoh's error reply, for ROS 2 has no response that says so."""
         self._counts["out"] += 1
         try:
@@ -147,7 +148,7 @@ class OfferedService:
         finally:
             self._calls -= 1
 
-    async def _call(self, query: ZenohQuery) -> tuple[bytes, bytes]:
+    async def _call(self, query: ArrivedQuery) -> tuple[bytes, bytes]:
         if self._pair is None or self._closed:
             raise RemoteProtocolError(f"the service {self.source.here} is gone")
         asked = Ros2Attachment.parse(query.attachment)

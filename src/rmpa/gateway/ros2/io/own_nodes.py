@@ -15,7 +15,7 @@ from rmpa.gateway.ros2.tokens import Ros2Endpoint, Ros2Node
 if TYPE_CHECKING:
     from rmpa.gateway.ros2.qos import Ros2Qos
     from rmpa.gateway.ros2.tokens import EntityKind
-    from rmpa.gateway.zenoh_api import Declared, ZenohSession
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
 _NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_]")
 
@@ -34,7 +34,7 @@ class OwnEndpoint:
         self.gid = gid_of(endpoint.token(), gid_bytes)
         """What its messages, requests or replies have in their attachment."""
         self._nodes = nodes
-        self._token: Declared | None = nodes.session.token(endpoint.token())
+        self._token: Declaration | None = nodes.session.token(endpoint.token())
 
     def close(self) -> None:
         """Take its token back, and its node's if it was the last of it."""
@@ -54,7 +54,7 @@ class OwnRos2Nodes:
         gid_bytes: The length of a GID: 16, and 24 in ROS 2 Humble.
     """
 
-    def __init__(self, session: ZenohSession, domain: int, name: str, gid_bytes: int) -> None:
+    def __init__(self, session: OpenSession, domain: int, name: str, gid_bytes: int) -> None:
         self.session = session
         self.own_name = OWN_NAMESPACE + _NOT_IN_NAMES.sub("_", name)
         """The node that subscribes and calls for all nodes of the mesh."""
@@ -63,7 +63,7 @@ class OwnRos2Nodes:
         self._domain = domain
         self._gid_bytes = gid_bytes
         self._next = 0
-        self._nodes: dict[str, tuple[Ros2Node, Declared]] = {}
+        self._nodes: dict[str, tuple[Ros2Node, Declaration]] = {}
         self._uses: dict[str, int] = {}
 
     def declare(

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from rmpa.config.gateway_rules import GatewaySettings
     from rmpa.core.contract import Contracts
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.crossing import Ros2Crossing
     from rmpa.gateway.ros2.graph import Ros2Graph
     from rmpa.gateway.ros2.io.own_nodes import OwnRos2Nodes
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.mapping import TypeMapping
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
     from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
 SERVICE_NEEDS: Final = Needs(
@@ -50,8 +51,8 @@ class Ros2Context:
         say: Logs a problem once, and keeps it for ``report``: what it is about, and the text. An empty text: solved.
     """
 
-    graph: OwnGraph
-    session: ZenohSession
+    graph: AgentGraph
+    session: OpenSession
     settings: GatewaySettings
     contracts: Contracts
     types: Ros2Types

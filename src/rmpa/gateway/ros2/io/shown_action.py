@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.clock import Clock
-    from rmpa.gateway.neighbour import MeshSource, Tap
+    from rmpa.gateway.graph.taps import TopicTap
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
@@ -219,7 +220,7 @@ class ShownAction(JoinedAction[GoalsToRos2]):
     def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
         super().__init__(context, name, here, server.node.name, server.node.name)
         self.server = server
-        self._clients: dict[MeshSource, Tap | None] = {}
+        self._clients: dict[MeshSource, TopicTap | None] = {}
         self._subscribed = False
         self._callers: dict[str, OwnEndpoint] = {}
         self._leaving: asyncio.TimerHandle | None = None

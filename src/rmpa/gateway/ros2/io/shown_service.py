@@ -22,7 +22,7 @@ from rmpa.ros.types.find import find_service_type
 if TYPE_CHECKING:
     from collections import Counter
 
-    from rmpa.gateway.neighbour import ForeignService
+    from rmpa.gateway.graph.foreign_service import ProxiedService
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
@@ -45,7 +45,7 @@ class ShownRos2Service:
         self._context = context
         self._counts = counts
         self._pair: ServicePair | None = None
-        self._service: ForeignService | None = None
+        self._service: ProxiedService | None = None
         self._client: OwnEndpoint | None = None
         self._sequence = 0
         self._calls = 0

@@ -19,12 +19,13 @@ from rmpa.ros.types.header_types import type_of_header
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import MeshSource, Tap
+    from rmpa.gateway.graph.taps import TopicTap
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.pairs import Ros2Pairs
     from rmpa.gateway.sites.rules import CrossingDecision
-    from rmpa.gateway.zenoh_api import ZenohPublisher
+    from rmpa.gateway.zenoh.sending import QueuedPublisher
     from rmpa.ros.wire.tcpros import TopicDescription
 
 _STATIC_TF: Final = "/tf_static"
@@ -80,9 +81,9 @@ class Ros2TopicExport:
         )
         self._looks = looks
         self._was_described = asyncio.Event()
-        self._tap: Tap | None = None
+        self._tap: TopicTap | None = None
         self._opening = False
-        self._publisher: ZenohPublisher | None = None
+        self._publisher: QueuedPublisher | None = None
         self._endpoint: OwnEndpoint | None = None
         self._conversion: Conversion | None = None
         self._wanted = self._was_wanted = False
@@ -159,7 +160,7 @@ class Ros2TopicExport:
         self._endpoint = context.nodes.declare(
             source.proxy, EntityKind.PUBLISHER, source.here, type_name, type_hash, qos
         )
-        publisher: list[ZenohPublisher] = []
+        publisher: list[QueuedPublisher] = []
 
         def matching(there: bool) -> None:
             if not publisher or publisher[0] is self._publisher:
@@ -176,7 +177,7 @@ class Ros2TopicExport:
         self._endpoint, self._publisher = None, None
         self._drop(endpoint, publisher)
 
-    def _drop(self, endpoint: OwnEndpoint | None, publisher: ZenohPublisher | None) -> None:
+    def _drop(self, endpoint: OwnEndpoint | None, publisher: QueuedPublisher | None) -> None:
         if endpoint is not None:
             endpoint.close()
         if publisher is not None:

@@ -27,12 +27,13 @@ from rmpa.ros.wire.tcpros import TopicDescription
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import ForeignTopic
+    from rmpa.gateway.graph.foreign_topic import ProxiedTopic
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
     from rmpa.gateway.sites.rules import CrossingDecision
-    from rmpa.gateway.zenoh_api import Declared, ZenohSample
+    from rmpa.gateway.zenoh.session import Declaration
+    from rmpa.gateway.zenoh_api import ZenohSample
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -45,7 +46,7 @@ class _Publisher:
     def __init__(self, node: str) -> None:
         self.node: Final = node
         self.endpoints: list[Ros2Endpoint] = []
-        self.topic: ForeignTopic | None = None
+        self.topic: ProxiedTopic | None = None
         self.wanted = False
         self.kept: bytes | None = None
         self.received = 0
@@ -89,7 +90,7 @@ class Ros2TopicImport:
         self._adopted: dict[bytes, _Publisher] = {}
         self._conversion: Conversion | None = None
         self._has_seq = False
-        self._subscription: Declared | None = None
+        self._subscription: Declaration | None = None
         self._endpoint: OwnEndpoint | None = None
         self._history = False
         self._sequences = Ros2Sequences()

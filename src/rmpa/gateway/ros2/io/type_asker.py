@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.io.own_nodes import OwnRos2Nodes
     from rmpa.gateway.ros2.tokens import Ros2Node
     from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
 class Ros2TypeAsker:
@@ -34,7 +34,7 @@ class Ros2TypeAsker:
         types: The types of ROS 2's distribution.
     """
 
-    def __init__(self, session: ZenohSession, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
+    def __init__(self, session: OpenSession, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
         self._session = session
         self._nodes = nodes
         self._ros2 = ros2

@@ -17,7 +17,8 @@ from rmpa.gateway.sites.part import SitePart
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import ForeignSource, MeshSource, Tap
+    from rmpa.gateway.graph.taps import TopicTap
+    from rmpa.gateway.neighbour import ForeignSource, MeshSource
     from rmpa.gateway.sites.part import SiteExport, SiteImport
 
 _STATUS: Final = "actionlib_msgs/GoalStatusArray"
@@ -32,7 +33,7 @@ class SiteActions(SitePart):
 
     name = "actions"
 
-    def __init__(self, attend: Callable[[MeshSource, ForeignSource], Tap]) -> None:
+    def __init__(self, attend: Callable[[MeshSource, ForeignSource], TopicTap]) -> None:
         self._attend = attend
         self._clients: dict[MeshSource, str] = {}
         """The topics of goals and cancellations of this site, with the action's name."""
@@ -40,7 +41,7 @@ class SiteActions(SitePart):
         """The sites that each of them is offered to; empty text: all."""
         self._servers: dict[ForeignSource, str] = {}
         """The topics of status of other sites, likewise."""
-        self._listening: dict[tuple[MeshSource, ForeignSource], Tap] = {}
+        self._listening: dict[tuple[MeshSource, ForeignSource], TopicTap] = {}
 
     def export(self, entry: SiteExport) -> None:
         """A client of this site sends goals or cancellations."""

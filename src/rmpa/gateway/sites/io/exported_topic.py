@@ -17,9 +17,12 @@ from rmpa.runtime.corking import after_read
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contract
-    from rmpa.gateway.neighbour import OwnGraph, Tap
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.graph.taps import TopicTap
     from rmpa.gateway.sites.part import SiteExport
-    from rmpa.gateway.zenoh_api import ZenohPublisher, ZenohQuery, ZenohSession
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.sending import QueuedPublisher
+    from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
 
@@ -42,8 +45,8 @@ class ExportedTopic:
     def __init__(
         self,
         entry: SiteExport,
-        graph: OwnGraph,
-        session: ZenohSession,
+        graph: AgentGraph,
+        session: OpenSession,
         contract: Contract,
         clock: Clock,
     ) -> None:
@@ -59,7 +62,7 @@ class ExportedTopic:
         self._traffic = SiteTraffic(clock.now())
         self._sent_before = self._dropped_before = 0
         self._problem = ""
-        self._tap: Tap | None = None
+        self._tap: TopicTap | None = None
         self.description: TopicDescription | None = None
         """The publisher's last header; ``None`` before the first."""
         self._writer: AttachmentWriter | None = None
@@ -68,13 +71,13 @@ class ExportedTopic:
         self.wanted = False
         """Whether another site subscribes."""
         self._linger: asyncio.TimerHandle | None = None
-        self._queries: list[tuple[ZenohQuery, asyncio.TimerHandle]] = []
+        self._queries: list[tuple[ArrivedQuery, asyncio.TimerHandle]] = []
         self._large = self._cached = False
         self._latched: bytes | None = None
         self._repeated = False
         self._held: bytes | None = None
         self._held_timer: asyncio.TimerHandle | None = None
-        self._retired: list[ZenohPublisher] = []
+        self._retired: list[QueuedPublisher] = []
         self._retire_timer: asyncio.TimerHandle | None = None
         self._publisher = self._declare()
 
@@ -83,7 +86,7 @@ class ExportedTopic:
         """Messages that the queues to Zenoh dropped."""
         return self._dropped_before + sum(each.dropped for each in (self._publisher, *self._retired))
 
-    def ask(self, query: ZenohQuery) -> None:
+    def ask(self, query: ArrivedQuery) -> None:
         """Answer a question for the publisher's header, once it is connected."""
         if self._tap is not None and self._tap.description is not None:
             self._answer(query)
@@ -141,7 +144,7 @@ class ExportedTopic:
 
     # --- demand ---------------------------------------------------------------------------------------------------
 
-    def _declare(self) -> ZenohPublisher:
+    def _declare(self) -> QueuedPublisher:
         qos = qos_of(self._contract, latching=self._cached, large=self._large)
         return self._session.publisher(self.entry.announced.key(), qos, self._on_matching)
 
@@ -160,7 +163,7 @@ class ExportedTopic:
         if self._retired:
             self._retire_timer = asyncio.get_running_loop().call_later(limits.IDLE_CHECK, self._close_retired)
 
-    def _retire(self, publisher: ZenohPublisher) -> bool:
+    def _retire(self, publisher: QueuedPublisher) -> bool:
         """Close a publisher if nothing waits in it; return whether that was done."""
         if publisher.waiting:
             return False
@@ -307,7 +310,7 @@ class ExportedTopic:
 
     # --- questions for the header ---------------------------------------------------------------------------------
 
-    def _answer(self, query: ZenohQuery) -> None:
+    def _answer(self, query: ArrivedQuery) -> None:
         if self.description is None or self._writer is None:
             query.reply_error(self._problem or "the publisher's header is not known")
             return
@@ -321,7 +324,7 @@ class ExportedTopic:
         query.reply(query.key, header.serialize())
         query.finish()
 
-    def _give_up(self, query: ZenohQuery) -> None:
+    def _give_up(self, query: ArrivedQuery) -> None:
         self._queries = [each for each in self._queries if each[0] is not query]
         source = self.entry.source
         query.reply_error(

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.clock import Clock
-    from rmpa.gateway.neighbour import OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.part import SiteImport
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
 _log = logging.getLogger(__name__)
@@ -63,8 +63,8 @@ class ImportedTopic:
         self,
         entry: SiteImport,
         site: str,
-        graph: OwnGraph,
-        session: ZenohSession,
+        graph: AgentGraph,
+        session: OpenSession,
         clock: Clock,
         on_demand: Callable[[ImportedTopic, bool], None],
         interrupted: InterruptedTopic | None = None,

@@ -28,52 +28,39 @@ from rmpa.trust.permissions import refusal
 if TYPE_CHECKING:
     from rmpa.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.params import SiteAsker
     from rmpa.gateway.sites.part import SitePart
-    from rmpa.gateway.zenoh_api import OwnedSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
-def make_site_neighbour(
-    graph: OwnGraph, session: OwnedSession, settings: Settings, agent: Agent | None = None
-) -> SiteNeighbour:
-    """Make the neighbour "other sites"; it is not started.
-
-    Args:
-        graph: The gateway's graph.
-        session: The Zenoh session.
-        settings: The gateway's; ``settings.gateway.site`` is not empty.
-        agent: The gateway's agent, which carries parameters and questions; ``None``: neither crosses.
-    """
-    policy = OwnPolicy(settings)
-    gateway, clock = settings.gateway, SystemClock()
-    permissions = None if agent is None else SitePermissions(agent.bridge.gate)
-    rules = CrossingRules(gateway.rules, policy.judge, permissions)
+def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> SiteNeighbour:
+    """Make the neighbour "other sites"; it is not started. ``settings.gateway.site`` is not empty."""
+    gateway, clock, counters = settings.gateway, SystemClock(), graph.agent.bridge.counters
+    policy, history = OwnPolicy(settings), SiteHistory(clock.now)
+    rules = CrossingRules(gateway.rules, policy.judge, SitePermissions(graph.agent.bridge.gate))
 
     def why_not(site: str, source: MeshSource) -> str:
         return rules.refusal(site, source.module, source.name, Access.CALL)
 
-    counters = None if agent is None else agent.bridge.counters
-    history = SiteHistory(clock.now)
     parts: list[SitePart] = [
         SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, counters),
         SiteServices(gateway.site, session, graph, policy.timeout, why_not, clock.wall_ns),
+        SiteActions(graph.attend),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))
     neighbour = SiteNeighbour(graph, session, own, rules, parts, counters)
     neighbour.on_sites = history.seen
     neighbour.on_site_source = lambda source, there: history.source(source, there=there)
-    if isinstance(graph, AgentGraph):
-        neighbour.add(SiteActions(graph.attend))
-    if agent is not None:
-        _add_questions(neighbour, agent, session, own, rules, history, clock, settings.name)
+    _add_questions(neighbour, graph.agent, session, own, rules, history, clock, settings.name)
     return neighbour
 
 
 def _add_questions(
     neighbour: SiteNeighbour,
     agent: Agent,
-    session: OwnedSession,
+    session: OpenSession,
     own: SiteGateway,
     rules: CrossingRules,
     history: SiteHistory,

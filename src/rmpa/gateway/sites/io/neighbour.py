@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.core.counters import Counters
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.part import SiteExport, SitePart
     from rmpa.gateway.sites.rules import CrossingRules
-    from rmpa.gateway.zenoh_api import Declared, ZenohSession
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
 _log = logging.getLogger(__name__)
 
@@ -44,8 +45,8 @@ class SiteNeighbour:
 
     def __init__(
         self,
-        graph: OwnGraph,
-        session: ZenohSession,
+        graph: AgentGraph,
+        session: OpenSession,
         own: SiteGateway,
         rules: CrossingRules,
         parts: Sequence[SitePart],
@@ -70,8 +71,8 @@ class SiteNeighbour:
         self._leader: Leader | None = None
         self._active = False
         self._sites: tuple[str, ...] = ()
-        self._tokens: dict[str, Declared] = {}
-        self._declared: list[Declared] = []
+        self._tokens: dict[str, Declaration] = {}
+        self._declared: list[Declaration] = []
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
         self._closed = False
 

@@ -32,7 +32,8 @@ from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Generator
 
-    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
 _log = logging.getLogger(__name__)
 _NEEDS = Needs(
@@ -58,7 +59,7 @@ class SiteParamExports(SitePart):
     def __init__(
         self,
         site: str,
-        session: ZenohSession,
+        session: OpenSession,
         ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
         why_not: Callable[[SiteAsker, str, str, str], str],
     ) -> None:
@@ -66,7 +67,7 @@ class SiteParamExports(SitePart):
         self._session = session
         self._ask = ask
         self._why_not = why_not
-        self._queryable: Declared | None = None
+        self._queryable: Declaration | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._asked = self._refused = 0
 
@@ -91,7 +92,7 @@ class SiteParamExports(SitePart):
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    def _take(self, query: ZenohQuery) -> None:
+    def _take(self, query: ArrivedQuery) -> None:
         self._asked += 1
         if len(self._tasks) >= limits.SITE_PARAMS_AT_ONCE:
             self._refused += 1
@@ -101,7 +102,7 @@ class SiteParamExports(SitePart):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _answer(self, query: ZenohQuery) -> None:
+    async def _answer(self, query: ArrivedQuery) -> None:
         try:
             asker = SiteAsker(SiteAttachment.parse(query.attachment).path[-1] if query.attachment else "")
             module, name = parse_param_key(query.key)
@@ -127,7 +128,7 @@ class SiteParamExports(SitePart):
             _log.exception("! a question about a parameter failed")
             self._fail(query, f"the gateway of site {self._site} failed at the parameter; its log says why")
 
-    def _fail(self, query: ZenohQuery, text: str) -> None:
+    def _fail(self, query: ArrivedQuery, text: str) -> None:
         self._refused += 1
         query.reply_error(text)
 

@@ -25,7 +25,7 @@ from rmpa.gateway.sites.services import NO_MD5
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
 class SiteParamImports:
@@ -42,7 +42,7 @@ class SiteParamImports:
     def __init__(
         self,
         site: str,
-        session: ZenohSession,
+        session: OpenSession,
         stamp: Callable[[], int],
         why_not: Callable[[str, str, str], str] | None = None,
     ) -> None:

@@ -28,8 +28,10 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
-    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.wire.services import ServiceDescription
 
 _NEEDS = Needs((Access.CALL,), "the service, of the site", key="rmpa/1/<site>/<module>/s/**")
@@ -44,7 +46,7 @@ class _Exported:
 
     source: MeshSource
     to: str
-    queryable: Declared
+    queryable: Declaration
     slots: asyncio.Semaphore
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
     description: ServiceDescription | None = None
@@ -69,8 +71,8 @@ class SiteServiceExports:
     def __init__(
         self,
         site: str,
-        session: ZenohSession,
-        graph: OwnGraph,
+        session: OpenSession,
+        graph: AgentGraph,
         timeout: Callable[[str], float],
         why_not: Callable[[str, MeshSource], str] = lambda _site, _source: "",
     ) -> None:
@@ -133,7 +135,7 @@ class SiteServiceExports:
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    def _take(self, source: MeshSource, to: str, query: ZenohQuery) -> None:
+    def _take(self, source: MeshSource, to: str, query: ArrivedQuery) -> None:
         entry = self._exported.get((source.module, source.name, to))
         if entry is None or entry.source is not source:
             query.reply_error(f"service {source.name} of {source.module} has left")
@@ -165,7 +167,7 @@ class SiteServiceExports:
         entry.tasks.discard(task)
         self._bytes -= size
 
-    async def _answer(self, entry: _Exported, query: ZenohQuery, md5: str) -> None:
+    async def _answer(self, entry: _Exported, query: ArrivedQuery, md5: str) -> None:
         try:
             if DESCRIPTION in query.parameters.split(";"):
                 query.reply(query.key, write_description(await self._describe(entry)))
@@ -183,7 +185,7 @@ class SiteServiceExports:
             _log.exception("! a call of %s by another site failed", entry.source.name)
             self._fail(entry, query, f"the gateway of site {self._site} failed at the call; its log says why")
 
-    async def _call(self, entry: _Exported, query: ZenohQuery, md5: str) -> None:
+    async def _call(self, entry: _Exported, query: ArrivedQuery, md5: str) -> None:
         source = entry.source
         entry.calls += 1
         timeout = self._timeout(source.here)
@@ -218,7 +220,7 @@ class SiteServiceExports:
             raise PeerRefused(entry.source.module, text) from None
         return entry.description
 
-    def _fail(self, entry: _Exported, query: ZenohQuery, text: str) -> None:
+    def _fail(self, entry: _Exported, query: ArrivedQuery, text: str) -> None:
         entry.failed += 1
         entry.problem = text
         query.reply_error(text)
@@ -228,7 +230,7 @@ def _type_of(entry: _Exported) -> str:
     return entry.description.type if entry.description is not None else entry.source.type
 
 
-def _caller(query: ZenohQuery) -> tuple[str, str]:
+def _caller(query: ArrivedQuery) -> tuple[str, str]:
     """The site that calls, and the md5 sum that it takes the service for.
 
     Raises:

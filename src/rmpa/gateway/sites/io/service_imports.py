@@ -16,9 +16,11 @@ from rmpa.gateway.zenoh_api import ZenohPriority
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import ForeignService, ForeignSource, OwnGraph
+    from rmpa.gateway.graph.foreign_service import ProxiedService
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import ForeignSource
     from rmpa.gateway.sites.keys import SiteSource
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.services import ServiceDescription
 
 
@@ -29,7 +31,7 @@ class _Imported:
     source: SiteSource
     foreign: ForeignSource
     gone: asyncio.Event = field(default_factory=asyncio.Event)
-    service: ForeignService | None = None
+    service: ProxiedService | None = None
     description: ServiceDescription | None = None
     calls: int = 0
     failed: int = 0
@@ -50,8 +52,8 @@ class SiteServiceImports:
     def __init__(
         self,
         site: str,
-        session: ZenohSession,
-        graph: OwnGraph,
+        session: OpenSession,
+        graph: AgentGraph,
         timeout: Callable[[str], float],
         stamp: Callable[[], int],
     ) -> None:

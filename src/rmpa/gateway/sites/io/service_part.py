@@ -12,9 +12,10 @@ from rmpa.gateway.sites.part import SitePart
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.neighbour import MeshSource, OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.part import SiteExport, SiteImport
-    from rmpa.gateway.zenoh_api import ZenohSession
+    from rmpa.gateway.zenoh.session import OpenSession
 
 
 class SiteServices(SitePart):
@@ -34,8 +35,8 @@ class SiteServices(SitePart):
     def __init__(
         self,
         site: str,
-        session: ZenohSession,
-        graph: OwnGraph,
+        session: OpenSession,
+        graph: AgentGraph,
         timeout: Callable[[str], float],
         why_not: Callable[[str, MeshSource], str],
         stamp: Callable[[], int],

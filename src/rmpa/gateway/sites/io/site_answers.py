@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from rmpa.config.permission_rules import Access
     from rmpa.gateway.sites.history import SiteHistory
+    from rmpa.gateway.sites.io.neighbour import SiteNeighbour
     from rmpa.gateway.sites.io.site_why import SiteWhy
     from rmpa.gateway.sites.keys import SiteGateway, SiteModule
-    from rmpa.gateway.sites.known_sites import Sites
 
 _KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 
@@ -46,7 +46,7 @@ class SiteAnswers(SitePart):
         self,
         gateway: str,
         own: SiteGateway,
-        sites: Sites,
+        sites: SiteNeighbour,
         history: SiteHistory,
         endpoints: Callable[[], tuple[str, ...]],
         ask_param: Callable[[str, str, str, str, dict[str, Any]], Awaitable[object]],

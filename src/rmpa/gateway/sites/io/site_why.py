@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.sites.history import SiteHistory
+    from rmpa.gateway.sites.io.neighbour import SiteNeighbour
     from rmpa.gateway.sites.keys import SiteSource
-    from rmpa.gateway.sites.known_sites import Sites
     from rmpa.gateway.sites.rules import CrossingRules
-    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSession
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
 _NEEDS = Needs(
     (Access.SUBSCRIBE, Access.CALL),
@@ -66,8 +67,8 @@ class SiteWhy:
         self,
         site: str,
         gateway: str,
-        session: ZenohSession,
-        sites: Sites,
+        session: OpenSession,
+        sites: SiteNeighbour,
         history: SiteHistory,
         rules: CrossingRules,
         may: Callable[[str, Access, str], bool] = lambda _asker, _access, _name: True,
@@ -79,7 +80,7 @@ class SiteWhy:
         self._history = history
         self._rules = rules
         self._may = may
-        self._queryable: Declared = session.queryable(why_key(site), self._take, _NEEDS)
+        self._queryable: Declaration = session.queryable(why_key(site), self._take, _NEEDS)
 
     def close(self) -> None:
         """Answer no more."""
@@ -288,7 +289,7 @@ class SiteWhy:
                 problem = str(error)
         return (), problem
 
-    def _take(self, query: ZenohQuery) -> None:
+    def _take(self, query: ArrivedQuery) -> None:
         if not self._sites.leads:
             query.finish()
             return

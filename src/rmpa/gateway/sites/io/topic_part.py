@@ -23,19 +23,21 @@ from rmpa.gateway.sites.topic_header import REFUSED
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
-    from rmpa.gateway.neighbour import OwnGraph
+    from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.part import SiteExport, SiteImport
     from rmpa.gateway.sites.rules import CrossingRules
-    from rmpa.gateway.zenoh_api import Declared, ZenohQuery, ZenohSample, ZenohSession
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
+    from rmpa.gateway.zenoh_api import ZenohSample
 
 
 @dataclass(slots=True)
 class _Subscription:
     """The subscription to one topic of one module at another site, which its publishers share."""
 
-    declared: Declared
+    declared: Declaration
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
     """By node."""
     latched: dict[str, tuple[bytes, int, MessageSource]] = field(default_factory=dict)
@@ -61,8 +63,8 @@ class SiteTopics(SitePart):
     def __init__(
         self,
         site: str,
-        graph: OwnGraph,
-        session: ZenohSession,
+        graph: AgentGraph,
+        session: OpenSession,
         rules: CrossingRules,
         contracts: Contracts,
         clock: Clock,
@@ -81,7 +83,7 @@ class SiteTopics(SitePart):
         self._interrupted: dict[tuple[str, str, str, str], InterruptedTopic] = {}
         """Likewise: those that went while nodes subscribed."""
         self._subscriptions: dict[str, _Subscription] = {}
-        self._questions: dict[SiteModule, tuple[Declared, Declared]] = {}
+        self._questions: dict[SiteModule, tuple[Declaration, Declaration]] = {}
         self._reader = AttachmentReader()
         self._check_timer: asyncio.TimerHandle | None = None
         self.counters = counters if counters is not None else Counters()
@@ -243,7 +245,7 @@ class SiteTopics(SitePart):
 
     # --- questions of other sites -----------------------------------------------------------------------------------
 
-    def _on_header_query(self, module: SiteModule, query: ZenohQuery) -> None:
+    def _on_header_query(self, module: SiteModule, query: ArrivedQuery) -> None:
         name = query.key.removeprefix(f"{ROOT}/{module.site}/{module.name}/d/t")
         asked = dict(pair.partition("=")[::2] for pair in query.parameters.split(";"))
         node, site = asked.get("node", ""), asked.get("site", "")
@@ -258,7 +260,7 @@ class SiteTopics(SitePart):
             return
         topic.ask(query)
 
-    def _on_definition_query(self, module: SiteModule, query: ZenohQuery) -> None:
+    def _on_definition_query(self, module: SiteModule, query: ArrivedQuery) -> None:
         md5 = query.key.rpartition("/")[2]
         for (name, _), nodes in self._exported.items():
             for topic in nodes.values() if name == module.name else ():
