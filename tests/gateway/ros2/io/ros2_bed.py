@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.gateway_rules import CrossingRule
     from rmpa.core.contract import Contracts
+    from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.zenoh_api import ZenohSample
 
 STRING = MessageType("std_msgs/String")
@@ -30,6 +31,11 @@ STRING = MessageType("std_msgs/String")
 def find_none(name: str) -> MessageType:
     """A machine without ROS 1 packages: only what rmpa brings."""
     return MessageType(name)
+
+
+def find_no_topics(context: Ros2Context) -> Ros2Topics:
+    """The part for topics, on a machine without definitions."""
+    return Ros2Topics(context, find_none)
 
 
 def string(text: str) -> bytes:
@@ -84,7 +90,7 @@ class Ros2TopicBed:
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules, ros2=ros2 or Ros2Settings())
         self.neighbour = Ros2Neighbour(
-            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Topics(find_none)], contracts
+            cast("Any", self.graph), cast("Any", self.network.session()), settings, [find_no_topics], contracts
         )
         self.types = Ros2Types(settings.ros2.distribution)
         self._numbers = iter(range(1, 1000))

@@ -65,7 +65,7 @@ class Bed:
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
         own = self.network.session()
-        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", own), GatewaySettings(), [Ros2Actions()])
+        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", own), GatewaySettings(), [Ros2Actions])
 
     def endpoints(self, node: str) -> set[str]:
         tokens = [parse_token(each) for each in self.network.token_keys]
@@ -284,8 +284,7 @@ async def test_a_server_of_ros2_that_dies_aborts_the_goal_and_leaves(bed: Bed) -
 
 
 async def test_other_topics_of_such_names_are_left_to_other_parts(bed: Bed) -> None:
-    part = Ros2Actions()
-    part.start(bed.neighbour.context)
+    part = Ros2Actions(bed.neighbour.context)
     text = MessageType("std_msgs/String")
     assert not part.mesh_source(bed.graph.publisher("/door/status", text), there=True)
     assert not part.mesh_source(bed.graph.publisher("/goal", text), there=True)

@@ -12,10 +12,9 @@ import pytest
 
 from rmpa.config.gateway_rules import GatewaySettings
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.io.topics import Ros2Topics
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph
-from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string
+from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string
 from tests.gateway.zenoh_bed import bed, until
 
 if TYPE_CHECKING:
@@ -90,7 +89,7 @@ async def program(net: ZenohBed) -> AsyncIterator[SdkProgram]:
 @contextlib.asynccontextmanager
 async def gateway(net: ZenohBed) -> AsyncIterator[tuple[MemoryGraph, Ros2Neighbour]]:
     graph = MemoryGraph()
-    neighbour = Ros2Neighbour(cast("Any", graph), await net.session(), GatewaySettings(), [Ros2Topics(find_none)])
+    neighbour = Ros2Neighbour(cast("Any", graph), await net.session(), GatewaySettings(), [find_no_topics])
     neighbour.start()
     try:
         yield graph, neighbour

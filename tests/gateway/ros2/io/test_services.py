@@ -41,7 +41,7 @@ class Bed:
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules)
         self.neighbour = Ros2Neighbour(
-            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Services()]
+            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Services]
         )
         self.types = Ros2Types("jazzy")
         self.types.service_hash(ADD, ADD_2)

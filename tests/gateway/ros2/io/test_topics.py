@@ -11,7 +11,6 @@ from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.conversion import Conversion
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.io.own_nodes import gid_of
-from rmpa.gateway.ros2.io.topics import Ros2Topics
 from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Qos, Ros2Reliability
 from rmpa.gateway.ros2.tokens import NO_HASH, EntityKind
 from rmpa.gateway.ros2.type_description import SERVICE_TYPE
@@ -19,7 +18,7 @@ from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
-from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
+from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string, topic_bed
 from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
@@ -510,7 +509,7 @@ async def test_of_two_gateways_of_one_mesh_one_shows_a_node_and_the_other_takes_
     async with topic_bed() as bed:
         gateways = [
             Ros2Neighbour(
-                cast("Any", bed.graph), cast("Any", bed.network.session()), GatewaySettings(), [Ros2Topics(find_none)]
+                cast("Any", bed.graph), cast("Any", bed.network.session()), GatewaySettings(), [find_no_topics]
             )
         ]
         gateways[0].start()

@@ -31,8 +31,8 @@ _OF_SERVER: Final = ("status", "feedback", "result")
 class Ros2Actions:
     """Joins actions both ways. It takes all topics and services of actions, so that no other part carries them."""
 
-    def __init__(self) -> None:
-        self._context: Ros2Context | None = None
+    def __init__(self, context: Ros2Context) -> None:
+        self._context = context
         self._servers: dict[str, dict[str, dict[str, MeshSource]]] = {}
         """The topics of servers of ROS 1 by action, node and part."""
         self._clients: dict[str, list[MeshSource]] = {}
@@ -41,10 +41,6 @@ class Ros2Actions:
         self._shown: dict[str, ShownAction] = {}
         self._leaving: dict[str, ShownAction] = {}
         """Actions whose server is gone, the last of each name: their topics stay for a moment."""
-
-    def start(self, context: Ros2Context) -> None:
-        """Begin."""
-        self._context = context
 
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Take a topic of an action."""
@@ -106,14 +102,13 @@ class Ros2Actions:
         self._offer(name)
 
     def _offer(self, name: str) -> None:
-        context = self._context
         whole = [parts for parts in self._servers.get(name, {}).values() if len(parts) == len(_OF_SERVER)]
-        if context is None or name in self._offered or not whole or len(self._offered) >= limits.ROS2_ACTIONS_MAX:
+        if name in self._offered or not whole or len(self._offered) >= limits.ROS2_ACTIONS_MAX:
             return
         result = whole[0]["result"]
         ros1 = action_name(result.type, "ActionResult")
-        if context.crossing.outgoing(result.module, result.name).allowed and ros1:
-            self._offered[name] = OfferedAction(context, name, ros1, whole[0])
+        if self._context.crossing.outgoing(result.module, result.name).allowed and ros1:
+            self._offered[name] = OfferedAction(self._context, name, ros1, whole[0])
             self._offered[name].start()
 
     def _client_changed(self, name: str, source: MeshSource, *, there: bool) -> None:
@@ -129,20 +124,18 @@ class Ros2Actions:
                 shown.client(source, there=there)
 
     def _show(self, name: str, endpoint: Ros2Endpoint) -> None:
-        context = self._context
-        if context is None or len(self._shown) >= limits.ROS2_ACTIONS_MAX:
+        if len(self._shown) >= limits.ROS2_ACTIONS_MAX:
             return
         if (before := self._leaving.pop(name, None)) is not None:
             before.finish()
-        decision = context.crossing.incoming(SourceKind.SERVICE, name, "*", endpoint.node.name)
+        decision = self._context.crossing.incoming(SourceKind.SERVICE, name, "*", endpoint.node.name)
         if decision.allowed:
-            self._shown[name] = shown = ShownAction(context, endpoint, name, decision.name)
+            self._shown[name] = shown = ShownAction(self._context, endpoint, name, decision.name)
             shown.start()
             for source in self._clients.get(decision.name, ()):
                 shown.client(source, there=True)
 
     def _show_other(self, name: str) -> None:
         """The server is gone: the next of this name takes its place."""
-        servers = self._context.ros2.at(name + _SEND, EntityKind.SERVICE) if self._context is not None else ()
-        if (other := next(iter(servers), None)) is not None:
+        if (other := next(self._context.ros2.at(name + _SEND, EntityKind.SERVICE), None)) is not None:
             self._show(name, other)

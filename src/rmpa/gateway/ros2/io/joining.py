@@ -24,7 +24,7 @@ def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
         ConfigError: A setting of it is wrong.
     """
     agent = graph.agent
-    parts = (Ros2Actions(), Ros2Services(), Ros2Topics())
+    parts = (Ros2Actions, Ros2Services, Ros2Topics)
     neighbour = Ros2Neighbour(graph, session, settings.gateway, parts, settings.make_contracts())
     sites = agent.sites.answerer if settings.gateway.site else None
     gate = agent.bridge.gate

@@ -21,7 +21,7 @@ from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
 from rmpa.gateway.ros2.why import topic_ways
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Sequence
+    from collections.abc import Callable, Coroutine, Sequence
 
     from rmpa.config.gateway_rules import GatewaySettings
     from rmpa.gateway.graph.own_graph import AgentGraph
@@ -42,7 +42,7 @@ class Ros2Neighbour:
         graph: The gateway's own graph.
         session: The Zenoh session.
         settings: The table ``[gateway]``.
-        parts: What joins actions, services and topics, in the order in which they are asked.
+        parts: Make what joins actions, services and topics, in the order in which they are asked.
         contracts: The contracts of topics; by default those without any rule.
 
     Raises:
@@ -54,7 +54,7 @@ class Ros2Neighbour:
         graph: AgentGraph,
         session: OpenSession,
         settings: GatewaySettings,
-        parts: Sequence[Ros2Part],
+        parts: Sequence[Callable[[Ros2Context], Ros2Part]],
         contracts: Contracts | None = None,
     ) -> None:
         ros2 = settings.ros2
@@ -82,14 +82,12 @@ class Ros2Neighbour:
             self._spawn,
             self._say,
         )
-        self._parts = tuple(parts)
+        self._parts = [make(self.context) for make in parts]
         self._watch: Declaration | None = None
         self._closed = False
 
     def start(self) -> None:
         """Begin, in the event loop."""
-        for part in self._parts:
-            part.start(self.context)
         self._watch = self.context.session.watch_tokens(graph_key(self.context.settings.ros2.domain), self._token)
         self.context.graph.watch(self._mesh_source)
 

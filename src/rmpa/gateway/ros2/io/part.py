@@ -72,9 +72,6 @@ class Ros2Context:
 class Ros2Part(Protocol):
     """One part. All is called in the event loop. The first part that takes a source or an endpoint has it."""
 
-    def start(self, context: Ros2Context) -> None:
-        """Begin; sources and endpoints are told afterwards."""
-
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """A source of a module appeared or is gone. Rules were not looked at.
 

@@ -20,19 +20,15 @@ if TYPE_CHECKING:
 class Ros2Services:
     """Joins services both ways. Of several servers of one name the first is called, as in each of the graphs."""
 
-    def __init__(self) -> None:
-        self._context: Ros2Context | None = None
+    def __init__(self, context: Ros2Context) -> None:
+        self._context = context
         self._offered: dict[str, list[OfferedService]] = {}
         self._shown: dict[str, ShownRos2Service] = {}
         self._counts: Counter[str] = Counter()
 
-    def start(self, context: Ros2Context) -> None:
-        """Begin."""
-        self._context = context
-
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Offer a service of a module to ROS 2, or take it back."""
-        if source.kind is not SourceKind.SERVICE or self._context is None:
+        if source.kind is not SourceKind.SERVICE:
             return False
         if not there:
             self._withdraw(source)
@@ -44,7 +40,7 @@ class Ros2Services:
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
         """Show a service of ROS 2 in the gateway's graph, or take it out."""
-        if endpoint.kind is not EntityKind.SERVICE or self._context is None:
+        if endpoint.kind is not EntityKind.SERVICE:
             return False
         if ros2_without_use(endpoint.name, endpoint.type):
             self._counts["without_use"] += there
@@ -88,15 +84,13 @@ class Ros2Services:
             self._offered.pop(source.here, None)
 
     def _show(self, endpoint: Ros2Endpoint) -> None:
-        context = self._context
-        if context is None or (here := context.crossing.name_here(endpoint.name)) is None:
-            return
-        self._shown[endpoint.name] = shown = ShownRos2Service(context, endpoint, here, self._counts)
-        shown.start()
+        if (here := self._context.crossing.name_here(endpoint.name)) is not None:
+            self._shown[endpoint.name] = shown = ShownRos2Service(self._context, endpoint, here, self._counts)
+            shown.start()
 
     def _replace(self, gone: Ros2Endpoint) -> None:
         """A server is gone: the next of that name takes its place."""
         self._shown.pop(gone.name).close()
-        others = self._context.ros2.at(gone.name, EntityKind.SERVICE) if self._context is not None else ()
+        others = self._context.ros2.at(gone.name, EntityKind.SERVICE)
         if (other := next((each for each in others if not ros2_without_use(each.name, each.type)), None)) is not None:
             self._show(other)

@@ -310,7 +310,7 @@ class ShownAction(JoinedAction[GoalsToRos2]):
             return
         for source, tap in self._clients.items():
             if tap is None:
-                self._clients[source] = self._tap(source, source.name.rpartition("/")[2], _ignore)
+                self._clients[source] = self._tap(source, source.here.rpartition("/")[2], _ignore)
         if self._clients and not self._subscribed:
             self._subscribed = True
             for part in ("feedback", "status"):

@@ -32,23 +32,18 @@ class Ros2Topics:
     """Joins topics both ways.
 
     Args:
+        context: What the parts share.
         find: Finds a ROS 1 type on this machine by its name; raises ``RmpaError`` if there is none.
     """
 
-    def __init__(self, find: Callable[[str], MessageType] = find_message_type) -> None:
-        self._find = find
-        self._context: Ros2Context | None = None
-        self._pairs: Ros2Pairs | None = None
+    def __init__(self, context: Ros2Context, find: Callable[[str], MessageType] = find_message_type) -> None:
+        self._context = context
+        self._pairs = Ros2Pairs(context.types, context.mapping, find)
         self._exports: dict[tuple[str, str], Ros2TopicExport] = {}
         self._exports_named: dict[str, dict[tuple[str, str], Ros2TopicExport]] = {}
         self._imports: dict[str, Ros2TopicImport] = {}
         self._refused: dict[str, str] = {}
         self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
-
-    def start(self, context: Ros2Context) -> None:
-        """Begin."""
-        self._context = context
-        self._pairs = Ros2Pairs(context.types, context.mapping, self._find)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
@@ -71,8 +66,8 @@ class Ros2Topics:
 
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Put a topic of a module into ROS 2's graph, or take it out."""
-        context, pairs = self._context, self._pairs
-        if source.kind is not SourceKind.TOPIC or context is None or pairs is None:
+        context = self._context
+        if source.kind is not SourceKind.TOPIC:
             return False
         key = source.here, source.proxy
         if (old := self._exports.pop(key, None)) is not None:
@@ -91,7 +86,7 @@ class Ros2Topics:
             self._refuse(refused, decision.why)
         else:
             export = self._exports[key] = Ros2TopicExport(
-                context, pairs, source, decision, self._looks, self._declared
+                context, self._pairs, source, decision, self._looks, self._declared
             )
             self._exports_named.setdefault(source.here, {})[key] = export
             export.start()
@@ -99,15 +94,14 @@ class Ros2Topics:
 
     def _declared(self, export: Ros2TopicExport) -> None:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""
-        if self._context is not None:
-            for other in list(self._context.ros2.at(export.source.here, *_TOPIC_ENDS)):
-                self._compare(export, other)
-            self._retry_imports()
+        for other in list(self._context.ros2.at(export.source.here, *_TOPIC_ENDS)):
+            self._compare(export, other)
+        self._retry_imports()
 
     def _retry_imports(self) -> None:
         """A type was learnt: topics of ROS 2 whose fields were not known may have it."""
-        for imported in self._imports.values() if self._pairs is not None else ():
-            if imported.converts or self._pairs is None:
+        for imported in self._imports.values():
+            if imported.converts:
                 continue
             try:
                 found = self._pairs.incoming(imported.type, imported.type_hash)
@@ -117,7 +111,7 @@ class Ros2Topics:
                 imported.converted(found, "")
 
     def _compare(self, export: Ros2TopicExport, other: Ros2Endpoint) -> None:
-        if self._context is not None and export.endpoint is not None:
+        if export.endpoint is not None:
             text = mismatch(export.endpoint.endpoint, other, self._context.types.distribution)
             if text:
                 self._context.say(f"{other.name} of {other.node.name}", text)
@@ -126,7 +120,7 @@ class Ros2Topics:
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""
-        if endpoint.kind not in _TOPIC_ENDS or self._context is None:
+        if endpoint.kind not in _TOPIC_ENDS:
             return False
         if not there:
             self._context.say(f"{endpoint.name} of {endpoint.node.name}", "")
@@ -138,8 +132,6 @@ class Ros2Topics:
 
     def _publisher_there(self, endpoint: Ros2Endpoint) -> None:
         context, pairs = self._context, self._pairs
-        if context is None or pairs is None:
-            return
         key = endpoint.key()
         imported = self._imports.get(key)
         if imported is None:
@@ -174,8 +166,6 @@ class Ros2Topics:
 
     def _find_conversion(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
         context, pairs = self._context, self._pairs
-        if context is None or pairs is None:
-            return
         try:
             conversion = pairs.incoming(endpoint.type, endpoint.type_hash)
         except NoConversion as error:
@@ -189,8 +179,6 @@ class Ros2Topics:
     async def _ask_type(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
         """Ask the publisher's node for the fields of its type."""
         context, pairs = self._context, self._pairs
-        if context is None or pairs is None:
-            return
         try:
             pairs.described(endpoint.type, endpoint.type_hash, await context.asker.learn(of=endpoint))
             imported.converted(pairs.incoming(endpoint.type, endpoint.type_hash), "")
