@@ -25,7 +25,6 @@ from rmpa.config.values import (
     member_of,
     read_keys,
     read_text,
-    table_schema,
     tables_of,
     whole_number,
     word_of,
@@ -197,14 +196,7 @@ def _read_rule(raw: Mapping[str, object]) -> CrossingRule:
     return CrossingRule(**values)
 
 
-def _read_rules(raw: object) -> tuple[CrossingRule, ...]:
-    if isinstance(raw, list | tuple) and len(raw) > limits.GATEWAY_RULES_MAX:
-        raise BadValue(f"{len(raw)} rules", f"at most {limits.GATEWAY_RULES_MAX}; one may have several globs")
-    return _TABLES.read(raw)
-
-
-_TABLES: Final = tables_of(_KEYS, _read_rule)
-GATEWAY_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
+GATEWAY_RULES: Final = tables_of(_KEYS, _read_rule, limits.GATEWAY_RULES_MAX, "one may have several globs")
 
 # --- settings -------------------------------------------------------------------------------------------------------
 

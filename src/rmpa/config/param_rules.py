@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.values import NAME, BadValue, Place, RuleKey, ValueType, read_at, read_keys, read_text, table_schema
+from rmpa.config.values import NAME, BadValue, Place, RuleKey, ValueType, read_at, read_keys, read_text, tables_of
 from rmpa.core.names import is_global_name, is_legal_name, matches
 
 if TYPE_CHECKING:
@@ -93,33 +94,24 @@ _KEYS: Final = (
 )
 
 
-def _read_rules(raw: object) -> tuple[FollowRule, ...]:
-    """Every ``[[param]]`` of a file; the error about a rule that contradicts an earlier one is at the later one."""
-    if not isinstance(raw, list | tuple):
-        raise BadValue(f"{raw!r} is not a list")
-    if len(raw) > limits.FOLLOW_RULES_MAX:
-        raise BadValue(f"{len(raw)} rules", f"at most {limits.FOLLOW_RULES_MAX}; follow a namespace as a whole")
-    rules: list[FollowRule] = []
-
-    def read(table: Mapping[str, object]) -> FollowRule:
-        rule = _read_rule(table)
-        _check_against(rules, rule)
-        return rule
-
-    for index, table in enumerate(raw):
-        rules.append(read_at((index,), read, table))
-    return tuple(rules)
-
-
-PARAM_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
-
-
 def _read_rule(table: Mapping[str, object]) -> FollowRule:
     values = read_keys(table, _KEYS, 'one has key = "/robot_description" and from = "base"')
     rule = FollowRule(values["key"], values["from"], values.get("to", values["key"]))
     if why := untouchable(rule.to):
         raise BadValue(f"{rule.to} cannot be followed: {why}", at=("to",) if "to" in table else ("key",))
     return rule
+
+
+def _read_rules(raw: object) -> tuple[FollowRule, ...]:
+    """Every ``[[param]]`` of a file; the error about a rule that contradicts an earlier one is at the later one."""
+    rules = _TABLES.read(raw)
+    for index, rule in enumerate(rules):
+        read_at((index,), partial(_check_against, rules[:index]), rule)
+    return rules
+
+
+_TABLES: Final = tables_of(_KEYS, _read_rule, limits.FOLLOW_RULES_MAX, "follow a namespace as a whole")
+PARAM_RULES: Final = ValueType(_read_rules, _TABLES.json_schema)
 
 
 def _check_against(rules: Sequence[FollowRule], rule: FollowRule) -> None:

@@ -16,6 +16,7 @@ from rmpa.config.contract_rules import ConfigWarning
 from rmpa.config.policy import PolicySettings
 from rmpa.config.values import (
     PEER_GLOB,
+    TOPIC_GLOB,
     TYPE_GLOB,
     BadValue,
     JsonSchema,
@@ -25,7 +26,6 @@ from rmpa.config.values import (
     read_at,
     read_keys,
     read_text,
-    read_topic_glob,
     tables_of,
 )
 from rmpa.core.names import NEVER_CROSSING, is_global_name, matches
@@ -40,18 +40,19 @@ Renames = tuple[tuple[str, str], ...]
 """Names before and after, or namespaces ``/namespace/**``; ``{peer}`` in them is the peer's name."""
 
 
-def _read_peer_topic_glob(raw: object) -> str:
-    """A glob over topics that may have ``{peer}`` in it."""
-    try:
-        read_topic_glob(raw.replace(PEER, _SOME_PEER) if isinstance(raw, str) else raw)
-    except BadValue as error:
-        if error.better is not None and isinstance(raw, str):
-            error.better = f"/{raw.strip()}"
-        raise
-    return read_text(raw).strip()
+def with_peer(glob: ValueType[str]) -> ValueType[str]:
+    """A glob that may have ``{peer}`` in it."""
 
+    def read(raw: object) -> str:
+        try:
+            glob.read(raw.replace(PEER, _SOME_PEER) if isinstance(raw, str) else raw)
+        except BadValue as error:
+            if error.better is not None:
+                error.better = f"/{str(raw).strip()}"
+            raise
+        return str(raw).strip()
 
-_PEER_TOPIC_GLOB: Final = ValueType(_read_peer_topic_glob, {"type": "string", "examples": ["/{peer}/**"]})
+    return ValueType(read, {"type": "string", "examples": ["/**", f"/{PEER}/**"]})
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +153,10 @@ _KEYS: Final = (
     ),
     RuleKey("remap_in", ValueType(_read_renames, _RENAMES), "Their names, and what they are here."),
     RuleKey("remap_out", ValueType(_read_renames, _RENAMES), "Our names, and what they are there."),
-    RuleKey("allow", list_of(_PEER_TOPIC_GLOB), "Topics that may cross, on top of [bridge], by their names here."),
-    RuleKey("deny", list_of(_PEER_TOPIC_GLOB), "Topics that stay home."),
+    RuleKey(
+        "allow", list_of(with_peer(TOPIC_GLOB)), "Topics that may cross, on top of [bridge], by their names here."
+    ),
+    RuleKey("deny", list_of(with_peer(TOPIC_GLOB)), "Topics that stay home."),
     RuleKey("allow_types", list_of(TYPE_GLOB), "Message types that may cross."),
     RuleKey("deny_types", list_of(TYPE_GLOB), "Message types that stay home."),
 )

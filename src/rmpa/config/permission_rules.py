@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.peer_rules import PEER
+from rmpa.config.peer_rules import with_peer
 from rmpa.config.values import (
     NODE_GLOB,
     PARAM_GLOB,
@@ -28,7 +28,6 @@ from rmpa.config.values import (
     read_at,
     read_keys,
     read_text,
-    table_schema,
     tables_of,
     word_of,
 )
@@ -36,7 +35,6 @@ from rmpa.config.values import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-_SOME_PEER: Final = "peer"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 
 
@@ -115,23 +113,8 @@ def _read_group_name(raw: object) -> str:
 GROUP_NAME: Final = ValueType(_read_group_name, {"type": "string", "examples": ["operators"]})
 
 
-def _with_peer(glob: ValueType[str]) -> ValueType[str]:
-    """A glob that may have ``{peer}`` in it."""
-
-    def read(raw: object) -> str:
-        try:
-            glob.read(raw.replace(PEER, _SOME_PEER) if isinstance(raw, str) else raw)
-        except BadValue as error:
-            if error.better is not None:
-                error.better = f"/{str(raw).strip()}"
-            raise
-        return str(raw).strip()
-
-    return ValueType(read, {"type": "string", "examples": ["/**", f"/{PEER}/**"]})
-
-
 def _globs(glob: ValueType[str]) -> ValueType[tuple[str, ...]]:
-    return list_of(_with_peer(glob), if_empty="leave the key out, or name some")
+    return list_of(with_peer(glob), if_empty="leave the key out, or name some")
 
 
 _NAME_KEYS: Final = (
@@ -178,14 +161,7 @@ def _read_rule(table: Mapping[str, object]) -> PermissionRule:
     return PermissionRule(modules, groups, effect, values)
 
 
-def _read_rules(raw: object) -> tuple[PermissionRule, ...]:
-    if isinstance(raw, list | tuple) and len(raw) > limits.PERMISSION_RULES_MAX:
-        raise BadValue(f"{len(raw)} rules", f"at most {limits.PERMISSION_RULES_MAX}; make groups of modules")
-    return _TABLES.read(raw)
-
-
-_TABLES: Final = tables_of(_KEYS, _read_rule)
-PERMISSION_RULES: Final = ValueType(_read_rules, {"type": "array", "items": table_schema(_KEYS)})
+PERMISSION_RULES: Final = tables_of(_KEYS, _read_rule, limits.PERMISSION_RULES_MAX, "make groups of modules")
 
 
 _GROUP: Final = list_of(PEER_GLOB, if_empty="leave the group out, or name some modules")

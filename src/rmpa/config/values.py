@@ -176,14 +176,8 @@ CORE_MODE: Final = word_of(
 def member_of(kind: type[_Word], what: str) -> ValueType[_Word]:
     """A word of an enumeration; ``what`` names one with its article, for the text of errors."""
     words = [word.value for word in kind]
-
-    def read(raw: object) -> _Word:
-        text = str(raw).strip().lower()
-        if text not in words:
-            raise BadValue(f"{raw!r} is not {what}", f"it is one of {', '.join(words)}", did_you_mean(text, words))
-        return kind(text)
-
-    return ValueType(read, {"type": "string", "enum": words})
+    one = word_of(words, what, f"it is one of {', '.join(words)}", "")
+    return ValueType(lambda raw: kind(one.read(raw)), one.json_schema)
 
 
 TRANSPORT: Final = member_of(Transport, "a transport")
@@ -460,17 +454,23 @@ def read_keys(table: Mapping[str, object], keys: Iterable[RuleKey], example: str
     return {key.name: read_at((key.name,), key.type.read, table[key.name]) for key in keys if key.name in table}
 
 
-def tables_of(keys: Iterable[RuleKey], read_table: Callable[[Any], _T]) -> ValueType[tuple[_T, ...]]:
+def tables_of(
+    keys: Iterable[RuleKey], read_table: Callable[[Any], _T], most: int = 0, instead: str = ""
+) -> ValueType[tuple[_T, ...]]:
     """A list of tables (``[[contract]]``); errors name the table's index.
 
     Args:
         keys: The keys that each table may have.
         read_table: Reads one table.
+        most: How many there may be; 0: any number.
+        instead: What to do about more.
     """
 
     def read(raw: object) -> tuple[_T, ...]:
         if not isinstance(raw, list | tuple):
             raise BadValue(f"{shown(raw)} is not a list")
+        if most and len(raw) > most:
+            raise BadValue(f"{len(raw)} rules", f"at most {most}; {instead}")
         return tuple(read_at((index,), read_table, table) for index, table in enumerate(raw))
 
     return ValueType(read, {"type": "array", "items": table_schema(keys)})
