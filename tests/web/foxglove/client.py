@@ -27,7 +27,7 @@ class Client:
         self.knows = knows
         self.json: list[dict[str, Any]] = []
         self.frames: list[protocol.BinaryFrame] = []
-        self.asked: list[requests.Request] = []
+        self.asked: list[requests.HubRequest] = []
         self.closed: list[FoxgloveClose] = []
         self.do(self.session.open())
 

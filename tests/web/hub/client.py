@@ -17,7 +17,7 @@ from tests.ros.node.peers import until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.web.hub.requests import Request
+    from rmpa.web.hub.requests import HubRequest
     from rmpa.web.hub.rights import NodeRules
 
 _A = TypeVar("_A", bound=Answer)
@@ -68,7 +68,7 @@ class FakeClient:
     def handle(self) -> int:
         return next(self._handles)
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: HubRequest) -> None:
         self.hub.ask(self.client, request)
 
     def close(self) -> None:

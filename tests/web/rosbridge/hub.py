@@ -10,7 +10,7 @@ import msgspec
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.types.service_types import ServiceType
-from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, ParamValue, ReceivedMessage, Request
+from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, HubRequest, ParamValue, ReceivedMessage
 from rmpa.web.rosbridge.encodings import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rmpa.web.rosbridge.protocol import RosbridgeFrame
 
 NOW_NS = 1_700_000_000_000_000_123
-_R = TypeVar("_R", bound=Request)
+_R = TypeVar("_R", bound=HubRequest)
 
 
 @dataclass
@@ -59,19 +59,19 @@ class Client:
         graph: Any = self.graph
         self.session = RosbridgeSession(types, graph, lambda: NOW_NS, frames=frames or PublishFrames())
 
-    def send(self, op: str, **values: Any) -> list[Request]:
+    def send(self, op: str, **values: Any) -> list[HubRequest]:
         return self.send_raw(msgspec.json.encode({"op": op, **values}).decode())
 
-    def send_raw(self, data: str | bytes) -> list[Request]:
+    def send_raw(self, data: str | bytes) -> list[HubRequest]:
         self.session.receive_frame(data, self.now)
         return self.session.requests_to_send()
 
-    def one(self, kind: type[_R], requests: list[Request]) -> _R:
+    def one(self, kind: type[_R], requests: list[HubRequest]) -> _R:
         (request,) = requests
         assert isinstance(request, kind)
         return request
 
-    def answer(self, answer: Answer) -> list[Request]:
+    def answer(self, answer: Answer) -> list[HubRequest]:
         self.session.receive_answer(answer, self.now)
         return self.session.requests_to_send()
 

@@ -85,7 +85,7 @@ class ChannelTable:
         """Whether the hub's answers with this handle belong here."""
         return handle in self._asked or handle in self._searched
 
-    def update(self, graph: GraphChanged) -> Iterator[ServerMessage | requests.Request]:
+    def update(self, graph: GraphChanged) -> Iterator[ServerMessage | requests.HubRequest]:
         """Offer what is new in the graph, withdraw what is gone, and ask for the types that are not known yet."""
         self._pairs = {
             (topic.name, type_): None
@@ -106,7 +106,7 @@ class ChannelTable:
 
     def answer(
         self, answer: requests.Described | requests.ServiceFound | requests.Failed
-    ) -> Iterator[ServerMessage | requests.Request]:
+    ) -> Iterator[ServerMessage | requests.HubRequest]:
         """What follows from the hub's answer about a type or a service."""
         handle = answer.handle
         if handle in self._searched:
@@ -128,7 +128,7 @@ class ChannelTable:
 
     def other_version(
         self, channel: Channel, md5sum: str, *, keep: bool
-    ) -> Iterator[ServerMessage | requests.Request]:
+    ) -> Iterator[ServerMessage | requests.HubRequest]:
         """A message for a channel has another version of the type than its schema; it must not be sent there.
 
         Args:
@@ -156,14 +156,14 @@ class ChannelTable:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _want_channels(self) -> Iterator[ServerMessage | requests.Request]:
+    def _want_channels(self) -> Iterator[ServerMessage | requests.HubRequest]:
         """A channel for each version that was seen of a topic's type; before that one, of the version known here."""
         self._wanted = {(*pair, md5sum): None for pair in self._pairs for md5sum in self._versions.get(pair) or ("",)}
         yield from self._forget_types()
         for _, type_, md5sum in self._wanted:
             yield from self._describe(type_, service=False, md5sum=md5sum)
 
-    def _want_services(self, graph: GraphChanged) -> Iterator[requests.Request]:
+    def _want_services(self, graph: GraphChanged) -> Iterator[requests.HubRequest]:
         present = {service.name for service in graph.services}
         self._found = {name: type_ for name, type_ in self._found.items() if name in present}
         self._wanted_services = {}
@@ -179,7 +179,7 @@ class ChannelTable:
 
     def _service_found(
         self, name: str, answer: requests.Described | requests.ServiceFound | requests.Failed
-    ) -> Iterator[ServerMessage | requests.Request]:
+    ) -> Iterator[ServerMessage | requests.HubRequest]:
         if isinstance(answer, requests.ServiceFound) and name in self._found and is_type_name(answer.type):
             self._found[name] = answer.type
             self._wanted_services[name, answer.type] = None
@@ -195,7 +195,7 @@ class ChannelTable:
             if asked.warned:
                 yield RemoveStatus(status_ids=(_status_id(asked),))
 
-    def _describe(self, name: str, *, service: bool, md5sum: str = "") -> Iterator[requests.Request]:
+    def _describe(self, name: str, *, service: bool, md5sum: str = "") -> Iterator[requests.HubRequest]:
         if (name, service, md5sum) not in self._types:
             handle = self._next_handle()
             self._types[name, service, md5sum] = self._asked[handle] = _Type(handle, name, service, md5sum)

@@ -157,7 +157,7 @@ class ParameterRequests:
         """Whether the hub's answers with this handle belong here."""
         return handle in self._pending or handle in self._names or handle == self._all
 
-    def get(self, message: GetParameters) -> list[requests.Request]:
+    def get(self, message: GetParameters) -> list[requests.HubRequest]:
         """What to ask the hub for a client's ``getParameters``.
 
         Raises:
@@ -168,7 +168,7 @@ class ParameterRequests:
         handle = self._begin(message.id, 1)[0]
         return [requests.GetParams(handle, tuple(dict.fromkeys(message.parameter_names)))]
 
-    def set(self, message: SetParameters) -> list[requests.Request]:
+    def set(self, message: SetParameters) -> list[requests.HubRequest]:
         """What to ask the hub for a client's ``setParameters``; one that is refused leaves all as they are.
 
         Raises:
@@ -183,7 +183,7 @@ class ParameterRequests:
             for handle, (name, value) in zip(handles, values.items(), strict=True)
         ]
 
-    def follow(self, names: Iterable[str]) -> list[requests.Request]:
+    def follow(self, names: Iterable[str]) -> list[requests.HubRequest]:
         """What to ask the hub for ``subscribeParameterUpdates``; no names are all parameters.
 
         Raises:
@@ -211,7 +211,7 @@ class ParameterRequests:
             out.append(requests.FollowParams(handle, (name,)))
         return out
 
-    def unfollow(self, names: Iterable[str]) -> list[requests.Request]:
+    def unfollow(self, names: Iterable[str]) -> list[requests.HubRequest]:
         """What to ask the hub for ``unsubscribeParameterUpdates``; no names are all parameters.
 
         Raises:
@@ -249,7 +249,7 @@ class ParameterRequests:
             self._followed.pop(self._names.pop(handle), None)
         return None
 
-    def close(self) -> list[requests.Request]:
+    def close(self) -> list[requests.HubRequest]:
         """What to ask the hub when the client is gone."""
         self._pending.clear()
         return self.unfollow(())
@@ -279,8 +279,8 @@ class ParameterRequests:
             return None
         return _values({n: v for n, v in pending.values.items() if v is not None}, pending.id)
 
-    def _end_named(self, names: tuple[str, ...]) -> list[requests.Request]:
-        out: list[requests.Request] = []
+    def _end_named(self, names: tuple[str, ...]) -> list[requests.HubRequest]:
+        out: list[requests.HubRequest] = []
         for name in names:
             handle = self._followed.pop(name)
             del self._names[handle]

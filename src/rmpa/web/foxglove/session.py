@@ -44,7 +44,7 @@ class FoxgloveClose:
     reason: str
 
 
-Output: TypeAlias = FoxgloveFrame | requests.Request | FoxgloveClose
+Output: TypeAlias = FoxgloveFrame | requests.HubRequest | FoxgloveClose
 
 
 @dataclass(slots=True)
@@ -185,9 +185,9 @@ class FoxgloveSession:
         """A status message of the server's own: it says, for example, what a slow client misses."""
         return protocol.FoxgloveStatus(level=level, message=message, id=identity).frame()
 
-    def close(self) -> list[requests.Request]:
+    def close(self) -> list[requests.HubRequest]:
         """End everything that the hub does for this client, which is gone."""
-        out: list[requests.Request] = [requests.Unsubscribe(handle) for handle in self._by_handle]
+        out: list[requests.HubRequest] = [requests.Unsubscribe(handle) for handle in self._by_handle]
         out += [requests.UnadvertiseTopic(handle) for handle in self._published.values()]
         out += [requests.CancelCall(handle) for handle in self._calls]
         out += self._parameters.close()
@@ -229,7 +229,7 @@ class FoxgloveSession:
         | protocol.SetParameters
         | protocol.SubscribeParameterUpdates
         | protocol.UnsubscribeParameterUpdates,
-    ) -> list[requests.Request]:
+    ) -> list[requests.HubRequest]:
         if isinstance(message, protocol.SetParameters):
             self._check(self._rights.control, "set parameters")
             return self._parameters.set(message)
@@ -372,8 +372,8 @@ class FoxgloveSession:
             yield update.frame()
 
     def _offered(
-        self, messages: Iterable[protocol.ServerMessage | requests.Request]
-    ) -> Iterator[protocol.ServerMessage | requests.Request]:
+        self, messages: Iterable[protocol.ServerMessage | requests.HubRequest]
+    ) -> Iterator[protocol.ServerMessage | requests.HubRequest]:
         """The messages; a withdrawn channel ends its subscription too."""
         for message in messages:
             yield message
@@ -420,7 +420,7 @@ class FoxgloveSession:
         return []
 
 
-def _framed(messages: Iterable[protocol.ServerMessage | requests.Request]) -> list[Output]:
+def _framed(messages: Iterable[protocol.ServerMessage | requests.HubRequest]) -> list[Output]:
     return [each.frame() if isinstance(each, protocol.FromServer) else each for each in messages]
 
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rmpa.web.gateways.frame_writer import FrameSocket
     from rmpa.web.hub.clients import HubClient
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import Answer, Payload, Request
+    from rmpa.web.hub.requests import Answer, HubRequest, Payload
     from rmpa.web.hub.rights import Rights
 
 _log = logging.getLogger(__name__)
@@ -159,7 +159,7 @@ class ClientConnection(ABC):
         size = sum(map(len, frame[1])) + _OVERHEAD
         self._queue(handle, frame, size, self.client.subscriptions.get(handle, ""))
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: HubRequest) -> None:
         """Pass a request on to the hub, but no command that may be too old; an ended subscription's queue goes."""
         if isinstance(request, Unsubscribe):
             self.queue.end(request.handle)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.clients import Key, Receive
     from rmpa.web.hub.node_link import MakeNode, Where
-    from rmpa.web.hub.requests import Request
+    from rmpa.web.hub.requests import HubRequest
     from rmpa.web.hub.rights import NodeRules, Rights
 
 _log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class Hub:
         )
         self.time = RosTime(self.topics, self.params, (OWN_CLIENT, 1), now_ns)
         self.counts = ClientCounts(self.publishers, self.types, (OWN_CLIENT, 2), now_ns)
-        self._handlers: Mapping[type[Request], Callable[[HubClient, Any], None]] = {
+        self._handlers: Mapping[type[HubRequest], Callable[[HubClient, Any], None]] = {
             requests.Subscribe: self._subscribe,
             requests.Unsubscribe: self._unsubscribe,
             requests.AdvertiseTopic: self._advertise,
@@ -209,7 +209,7 @@ class Hub:
         self.counts.remove(client.number)
         self.graph.active = bool(self._clients)
 
-    def ask(self, client: HubClient, request: Request) -> None:
+    def ask(self, client: HubClient, request: HubRequest) -> None:
         """Do what a client's session asks; what cannot be done is answered by ``Failed``."""
         if client.number not in self._clients:
             return

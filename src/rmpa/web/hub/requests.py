@@ -26,24 +26,24 @@ Payload: TypeAlias = bytes | bytearray | memoryview
 # --- from a session to the hub ---
 
 
-class Request(msgspec.Struct, frozen=True):
+class HubRequest(msgspec.Struct, frozen=True):
     """What a session asks for."""
 
     handle: int
 
 
-class Subscribe(Request, frozen=True):
+class Subscribe(HubRequest, frozen=True):
     """Messages of `topic`; any type where `type` is None. Latched messages of each source come first."""
 
     topic: str
     type: str | None = None
 
 
-class Unsubscribe(Request, frozen=True):
+class Unsubscribe(HubRequest, frozen=True):
     """No more messages for `handle`."""
 
 
-class AdvertiseTopic(Request, frozen=True):
+class AdvertiseTopic(HubRequest, frozen=True):
     """A publisher on `topic`; `latch` keeps its last message for newcomers."""
 
     topic: str
@@ -51,17 +51,17 @@ class AdvertiseTopic(Request, frozen=True):
     latch: bool = False
 
 
-class UnadvertiseTopic(Request, frozen=True):
+class UnadvertiseTopic(HubRequest, frozen=True):
     """The publisher of `handle` ends."""
 
 
-class PublishMessage(Request, frozen=True):
+class PublishMessage(HubRequest, frozen=True):
     """One message of the publisher `handle`."""
 
     payload: Payload
 
 
-class CallService(Request, frozen=True):
+class CallService(HubRequest, frozen=True):
     """One call; `type` is None where the session does not know it. `timeout` in seconds; None for the hub's own."""
 
     service: str
@@ -70,35 +70,35 @@ class CallService(Request, frozen=True):
     timeout: float | None = None
 
 
-class FindService(Request, frozen=True):
+class FindService(HubRequest, frozen=True):
     """Asks for the type of a service whose type the graph does not say; answered by `ServiceFound` or `Failed`."""
 
     service: str
 
 
-class FindServices(Request, frozen=True):
+class FindServices(HubRequest, frozen=True):
     """Asks for the types of all services whose types the graph does not say.
 
     Answered by `ServiceFound` without a type once the graph has them; some may stay unknown.
     """
 
 
-class CancelCall(Request, frozen=True):
+class CancelCall(HubRequest, frozen=True):
     """The answer of the call `handle` is no longer wanted."""
 
 
-class ServeService(Request, frozen=True):
+class ServeService(HubRequest, frozen=True):
     """The session answers calls of `service` until `EndService`."""
 
     service: str
     type: str
 
 
-class EndService(Request, frozen=True):
+class EndService(HubRequest, frozen=True):
     """The session answers no more calls of `handle`; open calls fail."""
 
 
-class Respond(Request, frozen=True):
+class Respond(HubRequest, frozen=True):
     """The answer to `ServiceRequest` number `call`: serialized bytes where `ok`, else the error's text."""
 
     call: int
@@ -106,45 +106,45 @@ class Respond(Request, frozen=True):
     response: Payload | str
 
 
-class GetParams(Request, frozen=True):
+class GetParams(HubRequest, frozen=True):
     """Values of `names`, or of all names below `prefix` where `names` is empty ("/" for all)."""
 
     names: tuple[str, ...] = ()
     prefix: str = "/"
 
 
-class SetParam(Request, frozen=True):
+class SetParam(HubRequest, frozen=True):
     """Sets one parameter."""
 
     name: str
     value: ParamValue
 
 
-class DeleteParam(Request, frozen=True):
+class DeleteParam(HubRequest, frozen=True):
     """Deletes one parameter, with all below it."""
 
     name: str
 
 
-class FollowParams(Request, frozen=True):
+class FollowParams(HubRequest, frozen=True):
     """`ParamsChanged` at each change of `names`; of all parameters where `names` is empty."""
 
     names: tuple[str, ...] = ()
 
 
-class UnfollowParams(Request, frozen=True):
+class UnfollowParams(HubRequest, frozen=True):
     """Ends a `FollowParams`."""
 
 
-class FollowGraph(Request, frozen=True):
+class FollowGraph(HubRequest, frozen=True):
     """`GraphChanged` now and at each change of topics, services and their nodes."""
 
 
-class UnfollowGraph(Request, frozen=True):
+class UnfollowGraph(HubRequest, frozen=True):
     """Ends a `FollowGraph`."""
 
 
-class DescribeType(Request, frozen=True):
+class DescribeType(HubRequest, frozen=True):
     """Asks for the definition of a message type, or of a service type where `service`.
 
     `md5sum` asks for the version that a publisher has whose messages came; "" for the one that is known best.
@@ -156,7 +156,7 @@ class DescribeType(Request, frozen=True):
     md5sum: str = ""
 
 
-class FetchAsset(Request, frozen=True):
+class FetchAsset(HubRequest, frozen=True):
     """Asks for a file of a ROS package, `package://NAME/PATH`, of at most `most` bytes.
 
     The answer is `AssetFetched`, or `Failed`. The hub reads only files inside that package's folder.

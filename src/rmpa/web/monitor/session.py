@@ -99,7 +99,7 @@ class MonitorClose:
     refusal: str
 
 
-Output: TypeAlias = str | bytes | requests.Request | Question | Speed | FollowLog | MonitorClose
+Output: TypeAlias = str | bytes | requests.HubRequest | Question | Speed | FollowLog | MonitorClose
 
 
 class MonitorSession:

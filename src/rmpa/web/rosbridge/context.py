@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from typing import Any
 
-    from rmpa.web.hub.requests import Request
+    from rmpa.web.hub.requests import HubRequest
     from rmpa.web.hub.types import TypeLibrary
     from rmpa.web.rosbridge.rosapi import HubGraph
 
@@ -38,7 +38,7 @@ class SessionContext:
         self.ros_time_ns = ros_time_ns
         self.level = "error"
         self.frames: list[RosbridgeFrame] = []
-        self.requests: list[Request] = []
+        self.requests: list[HubRequest] = []
         self._handles = itertools.count(1)
         self._fragment_ids = itertools.count()
 
@@ -46,7 +46,7 @@ class SessionContext:
         """A handle that was never used in this session."""
         return next(self._handles)
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: HubRequest) -> None:
         """Send a request to the hub."""
         self.requests.append(request)
 

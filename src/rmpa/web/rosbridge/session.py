@@ -8,10 +8,10 @@ from rmpa.core.errors import RmpaError
 from rmpa.web.hub.requests import (
     Answer,
     Failed,
+    HubRequest,
     OtherType,
     ParamsChanged,
     ReceivedMessage,
-    Request,
     ServiceFound,
     ServiceRequest,
     ServiceResult,
@@ -148,7 +148,7 @@ class RosbridgeSession:
         frames, self._context.frames = self._context.frames, []
         return frames
 
-    def requests_to_send(self) -> list[Request]:
+    def requests_to_send(self) -> list[HubRequest]:
         """The requests for the hub since the last call."""
         requests, self._context.requests = self._context.requests, []
         return requests
