@@ -30,7 +30,8 @@ SUBSCRIBED_TOPICS_MAX: Final = 4000
 """Topics that the hub subscribes to for all clients; beyond, only those with a publisher are added. Each name is
 registered with the master, which takes a millisecond and some kilobytes."""
 UNADVERTISE_DELAY: Final = 10.0
-"""Time until a topic is withdrawn that no client advertises any more, as rosbridge_suite does."""
+"""Time until a topic is withdrawn that no client advertises any more, as rosbridge_suite does: many advertise it
+again at once, and pages reload."""
 PUBLISHERS_MAX: Final = 2000
 """Topics that the hub publishes, those included that wait for their withdrawal."""
 NODE_RETRY: Final = 1.0

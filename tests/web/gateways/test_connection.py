@@ -66,11 +66,11 @@ async def forever() -> None:
 
 async def watched(transport: Transport) -> None:
     hub: Any = None
-    connection = Silent(hub, READ_ONLY, lambda _: 0, "here", unadvertise_delay=0.0)
+    connection = Silent(hub, READ_ONLY, lambda _: 0, "here")
     played: Any = transport
     connection._transport = played
     connection._out = FrameWriter(played, forever)
-    connection._client = HubClient(1, "test", READ_ONLY, lambda _: None, 0.0)
+    connection._client = HubClient(1, "test", READ_ONLY, lambda _: None)
     await asyncio.wait_for(connection._watch(), DEADLINE)
 
 

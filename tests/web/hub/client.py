@@ -59,10 +59,10 @@ async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIter
 class FakeClient:
     """One client of a hub."""
 
-    def __init__(self, hub: Hub, rights: Rights = FULL, *, unadvertise_delay: float = 0.0) -> None:
+    def __init__(self, hub: Hub, rights: Rights = FULL) -> None:
         self.hub = hub
         self.answers: list[Answer] = []
-        self.client = hub.connect("test", rights, self.answers.append, unadvertise_delay=unadvertise_delay)
+        self.client = hub.connect("test", rights, self.answers.append)
         self._handles = itertools.count(1)
 
     def handle(self) -> int:

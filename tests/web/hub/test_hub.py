@@ -368,9 +368,12 @@ async def test_what_a_client_latches_reaches_late_nodes_and_clients(core: RosCor
         assert two.payloads(1) == [ONE]
 
 
-async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while(core: RosCore) -> None:
+async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "UNADVERTISE_DELAY", 0.05)
     async with running_hub(core) as hub:
-        one, two = FakeClient(hub), FakeClient(hub, unadvertise_delay=0.05)
+        one, two = FakeClient(hub), FakeClient(hub)
         one.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
         two.ask(AdvertiseTopic(1, "/t", "std_msgs/String"))
         await until(lambda: core.publishers("/t"))
@@ -380,6 +383,22 @@ async def test_clients_share_a_publisher_and_the_last_withdraws_it_after_a_while
         two.ask(UnadvertiseTopic(1))
         await until(lambda: not core.publishers("/t"))
         assert time.monotonic() - began >= 0.05
+
+
+async def test_a_topic_that_is_advertised_again_in_time_stays_and_latches_as_it_is_told(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "UNADVERTISE_DELAY", DEADLINE)
+    async with running_hub(core) as hub:
+        client, listener = FakeClient(hub), FakeClient(hub)
+        for handle, latch in ((1, True), (2, True), (3, False)):
+            client.ask(AdvertiseTopic(handle, "/t", "std_msgs/String", latch=latch))
+            await until(lambda: core.publishers("/t"))
+            client.ask(PublishMessage(handle, ONE))
+            client.ask(UnadvertiseTopic(handle))
+            assert core.publishers("/t")
+            listener.ask(Subscribe(handle, "/t"))
+            assert listener.payloads(handle) == ([ONE] if latch else [])
 
 
 async def test_another_type_of_a_published_topic_is_refused(core: RosCore) -> None:

@@ -213,22 +213,15 @@ def test_what_python_clients_write_for_not_a_number_is_taken(value: str) -> None
     assert bytes(publish.payload)[-2] & 0xF0 == 0xF0
 
 
-def test_a_publisher_is_withdrawn_ten_seconds_after_the_last_id_unadvertised_it() -> None:
+def test_a_publisher_ends_when_the_last_id_has_unadvertised_it() -> None:
     client = Client()
     handle = client.one(AdvertiseTopic, client.send("advertise", id="a", topic="/t", type=STRING)).handle
     assert not client.send("advertise", id="b", topic="/t", type=STRING)
-    client.send("unadvertise", id="a", topic="/t")
-    client.advance(60)
-    assert not client.session.requests_to_send()
-    client.send("unadvertise", id="b", topic="/t")
-    client.advance(limits.UNADVERTISE_DELAY - 0.1)
-    assert not client.session.requests_to_send()
-    client.send("advertise", id="c", topic="/t", type=STRING)
-    client.advance(60)
-    assert not client.session.requests_to_send()
-    client.send("unadvertise", topic="/t")
-    client.advance(limits.UNADVERTISE_DELAY)
-    assert client.session.requests_to_send() == [UnadvertiseTopic(handle)]
+    assert not client.send("unadvertise", id="a", topic="/t")
+    assert client.send("unadvertise", id="b", topic="/t") == [UnadvertiseTopic(handle)]
+    handle = client.one(AdvertiseTopic, client.send("advertise", id="c", topic="/t", type=STRING)).handle
+    client.send("advertise", id="d", topic="/t", type=STRING)
+    assert client.send("unadvertise", topic="/t") == [UnadvertiseTopic(handle)]
 
 
 def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:

@@ -67,7 +67,6 @@ class ClientConnection(ABC):
         rights: What the client may do.
         priority: The priority of a topic's messages: higher ones go first.
         address: The client's, for logs.
-        unadvertise_delay: As ``Hub.connect`` has it.
     """
 
     kind = ""
@@ -83,8 +82,6 @@ class ClientConnection(ABC):
         rights: Rights,
         priority: Callable[[str], int],
         address: str,
-        *,
-        unadvertise_delay: float,
     ) -> None:
         self.hub = hub
         self.rights = rights
@@ -98,7 +95,6 @@ class ClientConnection(ABC):
         self._age: CommandAge | None = None
         self._late_told = -limits.DROPS_SHOWN
         self._priority = priority
-        self._unadvertise_delay = unadvertise_delay
         self._wake = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -231,9 +227,7 @@ class ClientConnection(ABC):
             PeerRefused: There are too many clients.
         """
         self._refused = refused
-        self._client = self.hub.connect(
-            f"{self.kind} {self.address}", self.rights, self.receive, unadvertise_delay=self._unadvertise_delay
-        )
+        self._client = self.hub.connect(f"{self.kind} {self.address}", self.rights, self.receive)
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)

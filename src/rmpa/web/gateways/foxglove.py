@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.web import limits
 from rmpa.web.foxglove.protocol import BinaryFrame, StatusLevel, TextFrame
 from rmpa.web.foxglove.session import FoxgloveClose, FoxgloveSession
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
@@ -40,7 +39,7 @@ class FoxgloveConnection(ClientConnection):
         name: str,
         session_id: str,
     ) -> None:
-        super().__init__(hub, rights, priority, address, unadvertise_delay=limits.UNADVERTISE_DELAY)
+        super().__init__(hub, rights, priority, address)
         self._session = FoxgloveSession(name, session_id, rights, sim_time=hub.time.simulated)
 
     def opened(self) -> None:

@@ -9,7 +9,6 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.web import limits
 from rmpa.web.gateways.connection import ClientConnection
 from rmpa.web.gateways.websocket_frames import Opcode
 from rmpa.web.hub.requests import AdvertiseTopic, Failed, PublishMessage, ReceivedMessage, UnadvertiseTopic
@@ -59,7 +58,7 @@ class MonitorConnection(ClientConnection):
     ) -> None:
         # The joystick publishes by the hub, whatever else the page may publish: nothing.
         own = dataclasses.replace(rights, control=rights.drive)
-        super().__init__(hub, own, priority, address, unadvertise_delay=limits.UNADVERTISE_DELAY)
+        super().__init__(hub, own, priority, address)
         self._monitor = monitor
         self._session = MonitorSession(
             monitor.mesh.details, monitor.values.of, rights, self._loop.time(), lambda: self.unsent

@@ -37,8 +37,7 @@ class RosbridgeConnection(ClientConnection):
         *,
         frames: PublishFrames,
     ) -> None:
-        # The session itself delays the end of a publisher.
-        super().__init__(hub, rights, priority, address, unadvertise_delay=0.0)
+        super().__init__(hub, rights, priority, address)
         graph = HubGraph(hub, rights)
         self._session = RosbridgeSession(hub.types, graph, hub.time.now_ns, frames=frames)
 

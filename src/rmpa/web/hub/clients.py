@@ -27,15 +27,12 @@ class HubClient:
         name: For logs and lists.
         rights: What it may do.
         receive: Takes answers; it must not raise.
-        unadvertise_delay: Seconds until a topic is withdrawn that it no longer advertises; its protocol may have a
-            delay of its own.
     """
 
     number: int
     name: str
     rights: Rights
     receive: Receive
-    unadvertise_delay: float
     subscriptions: dict[int, str] = field(default_factory=dict)
     """The topics by handle."""
     publishers: dict[int, str] = field(default_factory=dict)

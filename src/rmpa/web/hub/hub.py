@@ -167,8 +167,6 @@ class Hub:
         name: str,
         rights: Rights,
         receive: Receive,
-        *,
-        unadvertise_delay: float = limits.UNADVERTISE_DELAY,
     ) -> HubClient:
         """Take a client.
 
@@ -176,7 +174,6 @@ class Hub:
             name: For logs and lists.
             rights: What it may do.
             receive: Takes the answers, also within ``ask``; it must not raise.
-            unadvertise_delay: Seconds until a topic is withdrawn that it no longer advertises.
 
         Raises:
             PeerRefused: There are too many.
@@ -184,7 +181,7 @@ class Hub:
         if len(self._clients) >= limits.CLIENTS_MAX:
             problem = f"{len(self._clients)} clients are connected, which is the limit"
             raise PeerRefused("the web server", problem, "close some pages")
-        client = HubClient(next(self._numbers), name, rights, receive, unadvertise_delay)
+        client = HubClient(next(self._numbers), name, rights, receive)
         self._clients[client.number] = client
         self.start()
         self.graph.active = True
@@ -198,7 +195,7 @@ class Hub:
         for handle, topic in client.subscriptions.items():
             self.topics.unsubscribe((client.number, handle), topic)
         for handle, topic in client.publishers.items():
-            self.publishers.unadvertise((client.number, handle), topic, limits.UNADVERTISE_DELAY)
+            self.publishers.unadvertise((client.number, handle), topic)
         for handle, service in client.services.items():
             self.served.end((client.number, handle), service)
         for key in [key for key in self._tasks if key[0] == client.number]:
@@ -257,7 +254,7 @@ class Hub:
     def _unadvertise(self, client: HubClient, request: requests.UnadvertiseTopic) -> None:
         topic = client.publishers.pop(request.handle, None)
         if topic is not None:
-            self.publishers.unadvertise((client.number, request.handle), topic, client.unadvertise_delay)
+            self.publishers.unadvertise((client.number, request.handle), topic)
 
     def _publish(self, client: HubClient, request: requests.PublishMessage) -> None:
         topic = client.publishers.get(request.handle)

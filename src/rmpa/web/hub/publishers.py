@@ -96,7 +96,7 @@ class Publishers:
         """
         self._link.rules.check(Access.PUBLISH, topic)
         shared = self._shared.get(topic)
-        if shared is not None and shared.type != type_:
+        if shared is not None and (shared.type != type_ or (not shared.users and shared.latch != latch)):
             if shared.users:
                 problem = f"other clients publish {topic} as {shared.type}, not {type_}"
                 raise PeerRefused("the web server", problem, "publish it with that type, or under another name")
@@ -114,15 +114,12 @@ class Publishers:
             shared.linger = None
         shared.users[key] = failed
 
-    def unadvertise(self, key: Key, topic: str, delay: float) -> None:
-        """Leave a topic's publisher; the last one's is withdrawn after ``delay`` seconds."""
+    def unadvertise(self, key: Key, topic: str) -> None:
+        """Leave a topic's publisher; the last one's is withdrawn after ``limits.UNADVERTISE_DELAY``."""
         shared = self._shared.get(topic)
         if shared is None or shared.users.pop(key, None) is None or shared.users:
             return
-        if delay <= 0:
-            self._end(shared)
-        else:
-            shared.linger = asyncio.get_running_loop().call_later(delay, self._end, shared)
+        shared.linger = asyncio.get_running_loop().call_later(limits.UNADVERTISE_DELAY, self._end, shared)
 
     def publish(self, topic: str, payload: Payload) -> None:
         """Publish a message of an advertised topic, numbered. The payload must not change afterwards."""

@@ -16,7 +16,6 @@ import msgspec
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.nodes import NodeEntries, node_detail
 from rmpa.web.monitor.patch import Tree, Value, without_nulls
-from rmpa.web.monitor.places import Places
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
 from rmpa.web.monitor.steady import Steady, steady_figure
 
@@ -127,7 +126,8 @@ class StateBuilder:
     def __init__(self, own: str) -> None:
         self.own = own
         """The name of the agent's module."""
-        self._places = Places(own)
+        self._seen: dict[str, float] = {}
+        """When each module was in the roster last, those included that have left it."""
         self._steady = Steady()
         self._bytes = _ByteRates()
         self._known: dict[str, _KnownTopic] = {}
@@ -154,8 +154,7 @@ class StateBuilder:
         taken = snapshot.taken
         peers = _first_peers(snapshot.peers)
         self._bytes.keep(peer.name for peer in peers)
-        many = len(snapshot.peers) >= limits.RING_MODULES
-        self._places.update((peer.name for peer in peers if not many or peer.state != "parked"), taken)
+        self._remember(peers, taken)
         topics, flows = self._topics_and_flows(snapshot.topics)
         nodes = self._nodes.build(snapshot)
         modules: Tree = dict(self._modules(snapshot, peers))
@@ -163,7 +162,6 @@ class StateBuilder:
         state: Tree = {
             "reach": {"ok": True},
             "agent": self._agent(snapshot),
-            "ring": {"slots": self._places.slots, "places": dict(self._places.places)},
             "modules": modules,
             "flows": {**flows, **resource_flows(resources, self.own, self._steady)},
             "topics": topics,
@@ -241,19 +239,25 @@ class StateBuilder:
         for peer in peers:
             yield peer.name, self._module(peer, snapshot.taken)
         starts = snapshot.agent.uptime < limits.AGENT_SETTLES
-        for name in self._places.absent(peer.name for peer in snapshot.peers):
+        for name in sorted(self._seen.keys() - {peer.name for peer in snapshot.peers}):
             if starts:
                 text = "not found yet: the agent of this module has just started"
                 yield name, {"state": "linking", "since": round(snapshot.agent.started, 1), "error": text}
             else:
                 yield name, {"state": "away", "since": self._lost_since(name), "error": _GONE}
 
+    def _remember(self, peers: Sequence[PeerInfo], taken: float) -> None:
+        """Keep modules that have left the roster for a while, as many as can be shown."""
+        self._seen |= {peer.name: taken for peer in peers}
+        known = sorted(self._seen, key=self._seen.__getitem__, reverse=True)[: limits.MODULES_SHOWN]
+        self._seen = {name: self._seen[name] for name in known if taken - self._seen[name] <= limits.FORGET_AFTER}
+
     def _lost_since(self, name: str) -> float:
         """Since when nothing comes of a module that is in the roster no more."""
         known = self._sections.get("modules")
         before = known.get(name) if isinstance(known, dict) else None
         since = before.get("since") if isinstance(before, dict) and _is_lost(before) else None
-        return since if isinstance(since, float) else round(self._places.seen(name), 1)
+        return since if isinstance(since, float) else round(self._seen[name], 1)
 
     def _module(self, peer: PeerInfo, taken: float) -> Tree:
         link, steady, name = peer.link, self._steady, peer.name

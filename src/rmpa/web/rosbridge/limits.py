@@ -40,8 +40,6 @@ QUEUES_BYTES_MAX: Final = 16 * MIB
 """Bytes queued for all throttled subscriptions of a client; the newest message is dropped."""
 ADVERTISED_MAX: Final = 500
 """Topics that a client advertises."""
-UNADVERTISE_DELAY: Final = 10.0
-"""Time until a topic is withdrawn that a client no longer advertises: many advertise it again at once."""
 CALLS_MAX: Final = 1000
 """Calls of a client without an answer yet, questions of rosapi included."""
 SERVED_MAX: Final = 200

@@ -25,8 +25,6 @@ class _Publisher:
     latch: bool
     codec: MessageCodec
     ids: set[Id] = field(default_factory=set)
-    ends_at: float | None = None
-    """When it is withdrawn, after the client no longer advertises it."""
 
 
 class Publications:
@@ -50,10 +48,7 @@ class Publications:
         name, kind = graph_name(op.topic), type_name(op.type)
         publisher = self._publishers.get(name)
         if publisher is not None and publisher.type != kind:
-            if publisher.ends_at is None:
-                raise OpError(f"{name} is advertised as {publisher.type}, not {kind}", "unadvertise it first")
-            self._end(publisher)
-            publisher = None
+            raise OpError(f"{name} is advertised as {publisher.type}, not {kind}", "unadvertise it first")
         if publisher is not None and publisher.latch != bool(op.latch):
             ids = publisher.ids
             self._end(publisher)
@@ -64,14 +59,13 @@ class Publications:
         if op.id not in publisher.ids:
             check_count(len(publisher.ids), limits.SUBSCRIBERS_MAX, f"advertisements of {name}")
         publisher.ids.add(op.id)
-        publisher.ends_at = None
         self._context.status("info", f"advertised {name}", op.id)
 
-    def unadvertise(self, op: protocol.RosbridgeUnadvertise, now: float) -> None:
-        """Forget the id's advertisement, or all; the publisher ends a while after the last."""
+    def unadvertise(self, op: protocol.RosbridgeUnadvertise) -> None:
+        """Forget the id's advertisement, or all; the publisher ends with the last."""
         name = graph_name(op.topic)
         publisher = self._publishers.get(name)
-        if publisher is None or publisher.ends_at is not None:
+        if publisher is None:
             self._context.status("warning", f"{name} is not advertised", op.id)
             return
         if op.id is None:
@@ -79,7 +73,7 @@ class Publications:
         else:
             publisher.ids.discard(op.id)
         if not publisher.ids:
-            publisher.ends_at = now + limits.UNADVERTISE_DELAY
+            self._end(publisher)
         self._context.status("info", f"unadvertised {name}", op.id)
 
     def publish(self, op: protocol.RosbridgePublish) -> None:
@@ -107,16 +101,6 @@ class Publications:
                     self._context.status("error", problem, mid)
                 return True
         return False
-
-    def next_timer(self) -> float | None:
-        """When `handle_timer` is to be called; None for never."""
-        return min((each.ends_at for each in self._publishers.values() if each.ends_at is not None), default=None)
-
-    def handle_timer(self, now: float) -> None:
-        """Withdraw the publishers whose time has come."""
-        for publisher in list(self._publishers.values()):
-            if publisher.ends_at is not None and publisher.ends_at <= now:
-                self._end(publisher)
 
     def close(self) -> None:
         """End all."""

@@ -64,6 +64,7 @@ class RosbridgeSession:
         self._handlers: Mapping[type[protocol.Op], Callable[[Any], None]] = {
             protocol.RosbridgeUnsubscribe: self._subscriptions.unsubscribe,
             protocol.RosbridgeAdvertise: self._publications.advertise,
+            protocol.RosbridgeUnadvertise: self._publications.unadvertise,
             protocol.RosbridgePublish: self._publications.publish,
             protocol.RosbridgeCallService: self._calls.call,
             protocol.AdvertiseService: self._served.advertise,
@@ -90,8 +91,6 @@ class RosbridgeSession:
         try:
             if isinstance(op, protocol.Fragment | protocol.Png):
                 self._unwrap(op, now, depth)
-            elif isinstance(op, protocol.RosbridgeUnadvertise):
-                self._publications.unadvertise(op, now)
             elif isinstance(op, protocol.RosbridgeSubscribe):
                 self._subscriptions.subscribe(op, now)
             else:
@@ -157,13 +156,12 @@ class RosbridgeSession:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is to be called; None for never."""
-        parts = (self._subscriptions, self._publications, self._fragments)
+        parts = (self._subscriptions, self._fragments)
         return min((at for part in parts if (at := part.next_timer()) is not None), default=None)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
         self._subscriptions.handle_timer(now)
-        self._publications.handle_timer(now)
         for mid in self._fragments.expire(now):
             self._context.status("warning", f"no next fragment came for {limits.FRAGMENT_TIMEOUT:g} s", cast(Id, mid))
 
