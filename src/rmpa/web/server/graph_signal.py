@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
@@ -17,11 +17,13 @@ from rmpa.observe.io.control_client import choose_agent, same_core
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
+    from pathlib import Path
 
     from rmpa.web.hub.graph import GraphWatch
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 
 class GraphSignal:
@@ -66,19 +68,13 @@ class GraphSignal:
         master = await self._graph.master()
         agent = await asyncio.to_thread(choose_agent, self._environ, self._agent())
         # Only the first answer, and one after more changes than the agent keeps, has the whole graph.
-        reader, writer = await asyncio.open_unix_connection(agent.path, limit=observe_limits.CONTROL_REPLY_MAX)
-        try:
+        async with control_stream(agent.path) as (reader, writer):
             known: int | None = None
             while True:
                 args: dict[str, object] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
-                writer.write(ControlRequest("graph", args).serialize())
                 async with asyncio.timeout(limits.GRAPH_WAIT + limits.WEB_AGENT_TIMEOUT):
-                    line = await reader.readuntil(b"\n")
-                known = await self._take(_revision(line), known, master)
-        finally:
-            writer.close()
-            with contextlib.suppress(OSError):
-                await writer.wait_closed()
+                    told = await ask(reader, writer, ControlRequest("graph", args), GraphRevision)
+                known = await self._take(told, known, master)
 
     async def _take(self, told: GraphRevision, known: int | None, master: str) -> int:
         if told.rows is None:
@@ -96,11 +92,31 @@ class GraphSignal:
         return told.revision
 
 
-def _revision(line: bytes) -> GraphRevision:
-    reply = ControlReply.parse(line)
+@contextlib.asynccontextmanager
+async def control_stream(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A connection to an agent's control socket."""
+    reader, writer = await asyncio.open_unix_connection(path, limit=observe_limits.CONTROL_REPLY_MAX)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+async def ask(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: ControlRequest, kind: type[_T]
+) -> _T:
+    """The agent's answer to a request.
+
+    Raises:
+        RemoteProtocolError: It is refused, or of another kind.
+    """
+    writer.write(request.serialize())
+    reply = ControlReply.parse(await reader.readuntil(b"\n"))
     if not reply.ok:
         raise RemoteProtocolError(reply.error)
     try:
-        return msgspec.convert(reply.value, GraphRevision)
+        return msgspec.convert(reply.value, kind)
     except msgspec.ValidationError as error:
-        raise RemoteProtocolError(f"the agent answers graph in another way: {error}") from None
+        raise RemoteProtocolError(f"the agent answers {request.op} in another way: {error}") from None

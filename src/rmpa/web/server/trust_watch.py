@@ -7,14 +7,12 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING
 
-import msgspec
-
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.observe.control import ControlRequest
 from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.trust.status import TrustStatus
 from rmpa.web import limits
+from rmpa.web.server.graph_signal import ask, control_stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -84,20 +82,14 @@ class TrustWatch:
     async def _follow(self) -> None:
         """Ask one run of an agent, and wait for its end."""
         agent = await asyncio.to_thread(self._find)
-        reader, writer = await asyncio.open_unix_connection(agent.path, limit=observe_limits.CONTROL_REPLY_MAX)
-        try:
-            writer.write(ControlRequest("trust", {"what": "status"}).serialize())
+        async with control_stream(agent.path) as (reader, writer):
             async with asyncio.timeout(limits.WEB_AGENT_TIMEOUT):
-                status = _status(await reader.readuntil(b"\n"))
+                status = await ask(reader, writer, ControlRequest("trust", {"what": "status"}), TrustStatus)
             if not self._fits(status if status.on else None):
                 self.misfit.set()
                 return
             self._agent = self._agent or agent.name
             await reader.read()  # idle connections are ended, too: then it is asked again
-        finally:
-            writer.close()
-            with contextlib.suppress(OSError):
-                await writer.wait_closed()
 
     def _find(self) -> FoundAgent:
         """The agent; where it does not run, one that has its core."""
@@ -112,13 +104,3 @@ class TrustWatch:
         with ControlClient(found.path) as client:
             self._core = client.agent().core_uri
         return found
-
-
-def _status(line: bytes) -> TrustStatus:
-    reply = ControlReply.parse(line)
-    if not reply.ok:
-        raise RemoteProtocolError(reply.error)
-    try:
-        return msgspec.convert(reply.value, TrustStatus)
-    except msgspec.ValidationError as error:
-        raise RemoteProtocolError(f"the agent answers trust in another way: {error}") from None
