@@ -185,6 +185,25 @@ async def test_only_what_flows_moves_and_nothing_where_motion_is_to_be_reduced(s
     assert await page.run("window.moved.length") == 0
 
 
+async def test_a_module_keeps_its_place_on_the_ring_when_others_come_and_go(site: Site) -> None:
+    page = await site.open()
+    modules = "[...document.querySelectorAll('[data-module]')]"
+    box = "((at) => `${Math.round(at.x)} ${Math.round(at.y)}`)(each.querySelector('circle').getBoundingClientRect())"
+    where = f"Object.fromEntries({modules}.map((each) => [each.dataset.module, {box}]))"
+    before = await page.run(where)
+    assert len(before) == len(set(before.values())) == 4
+    await receive(page, {"modules": {"arm": {"state": "up"}, "base": None}})
+    await page.wait("document.querySelector('[data-module=arm]') && !document.querySelector('[data-module=base]')")
+    now = await page.run(where)
+    assert {name: now[name] for name in ("pc", "joystick", "velocity")} == {
+        name: before[name] for name in ("pc", "joystick", "velocity")
+    }
+    more = {f"m{number}": {"state": "up"} for number in range(7)}
+    await receive(page, {"modules": more})
+    await page.wait("document.querySelectorAll('[data-module]').length === 11")
+    assert len(set((await page.run(where)).values())) == 11
+
+
 async def test_only_what_changed_is_drawn_again(site: Site) -> None:
     page = await site.open()
     await page.run(
@@ -218,7 +237,7 @@ async def test_names_and_values_of_others_are_text(site: Site) -> None:
     await click(page, "On")
     await page.wait_text("<script>alert(1)</script>")
     evil = "<img src=x onerror='window.owned=1'>"
-    patch = {"modules": {evil: {"state": "up"}}, "ring": {"places": {evil: 1}}, "notes": ["<b id=owned>note</b>"]}
+    patch = {"modules": {evil: {"state": "up"}}, "notes": ["<b id=owned>note</b>"]}
     await receive(page, patch)
     await page.run("location.hash = '#/'")
     await page.wait_text("<b id=owned>note</b>")

@@ -61,14 +61,13 @@ def test_flows_between_other_modules_are_known_from_their_resources() -> None:
     assert flows["velocity>base"]["by"] == "resource"
 
 
-def test_a_killed_module_shows_in_the_next_state_and_comes_back_to_its_place() -> None:
+def test_a_killed_module_shows_in_the_next_state_and_comes_back() -> None:
     builder = StateBuilder("pc")
     states: list[Any] = [builder.build(snapshot) for snapshot in RECORDED]
     assert [state["modules"]["base"]["state"] for state in states] == ["up", "up", "linking", "away", "up", "up"]
     assert "refused" in states[2]["modules"]["base"]["error"]
     assert "base>pc" not in states[2]["flows"]
     assert states[2]["modules"]["base"]["since"] == states[3]["modules"]["base"]["since"]
-    assert len({json.dumps(state["ring"]) for state in states}) == 1
 
 
 def test_what_a_lost_module_said_last_is_no_news() -> None:
@@ -91,6 +90,19 @@ def test_a_module_that_left_the_roster_is_away_since_nothing_came_of_it() -> Non
         "state": "away", "since": FULL.taken, "error": "has left the roster: no beacon and no link"
     }  # fmt: skip
     assert left["modules"]["hand"]["since"] == FULL.taken - 1  # it had no link before
+
+
+def test_a_module_that_left_long_ago_is_forgotten_and_so_are_the_oldest_of_too_many() -> None:
+    builder = StateBuilder(FULL.agent.name)
+    builder.build(FULL)
+    later = msgspec.structs.replace(FULL, taken=FULL.taken + limits.FORGET_AFTER + 1, peers=())
+    assert list(builder.build(later)["modules"]) == [FULL.agent.name]  # type: ignore[arg-type]
+    last: Any = None
+    for start in range(2):
+        peers = tuple(peer(f"m{start}{number:03}") for number in range(limits.MODULES_SHOWN))
+        last = builder.build(msgspec.structs.replace(later, taken=later.taken + start, peers=peers))
+    assert len(last["modules"]) == limits.MODULES_SHOWN + 1
+    assert not [name for name in last["modules"] if name.startswith("m0")]
 
 
 def test_a_module_is_silent_since_it_was_heard_last() -> None:
@@ -202,16 +214,13 @@ def test_a_state_of_a_huge_mesh_is_bounded_and_says_what_is_left_out() -> None:
     assert state["hidden"] == {"topics": 5, "modules": 3}
 
 
-def test_parked_modules_of_a_large_mesh_are_counted_and_leave_the_ring_to_the_others() -> None:
+def test_parked_modules_of_a_large_mesh_are_counted_and_leave_room_to_the_others() -> None:
     parked = tuple(peer(f"a{number:04d}", state="parked", link=None) for number in range(limits.MODULES_SHOWN))
     linked = tuple(peer(f"z{number}") for number in range(3))
     state = build(msgspec.structs.replace(RECORDED[0], peers=(*parked, *linked), topics_left=7, services_left=2))
     assert state["parked"] == limits.MODULES_SHOWN
     assert {"z0", "z1", "z2"} <= state["modules"].keys(), "no place is kept from them by parked ones"
-    assert set(state["ring"]["places"]) == {state["agent"]["name"], "z0", "z1", "z2"}
     assert state["hidden"] == {"topics": 7, "services": 2, "modules": 3}
-    few = build(msgspec.structs.replace(RECORDED[0], peers=(*parked[:2], *linked)))
-    assert {"a0000", "a0001"} <= few["ring"]["places"].keys(), "in a small mesh all have a place"
 
 
 def test_without_an_agent_the_last_state_stays_and_says_so() -> None:

@@ -57,8 +57,6 @@ PARAMETER_NAMES_SHOWN: Final = 5000
 """Names of parameters that a search is given."""
 MODULES_SHOWN: Final = 256
 """Modules in a state; further ones are counted. A ring of more could not be read."""
-RING_MODULES: Final = 64
-"""From so many modules on, the ring shows those that are not parked: the names of more overlap."""
 FLOW_TOPICS: Final = 8
 """Topics that a flow names; the busiest first."""
 LOG_LINES: Final = 500
@@ -76,7 +74,7 @@ AGENT_SETTLES: Final = 10.0
 """Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
 FORGET_AFTER: Final = 600.0
-"""Time for which a module that has left the roster keeps its place in the ring."""
+"""Time for which a module that has left the roster is still shown."""
 STEADY: Final = 0.03
 """Share by which a figure must change before it is shown anew, so that noise moves nothing."""
 RATE_SMOOTHING: Final = 1.0

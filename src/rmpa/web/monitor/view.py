@@ -248,7 +248,7 @@ class StateBuilder:
 
     def _remember(self, peers: Sequence[PeerInfo], taken: float) -> None:
         """Keep modules that have left the roster for a while, as many as can be shown."""
-        self._seen |= {peer.name: taken for peer in peers}
+        self._seen |= {peer.name: taken for peer in peers if peer.state != "parked"}
         known = sorted(self._seen, key=self._seen.__getitem__, reverse=True)[: limits.MODULES_SHOWN]
         self._seen = {name: self._seen[name] for name in known if taken - self._seen[name] <= limits.FORGET_AFTER}
 

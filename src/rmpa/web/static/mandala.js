@@ -181,11 +181,35 @@ function same(key, list) {
   return list;
 }
 
+// The slot of each module: who has one keeps it, and a new one takes the free slot that is farthest from all others.
+// When all are taken the ring gets more; the order around it stays. Slot 0, at the top, is this module's.
+const SLOTS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
+const FULL = 64; // from so many modules on parked ones have no place: the names of more overlap
+const around = { slots: SLOTS[0], places: new Map() };
+function arrange(state) {
+  const modules = entries(state, "modules"), own = section(state, "agent").name;
+  const names = modules.filter(([, one]) => modules.length < FULL || one.state !== "parked").map(([name]) => name).sort();
+  if (!around.places.has(own)) around.places = new Map([[own, 0]]);
+  for (const name of [...around.places.keys()]) if (name !== own && !names.includes(name)) around.places.delete(name);
+  for (const name of names.filter((each) => !around.places.has(each))) {
+    if (around.places.size === around.slots) {
+      const order = [...around.places].sort(([, a], [, b]) => a - b);
+      around.slots = SLOTS.find((size) => size > order.length) ?? order.length + 1;
+      around.places = new Map(order.map(([each], at) => [each, Math.floor((at * around.slots) / order.length)]));
+    }
+    const taken = [...around.places.values()];
+    const room = (slot) => Math.min(...taken.map((each) => Math.min((slot - each + around.slots) % around.slots, (each - slot + around.slots) % around.slots)));
+    const best = Array.from({ length: around.slots }, (_, slot) => slot).reduce((found, slot) => (room(slot) > room(found) ? slot : found));
+    around.places.set(name, best);
+  }
+  return { slots: around.slots, places: Object.fromEntries(around.places) };
+}
+
 export function Ring({ state, current }) {
   const compact = useQuery("(max-width: 640px)");
   const still = useQuery("(prefers-reduced-motion: reduce)");
-  const ring = section(state, "ring"), places = section(ring, "places");
-  const geo = sizes(ring.slots || 4, compact);
+  const { slots, places } = arrange(state);
+  const geo = sizes(slots, compact);
   const modules = section(state, "modules");
   const names = Object.keys(modules).filter((name) => name in places).sort((a, b) => places[a] - places[b]);
   const at = (name) => point(places[name], geo);
@@ -252,7 +276,7 @@ export function Mandala({ state, connection }) {
   const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length + (state.parked || 0);
   const total = modules.length + (section(state, "hidden").modules || 0);
   const marks = ["up", "parked", "relayed", "silent", "linking", "refused", "away"].filter((each) => (each !== "parked" && each !== "relayed") || modules.some(([, one]) => one.state === each));
-  const places = section(section(state, "ring"), "places");
+  const { places } = arrange(state);
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
   return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${state.parked ? `, ${state.parked} of them parked` : ""}${current ? "" : " when last heard of"}`}>
     <div class="overview"><div class="stage-area"><${Ring} state=${state} current=${current} />
