@@ -20,7 +20,7 @@ BEGIN: Final = "<!-- The table is compared with the code by tests/bridge/test_pe
 KINDS: Final = {"on_request": "request", "on_notification": "notification", "queryable": "query"}
 """The methods at which handlers are registered: of ``PeerRpc``, and of Zenoh's session."""
 REGISTRARS: Final = frozenset({"rpc", "_rpc", "asks", "session", "_session"})
-"""The names under which both are called in ``src``; another ``on_request`` is a publisher's."""
+"""The names under which both are called in ``src``."""
 
 
 class Registrations(ast.NodeVisitor):

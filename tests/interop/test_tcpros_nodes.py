@@ -17,7 +17,7 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.node import Node
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType
@@ -224,7 +224,12 @@ async def test_a_real_listener_waits_while_the_type_is_not_known(core: RosCore, 
     proxy = SlaveNode("/proxy", "127.0.0.1", core.uri)
     await proxy.start()
     demand = asyncio.Event()
-    publication = Publication("/chatter", "/proxy", on_first_subscriber=demand.set)
+
+    class Events(PublicationEvents):
+        def first_subscriber(self) -> None:
+            demand.set()
+
+    publication = Publication("/chatter", "/proxy", events=Events())
     proxy.add_publication(publication)
     core.call("registerPublisher", "/proxy", "/chatter", BYTES, proxy.uri)
     listener = ros.node(library, "listener", count=3)

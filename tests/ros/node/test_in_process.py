@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
 from rmpa.ros.node.in_process import InProcessConnection
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Parts:
         self.aborted += 1
 
 
-class Bed:
+class Bed(PublicationEvents):
     """A publication, and a subscription to it."""
 
     def __init__(self, description: TopicDescription | None = STRING, *, parts: bool = False) -> None:
@@ -72,14 +72,14 @@ class Bed:
         )
 
     def publish(self, description: TopicDescription | None) -> Publication:
-        self.publication = self.there = Publication(
-            "/chatter",
-            "/talker",
-            description,
-            on_first_subscriber=lambda: self.demand.append(True),
-            on_last_subscriber=lambda: self.demand.append(False),
-        )
+        self.publication = self.there = Publication("/chatter", "/talker", description, events=self)
         return self.publication
+
+    def first_subscriber(self) -> None:
+        self.demand.append(True)
+
+    def last_subscriber(self) -> None:
+        self.demand.append(False)
 
     async def connect(self) -> None:
         self.connection.start()

@@ -3,14 +3,13 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.ros import limits
 from rmpa.ros.node.accepted_connection import AcceptedConnection
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber, until
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "int32 data\n")
 
 
-class Owner:
+class Owner(PublicationEvents):
     """A server with one publication of /t, and what it said."""
 
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
@@ -30,13 +29,17 @@ class Owner:
             "/t",
             "/p",
             description,
-            on_first_subscriber=lambda: self.said.append("first"),
-            on_last_subscriber=lambda: self.said.append("last"),
-            on_mismatch=self.mismatch,
-            **options,  # type: ignore[arg-type] # all of them are numbers
+            events=self,
+            **options,
         )
         self.server = TcprosServer("/p", {"/t": self.publication})
         self.server.start()
+
+    def first_subscriber(self) -> None:
+        self.said.append("first")
+
+    def last_subscriber(self) -> None:
+        self.said.append("last")
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
         self.said.append(f"refused {fields['callerid']}: {text}")
@@ -584,13 +587,13 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     owner.close()
 
 
-async def test_a_held_subscriber_counts_as_connected_while_others_are_served(held: Owner) -> None:
+async def test_a_held_subscriber_counts_as_connected_while_others_are_served(
+    held: Owner, monkeypatch: pytest.MonkeyPatch
+) -> None:
     links = [await held.subscriber(callerid=name) for name in ("/one", "/two")]
     assert held.publication.callers == {"/one", "/two"}
     seen: list[frozenset[str]] = []
-    held.publication.events = replace(
-        cast("Any", held.publication.events), listeners_changed=lambda: seen.append(held.publication.callers)
-    )
+    monkeypatch.setattr(held, "listeners_changed", lambda: seen.append(held.publication.callers))
     held.publication.describe(STRING)
     assert set(seen) == {frozenset({"/one", "/two"})}, "not one of them seems to have left meanwhile"
     assert held.publication.listeners == ("/one", "/two")

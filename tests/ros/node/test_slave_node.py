@@ -7,7 +7,7 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.ros.http.client import call, call_api
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import frame_message
@@ -15,7 +15,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from tests.ros.node.peers import STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
 
 @pytest.fixture
@@ -130,6 +130,16 @@ async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: Slav
         await SlaveNode("/q", "127.0.0.1", "", port=port).start()
 
 
+class Asked(PublicationEvents):
+    """Lets a function answer ``requestTopic``."""
+
+    def __init__(self, answer: Callable[[str], Awaitable[RosReply | None] | None]) -> None:
+        self.answer = answer
+
+    def request(self, caller: str) -> Awaitable[RosReply | None] | None:
+        return self.answer(caller)
+
+
 @pytest.mark.parametrize("other", [RosReply(1, "there", ["TCPROS", "10.0.0.1", 45225]), RosReply(0, "no", []), None])
 @pytest.mark.trap(42)
 async def test_the_answer_to_request_topic_may_take_its_time(node: SlaveNode, other: RosReply | None) -> None:
@@ -144,7 +154,7 @@ async def test_the_answer_to_request_topic_may_take_its_time(node: SlaveNode, ot
         asked.append(caller)
         return None if caller == "/plain" else decide()
 
-    node.add_publication(Publication("/t", "/p", STRING, on_request=request))
+    node.add_publication(Publication("/t", "/p", STRING, events=Asked(request)))
     own = await call_api(node.uri, "requestTopic", "/plain", "/t", [["TCPROS"]])
     waiting = asyncio.create_task(call_api(node.uri, "requestTopic", "/viewer", "/t", [["TCPROS"]]))
     await until(lambda: "/viewer" in asked)
@@ -169,7 +179,7 @@ async def test_a_caller_that_leaves_while_it_waits_ends_the_wait(node: SlaveNode
             ended.set()
         return None
 
-    node.add_publication(Publication("/t", "/p", STRING, on_request=lambda _: decide()))
+    node.add_publication(Publication("/t", "/p", STRING, events=Asked(lambda _: decide())))
     waiting = asyncio.create_task(call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]]))
     async with asyncio.timeout(20.0):
         await begun.wait()

@@ -9,7 +9,7 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.core import limits as core_limits
 from rmpa.gateway.graph.foreign_source import ProxiedSource
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import LENGTH, printable
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 
 
-class ProxiedTopic(ProxiedSource):
+class ProxiedTopic(ProxiedSource, PublicationEvents):
     """A foreign topic in the gateway's graph; until ``describe`` its subscribers wait.
 
     Args:
@@ -54,13 +54,7 @@ class ProxiedTopic(ProxiedSource):
         self._on_demand = on_demand
         self._offered = Source(source.name, proxies.name(origin.node))
         self._wanted = False
-        self.publication = Publication(
-            source.name,
-            self._offered.node,
-            on_first_subscriber=lambda: self._demand(wanted=True),
-            on_last_subscriber=lambda: self._demand(wanted=False),
-            on_mismatch=self._mismatched,
-        )
+        self.publication = Publication(source.name, self._offered.node, events=self)
         """Its messages for subscribers, here and of the mesh."""
 
     def describe(self, description: TopicDescription) -> None:
@@ -98,7 +92,16 @@ class ProxiedTopic(ProxiedSource):
             self._wanted = wanted
             self._on_demand(wanted)
 
-    def _mismatched(self, fields: Mapping[str, str], text: str) -> None:
+    def first_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._demand(wanted=True)
+
+    def last_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._demand(wanted=False)
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        """Of ``PublicationEvents``."""
         self._mismatch = f"{printable(fields.get('callerid', ''))}: {text}"
 
     def _ready(self, node: SlaveNode) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
 from rmpa.observe.health import Health, diagnostic_status
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.coarse_timer import call_at_tick
@@ -31,7 +31,7 @@ TOPIC: Final = "/diagnostics"
 """The topic of REP 107."""
 
 
-class Diagnostics:
+class Diagnostics(PublicationEvents):
     """Publishes judged snapshots; follows the peers' clocks as often, and seldom while no link is in use.
 
     Args:
@@ -54,7 +54,7 @@ class Diagnostics:
             bridge.node.name,
             TopicDescription(ARRAY_TYPE, ARRAY_MD5, ARRAY_DEFINITION),
             queue_messages=limits.DIAGNOSTICS_QUEUE,
-            on_first_subscriber=self._subscribed,
+            events=self,
         )
         self._timer: asyncio.TimerHandle | None = None
 
@@ -79,7 +79,8 @@ class Diagnostics:
         used = self._publication.subscribers or any(not s.link.rests for s in self._bridge.sessions.linked())
         self._timer = call_at_tick(limits.DIAGNOSTICS_INTERVAL if used else limits.CLOCKS_IDLE_INTERVAL, self._look)
 
-    def _subscribed(self) -> None:
+    def first_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
         if self._timer is not None:
             self._timer.cancel()
             self._again()

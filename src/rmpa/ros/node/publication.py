@@ -9,9 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rmpa.core.log import logged_failure
 from rmpa.ros import limits
@@ -20,7 +19,7 @@ from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, 
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Mapping, Sequence
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.accepted_connection import AcceptedConnection
@@ -36,12 +35,8 @@ _log = logging.getLogger(__name__)
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def _ignore(*_: object) -> None:
-    pass
-
-
-class PublicationEvents(Protocol):
-    """What a publication tells its owner.
+class PublicationEvents:
+    """What a publication tells its owner, which overrides what it needs.
 
     All are called in the event loop, and may call methods of the publication.
     """
@@ -60,40 +55,27 @@ class PublicationEvents(Protocol):
     def listeners_changed(self) -> None:
         """``Publication.listeners`` has changed."""
 
-    def request(self, caller: str) -> Awaitable[RosReply | None] | None:
+    def request(self, caller: str) -> Awaitable[RosReply | None] | None:  # noqa: ARG002 - of those who override it
         """Answer the ``requestTopic`` of a subscriber with this caller id.
 
         Its reply of ``None`` is the publication's own address. ``None`` instead of an awaitable: no need to wait.
         """
+        return None
 
 
-@dataclass(frozen=True, slots=True)
-class _Callbacks:
-    """Events as functions; see ``Publication``."""
-
-    first_subscriber: Callable[[], None]
-    last_subscriber: Callable[[], None]
-    mismatch: Callable[[Mapping[str, str], str], None]
-    listeners_changed: Callable[[], None]
-    request: Callable[[str], Awaitable[RosReply | None] | None]
+_NO_EVENTS: Final = PublicationEvents()
 
 
 class Publication:
     """One topic of one (real or proxy) node, with its subscribers.
 
-    Demand is the number of connections, held ones included. All callbacks are called in the event loop; they may
-    call methods of the publication.
+    Demand is the number of connections, held ones included.
 
     Args:
         topic: Its global name; compared literally with what subscribers ask for.
         caller_id: The publishing node's name.
         description: Type, md5 sum, definition and latching, or ``None`` until ``describe()``.
-        on_first_subscriber: Called when demand rises from 0.
-        on_last_subscriber: Called when demand returns to 0.
-        on_mismatch: ``(fields, text)``: a subscriber was refused; its header and the text of the error header.
-        on_listeners: ``listeners`` has changed.
-        on_request: ``(caller id) -> reply``: see ``PublicationEvents.request``.
-        events: Instead of the callbacks: an agent with thousands of topics has one small object for each.
+        events: What is called at changes.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         queue_bytes: Bytes queued for one slow subscriber; one message always fits.
     """
@@ -126,12 +108,7 @@ class Publication:
         caller_id: str,
         description: TopicDescription | None = None,
         *,
-        on_first_subscriber: Callable[[], None] = _ignore,
-        on_last_subscriber: Callable[[], None] = _ignore,
-        on_mismatch: Callable[[Mapping[str, str], str], None] = _ignore,
-        on_listeners: Callable[[], None] = _ignore,
-        on_request: Callable[[str], Awaitable[RosReply | None] | None] = _ignore,
-        events: PublicationEvents | None = None,
+        events: PublicationEvents = _NO_EVENTS,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
         queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
@@ -143,12 +120,7 @@ class Publication:
         """Bytes published, lengths included; each message counts once, whatever the number of subscribers."""
         self._description: TopicDescription | None = None
         self._reply: Mapping[str, str] = _NOTHING
-        self.events: PublicationEvents = (
-            events
-            if events is not None
-            else _Callbacks(on_first_subscriber, on_last_subscriber, on_mismatch, on_listeners, on_request)
-        )
-        """See above."""
+        self.events = events
         self._had: dict[str, tuple[bytes, ...]] | None = None
         """Latched messages that a subscriber has had by another path, by its caller id."""
         self._queue_messages = queue_messages
@@ -378,7 +350,7 @@ class Publication:
             await asyncio.gather(*(connection.stream.drained(timeout) for connection in self._open))
 
     def withdraw(self) -> None:
-        """Close all connections without calling ``on_last_subscriber``."""
+        """Close all connections without calling ``last_subscriber``."""
         self._withdrawn = True
         connections, self._held, self._open = (*self._held, *self._open), (), ()
         for connection in connections:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.header_types import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers
@@ -74,7 +74,7 @@ class Received:
         return self.header.get("callerid", "")
 
 
-class Publisher:
+class Publisher(PublicationEvents):
     """Publishes one topic of a ``Node``; made by ``Node.advertise``."""
 
     def __init__(
@@ -96,15 +96,7 @@ class Publisher:
         self._log = RefusalLog(_log, Counters())
         self.refusals: dict[str, str] = {}
         """Why subscribers (by caller id) were refused."""
-        self.publication = Publication(
-            topic,
-            caller_id,
-            description,
-            on_first_subscriber=self._change.set,
-            on_last_subscriber=self._change.clear,
-            on_mismatch=self._refused,
-            queue_messages=queue_messages,
-        )
+        self.publication = Publication(topic, caller_id, description, events=self, queue_messages=queue_messages)
 
     @property
     def subscribers(self) -> int:
@@ -153,7 +145,16 @@ class Publisher:
         await self.drained()
         await self._on_close(self.topic)
 
-    def _refused(self, fields: Mapping[str, str], text: str) -> None:
+    def first_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._change.set()
+
+    def last_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._change.clear()
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        """Of ``PublicationEvents``."""
         who = printable(fields.get("callerid", ""))
         _remember(self.refusals, who, text)
         self._log.refuse(asyncio.get_running_loop().time(), "publication.refused", who, f"{self.topic}: {text}")

@@ -11,7 +11,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.io.endpoints import LocalEndpoints
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply
 from tests.ros.node.peers import STRING
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
 
 
-class Talker:
+class Talker(PublicationEvents):
     """A node that publishes /t, and the endpoints of its module."""
 
     def __init__(self, host: str = "127.0.0.1") -> None:
         self.node = SlaveNode("/talker", host, "")
         self.asked: list[str] = []
         self.answer: RosReply | None = None
-        self.node.add_publication(Publication("/t", "/talker", STRING, on_request=self.request))
+        self.node.add_publication(Publication("/t", "/talker", STRING, events=self))
         self.services: dict[str, dict[str, str]] = {}
         core = SimpleNamespace(state=lambda: SimpleNamespace(services=self.services))
         self.endpoints = LocalEndpoints(cast("Any", core))

@@ -237,7 +237,7 @@ class DirectImporter:
     # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
-        """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``Publication.on_request``."""
+        """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         key = DirectKey(peer, source, subscriber)
         if self.routes.get(key) is None and not self._is_new and not self._moves.is_stuck(key):
             return None

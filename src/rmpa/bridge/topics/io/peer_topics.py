@@ -12,7 +12,7 @@ from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.serial_number import serial_add
 from rmpa.mesh import limits as mesh_limits
-from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import TopicDescription, printable
 from rmpa.runtime.event_loop import yielding_to_data
 from rmpa.runtime.machine_timer import MachineTimer
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class _Published:
+class _Published(PublicationEvents):
     """A topic of the peer at its proxy: what its publication tells, and what is registered.
 
     Args:
