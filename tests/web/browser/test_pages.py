@@ -190,18 +190,18 @@ async def test_a_module_keeps_its_place_on_the_ring_when_others_come_and_go(site
     modules = "[...document.querySelectorAll('[data-module]')]"
     box = "((at) => `${Math.round(at.x)} ${Math.round(at.y)}`)(each.querySelector('circle').getBoundingClientRect())"
     where = f"Object.fromEntries({modules}.map((each) => [each.dataset.module, {box}]))"
+    await receive(page, {"modules": {"arm": {"state": "up"}}})
+    await page.wait("document.querySelector('[data-module=arm]')")
     before = await page.run(where)
-    assert len(before) == len(set(before.values())) == 4
-    await receive(page, {"modules": {"arm": {"state": "up"}, "base": None}})
-    await page.wait("document.querySelector('[data-module=arm]') && !document.querySelector('[data-module=base]')")
+    assert len(before) == len(set(before.values())) == 5
+    await receive(page, {"modules": {"arm": None, "leg": {"state": "up"}}})
+    await page.wait("document.querySelector('[data-module=leg]')")
     now = await page.run(where)
-    assert {name: now[name] for name in ("pc", "joystick", "velocity")} == {
-        name: before[name] for name in ("pc", "joystick", "velocity")
-    }
+    assert {**now, "arm": ""} == {**before, "leg": now["leg"], "arm": ""}
     more = {f"m{number}": {"state": "up"} for number in range(7)}
     await receive(page, {"modules": more})
-    await page.wait("document.querySelectorAll('[data-module]').length === 11")
-    assert len(set((await page.run(where)).values())) == 11
+    await page.wait("document.querySelectorAll('[data-module]').length === 12")
+    assert len(set((await page.run(where)).values())) == 12
 
 
 async def test_only_what_changed_is_drawn_again(site: Site) -> None:
