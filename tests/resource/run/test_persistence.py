@@ -113,7 +113,7 @@ async def test_expired_latched_request_stays_expired(core: RosCore, tmp_path: Pa
         await until(lambda: not member.adapter.loop.requirements)
         seen: list[object] = []
         watcher = RuntimePart()
-        watcher.requirements_changed = lambda: seen.append(dict(member.adapter.loop.requirements))  # type: ignore[method-assign]
+        watcher.changed = lambda: seen.append(dict(member.adapter.loop.requirements))  # type: ignore[method-assign]
         member.runtime.parts.append(watcher)
         assert client._requirements is not None
         again: Any = {"header": {"stamp": float(next(iter(member.adapter.clients.expiries))[1])}}

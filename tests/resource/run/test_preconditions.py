@@ -74,7 +74,7 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
 async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     applied: list[str] = []
     watcher = RuntimePart()
-    watcher.acted = lambda action: applied.append(getattr(action, "profile", ""))  # type: ignore[method-assign]
+    watcher.changed = lambda: applied.extend(filter(None, [member.adapter.loop.applying]))  # type: ignore[method-assign]
     member = ResourceNode(declared(lambda: "the lid is shut"), core.uri, observers=[watcher])
     await member.start()
     await until(lambda: applied)

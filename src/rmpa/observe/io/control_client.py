@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import socket
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Self, TypeVar
 from urllib.parse import urlsplit
 
 import msgspec
@@ -29,19 +28,6 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _START_ONE = "start one with `rmpa up`"
-
-
-class _TypedReply(msgspec.Struct, Generic[_T], frozen=True):
-    """A ``ControlReply`` whose value has a known type."""
-
-    ok: bool
-    value: _T | msgspec.UnsetType = msgspec.UNSET
-
-
-@functools.cache
-def _decoder(value: object) -> msgspec.json.Decoder[_TypedReply[object]]:
-    """The decoder of replies whose value has this type."""
-    return msgspec.json.Decoder(_TypedReply[value])  # type: ignore[valid-type]
 
 
 class ControlClient:
@@ -100,13 +86,7 @@ class ControlClient:
             UnreachableError: It closed the connection, or did not reply in time.
             RemoteProtocolError: Its value has another type.
         """
-        line = self._exchange(op, args)
-        with contextlib.suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-            # Straight to its type takes half the time.
-            typed = _decoder(type).decode(line)  # type: ignore[arg-type]  # types are hashable
-            if typed.ok and typed.value is not msgspec.UNSET:
-                return cast("_T", typed.value)
-        return self._parse(op, line, type)
+        return self._parse(op, self._exchange(op, args), type)
 
     def snapshot(self, decoder: SnapshotDecoder | None = None, **args: object) -> Snapshot:
         """Everything that the agent shows; raises as ``call``.

@@ -350,10 +350,10 @@ class Adapter(RuntimePart):
                     self.reaction = action.reaction
                     self._restart_window()
                     _log.info("= %s: %s runs, after %.3g s", self._name, action.profile, action.reaction)
-            for part in self._runtime.parts:
-                part.acted(action)
         if actions:
             self._publish_decision()
+            for part in self._runtime.parts:
+                part.changed()
         self._arm_timers()
 
     def _applied(self, profile: str, why: str) -> None:
@@ -404,7 +404,7 @@ class Adapter(RuntimePart):
         """Publish the response to each client, and the decision."""
         self._publish_decision()
         for part in self._runtime.parts:
-            part.requirements_changed()
+            part.changed()
         statuses = []
         for client, requirement in self.loop.requirements.items():
             level, message, values = answer_to(requirement, self.loop, self._attributes, self._offered(requirement))

@@ -318,7 +318,7 @@ class Contexts(RuntimePart):
         if not self._closed:
             self._runtime.publish_text(TOPIC, self._current)
             for part in self._runtime.parts:
-                part.context_changed()
+                part.changed()
 
     def _spawn(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
         task = self._loop.create_task(work, name=name)

@@ -79,7 +79,7 @@ class Persistence(RuntimePart):
     async def start(self) -> None:
         """Write the present state, and each change from now on."""
         self._started = True
-        self.requirements_changed()
+        self.changed()
 
     async def close(self) -> None:
         """Write the last state; a disk that hangs is waited for 5 s at most."""
@@ -94,13 +94,9 @@ class Persistence(RuntimePart):
 
     def parameter_changed(self, parameter: Parameter) -> None:  # noqa: ARG002
         """Write the parameter's value."""
-        self.requirements_changed()
+        self.changed()
 
-    def context_changed(self) -> None:
-        """Write the context that was chosen by hand."""
-        self.requirements_changed()
-
-    def requirements_changed(self) -> None:
+    def changed(self) -> None:
         """Write the state if it has changed; called with each window too, so a write that failed is tried again."""
         idle = self._writing is None or self._writing.done()
         if self._started and idle and self._state(0.0, 0) != self._written:

@@ -31,7 +31,6 @@ from rmpa.ros.types.service_types import ServiceType
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.resource.decide.actions import Action
     from rmpa.resource.declare.parameters import Parameter, ParameterValue
     from rmpa.resource.run.adapter import Adapter
     from rmpa.resource.run.contexts import Contexts
@@ -131,12 +130,8 @@ class Reconfigure(RuntimePart):
         """Publish the configuration."""
         self.publish()
 
-    def acted(self, action: Action) -> None:  # noqa: ARG002
-        """Publish the configuration, because the profile chosen by hand may have changed."""
-        self.publish()
-
-    def context_changed(self) -> None:
-        """Publish the configuration, because the context chosen by hand may have changed."""
+    def changed(self) -> None:
+        """Publish the configuration, because the profile or context chosen by hand may have changed."""
         self.publish()
 
     def publish(self) -> None:

@@ -21,7 +21,6 @@ from rmpa.ros.wire.tcpros import printable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.resource.decide.actions import Action
     from rmpa.resource.declare.attributes import Value
     from rmpa.resource.declare.connections import Input, Output
     from rmpa.resource.declare.parameters import Parameter
@@ -58,9 +57,6 @@ class RuntimePart:
     def parameter_changed(self, parameter: Parameter) -> None:
         """A parameter's value has changed."""
 
-    def acted(self, action: Action) -> None:
-        """The control loop has acted: begun or completed a profile, raised or cleared an alarm."""
-
     def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:
         """A quality window has ended.
 
@@ -70,11 +66,8 @@ class RuntimePart:
             measured: Measured values by attribute.
         """
 
-    def requirements_changed(self) -> None:
-        """The requirements, the profile or its cool-downs may have changed."""
-
-    def context_changed(self) -> None:
-        """The present context, or the choice of a context by hand, may have changed."""
+    def changed(self) -> None:
+        """The requirements, the profile, its cool-downs, the context or a choice by hand may have changed."""
 
 
 class Runtime:

@@ -71,19 +71,6 @@ class DoctorInput:
         return {name: shown for name, shown in self.agents.items() if isinstance(shown, Snapshot)}
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorCheck:
-    """One row of ``CHECKS``.
-
-    Args:
-        name: What it looks at; at least one of its results has this name.
-        run: Looks, and says what was found; takes two seconds at the most where nothing hangs.
-    """
-
-    name: str
-    run: Callable[[DoctorInput], Iterable[Check]]
-
-
 def look_at(environ: Mapping[str, str], config: str | None = None, listen: float = 0.0) -> DoctorInput:
     """Read the settings and the interfaces, and ask the agents.
 
@@ -116,8 +103,8 @@ def _settings(environ: Mapping[str, str], config: str | None) -> tuple[Settings,
 
 def examine(given: DoctorInput) -> Iterator[Check]:
     """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
-    for check in CHECKS:
-        yield from check.run(given)
+    for check in CHECKS.values():
+        yield from check(given)
 
 
 def _interfaces(given: DoctorInput) -> Iterable[Check]:
@@ -214,19 +201,19 @@ def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
         yield Check("exposed nodes", SKIPPED, "no agent runs")
 
 
-CHECKS: Final = (
-    DoctorCheck("settings", lambda given: given.settings_checks),
-    DoctorCheck("agent", lambda given: judge_agents(given.agents, rmpa.__version__)),
-    DoctorCheck("interface", _interfaces),
-    DoctorCheck("multicast", _multicast),
-    DoctorCheck("firewall", lambda given: check_firewall(given.settings)),
-    DoctorCheck("rp_filter", lambda given: judge_rp_filter(network.read_rp_filter(), given.interfaces)),
-    DoctorCheck("radio", _radio),
-    DoctorCheck("route", _routes),
-    DoctorCheck("port", _ports),
-    DoctorCheck("ROS", _shell),
-    DoctorCheck("clock", _clock),
-    DoctorCheck("realtime", _rights),
-    DoctorCheck("exposed nodes", _exposed_nodes),
-)
-"""All checks, in the order of the output."""
+CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
+    "settings": lambda given: given.settings_checks,
+    "agent": lambda given: judge_agents(given.agents, rmpa.__version__),
+    "interface": _interfaces,
+    "multicast": _multicast,
+    "firewall": lambda given: check_firewall(given.settings),
+    "rp_filter": lambda given: judge_rp_filter(network.read_rp_filter(), given.interfaces),
+    "radio": _radio,
+    "route": _routes,
+    "port": _ports,
+    "ROS": _shell,
+    "clock": _clock,
+    "realtime": _rights,
+    "exposed nodes": _exposed_nodes,
+}
+"""All checks, in the order of the output; at least one result of each has its name. Each takes 2 s at most."""
