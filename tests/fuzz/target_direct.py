@@ -6,25 +6,20 @@ import json
 
 import msgspec
 
-from rmpa.bridge.direct import requests
 from rmpa.bridge.direct.conditions import Grant, read_reply, reply_of
+from rmpa.bridge.direct.requests import DirectAsk, read_ask, read_want, write
 from rmpa.core.contract import Contract
 from rmpa.core.errors import RemoteProtocolError
 
-_READERS = (requests.read_open, requests.read_close, requests.read_closed, requests.read_retry)
-
 SEEDS: list[bytes] = [
-    *(
-        json.dumps(requests.write(one)).encode()
-        for one in (
-            requests.OpenDirect("/chatter", "/talker", "/viewer", Contract()),
-            requests.CloseDirect("/chatter", "/talker", "/viewer", True),
-            requests.DirectClosed("/chatter", "/talker", "", "node", "restarted"),
-            requests.RetryDirect("/chatter", "/talker"),
-        )
-    ),
+    json.dumps(write(DirectAsk("/chatter", "/talker", "/viewer", Contract(), True))).encode(),
+    json.dumps(write(DirectAsk("/add", "/adder"))).encode(),
+    b'{"name": "/chatter", "node": "/talker", "user": "/viewer"}',
     b'{"port": 45225, "probe": "/talker/get_loggers"}',
+    b'{"port": 70000, "probe": "/adder/get_loggers"}',
     b'{"why": "caller_id", "text": "another /viewer"}',
+    b'{"why": "moon", "text": "of a later release"}',
+    b"[1, 2]",
 ]
 
 
@@ -37,14 +32,15 @@ def fuzz(data: bytes) -> None:
     _response(value)
     if not isinstance(value, dict):
         return
-    for read in _READERS:
+    for read in (read_ask, read_want):
         try:
-            arguments = read(value)
+            found = read(value)
         except RemoteProtocolError as error:
             if not str(error).isprintable():
                 raise AssertionError("an error's text is not safe to log") from error
             continue
-        if read(requests.write(arguments)) != arguments:
+        again = read_ask(write(found)) if isinstance(found, DirectAsk) else read_want(found._asdict())
+        if again != found:
             raise AssertionError("arguments do not survive their round trip")
 
 

@@ -230,18 +230,6 @@ def caller_at_loopback(module: Module) -> Process:
     return started
 
 
-def test_a_server_killed_with_its_agent_leaves_the_graph(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b", config=AUTO)
-    on_network(a, b)
-    server = worker(a)
-    wait_transport(b, "direct")
-    a.agent.kill()
-    b.agent.process.wait_for("link down: a")
-    assert "/work" in b.ros.tool("rosservice", "list").split()
-    server.kill()
-    eventually(lambda: "/work" not in b.ros.tool("rosservice", "list").split(), what="the service has left")
-
-
 def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_network(a, b)

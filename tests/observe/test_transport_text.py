@@ -36,8 +36,8 @@ WHY = f"{SAID} (condition caller_id)"
         ),
         ({"transport": "relay"}, "relayed for /viewer: it is moved to a direct connection"),
         (
-            {"transport": "", "state": "probing"},
-            "none yet for /viewer: the port of the publisher's node is tried",
+            {"transport": "", "state": "asking"},
+            "none yet for /viewer: the peer's agent is asked for a direct connection, and its node is tried",
         ),
         ({"state": "asking"}, "direct to 10.0.0.2:41234 for /viewer"),
         ({"state": "granted", "endpoint": "41234"}, "direct for /viewer, to port 41234 of this machine"),

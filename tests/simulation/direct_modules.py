@@ -1,34 +1,73 @@
-"""Modules that negotiate direct transport in made-up time: the machines of both sides, and models of their nodes.
+"""Modules that negotiate direct transport in made-up time: the real drivers of both sides, and models of their nodes.
 
-The drivers do what ``bridge.topics.io.direct_importer`` and ``direct_exporter`` do, with nodes that are values.
+What the drivers ask of nodes and of the kernel (``bridge.direct.io.nodes``) is answered by ``Network``.
 """
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
+import random
+from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.direct_route import Ask, Decided, DirectKey, HangUp, Move, Path, ProbeNode, Release
-from rmpa.bridge.direct.publisher_side import DirectGrants, EndConnections, Granted, Retry, WithdrawGrant
-from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
-from rmpa.core.contract import Contract, Transport
+from rmpa.bridge.messages import Source
+from rmpa.bridge.topics.io import direct_importer
+from rmpa.bridge.topics.io.direct_exporter import DirectExporter
+from rmpa.bridge.topics.io.direct_importer import DirectImporter
+from rmpa.core.contract import Contracts, Transport
+from rmpa.core.counters import Counters
+from rmpa.core.errors import UnreachableError
+from rmpa.ros.master.effects import RegistrationKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Awaitable, Callable, Coroutine, Iterator
+    from unittest.mock import _patch
 
-    from rmpa.bridge.direct.direct_route import DirectAction
-    from rmpa.bridge.direct.publisher_side import GrantAction
-    from rmpa.bridge.messages import Source
-    from tests.simulation.network import World
+TYPE: Final = "std_msgs/String"
 
-AUTO: Final = Contract(transport=Transport.AUTO)
-RELAYED: Final = Unmet(Condition.TRANSPORT, "relay")
+
+class World:
+    """What is random, the tasks of nodes, and the trace; the time is the loop's."""
+
+    def __init__(self, seed: int, *, keep: bool = False) -> None:
+        self.rng = random.Random(seed)
+        self.lines: deque[str] = deque(maxlen=None if keep else 200)
+        self.tasks: set[asyncio.Task[Any]] = set()
+        self._digest = hashlib.sha256()
+
+    @property
+    def now(self) -> float:
+        """Seconds."""
+        return asyncio.get_running_loop().time()
+
+    def note(self, who: str, what: str) -> None:
+        """Write one line of the trace."""
+        line = f"{self.now - 1000:10.6f} {who:>8} {what}"
+        self._digest.update(line.encode())
+        self.lines.append(line)
+
+    @property
+    def trace_hash(self) -> str:
+        """Of the whole trace so far."""
+        return self._digest.hexdigest()
+
+    async def pause(self, most: float) -> None:
+        """A random while."""
+        await asyncio.sleep(most * self.rng.random())
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Let something happen beside the rest."""
+        task = asyncio.create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
 
 
 class Channel:
-    """The control frames of one link, both ways: in order, each after a random delay, none behind the link's end."""
+    """One link, both ways: in order, each message after a random delay, none behind the link's end."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -37,9 +76,50 @@ class Channel:
 
     def send(self, way: int, deliver: Callable[[], None]) -> None:
         """Deliver a message in the direction ``way``, 0 or 1."""
-        when = self._world.now + self._world.rng.choice([0.0005, 0.005, 0.05]) * self._world.rng.random()
-        self._last[way] = when = max(when, self._last[way])
-        self._world.at(when, lambda: deliver() if self.up else None)
+        loop = asyncio.get_running_loop()
+        when = loop.time() + self._world.rng.choice([0.0005, 0.005, 0.05]) * self._world.rng.random()
+        self._last[way] = when = max(when, self._last[way] + 1e-9)
+        loop.call_at(when, lambda: deliver() if self.up else None)
+
+
+class Rpc:
+    """One end of the requests between two agents."""
+
+    def __init__(self, way: int) -> None:
+        self.way = way
+        self.handlers: dict[str, Any] = {}
+        self.routes: dict[int, tuple[Channel, Rpc, Any]] = {}
+        """By peer: the link, the other end, and the session there."""
+        self._answering: set[asyncio.Task[None]] = set()
+
+    def on_request(self, what: str, handler: object, _needs: object) -> None:
+        self.handlers[what] = handler
+
+    on_notification = on_request
+
+    def notify(self, session: Any, what: str, args: dict[str, Any]) -> None:
+        channel, other, there = self.routes[session.peer]
+        channel.send(self.way, lambda: other.handlers[what](there, args))
+
+    async def request(self, session: Any, what: str, args: dict[str, Any], _timeout: float) -> Any:
+        channel, other, there = self.routes[session.peer]
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+        async def answer() -> None:
+            value = await other.handlers[what](there, args)
+            channel.send(other.way, lambda: None if future.done() else future.set_result(value))
+
+        channel.send(self.way, lambda: self._start(answer()))
+        while not future.done():
+            if not channel.up:
+                raise UnreachableError("agent", session.link.name)
+            await asyncio.wait([future], timeout=0.05)
+        return future.result()
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._answering.add(task)
+        task.add_done_callback(self._answering.discard)
 
 
 @dataclass
@@ -67,116 +147,160 @@ class Listener:
     leaves: bool
     """Whether it hangs up on publishers that the master does not name, as roscpp does."""
     paths: dict[Source, list[str | int]] = field(default_factory=dict)
+    asking: set[Source] = field(default_factory=set)
+
+
+class Proxies:
+    """The proxies of a peer's nodes; nothing is registered at them here."""
+
+    def get(self, node: str) -> Any:
+        return SimpleNamespace(name=node, uri=f"http://proxy{node}/", address_of=lambda _: None)
+
+    def hold(self, *_: object) -> None:
+        """Does nothing."""
+
+    release = hold
+
+
+def session(peer: int, name: str, address: str) -> Any:
+    """The double of one run of a peer."""
+    link = SimpleNamespace(name=name, silent=True, crashed=False)
+    return SimpleNamespace(
+        peer=peer, link=link, linked=True, reachable=True, same_machine=False, address=address, proxies=Proxies()
+    )
+
+
+def sessions(of: dict[int, Any]) -> Any:
+    """The double of ``PeerSessions``."""
+    return SimpleNamespace(get=of.get, reachable=lambda: [one for one in of.values() if one.reachable])
 
 
 class PublisherModule:
-    """The module of the talkers: its grants, its local subscribers and its rules."""
+    """The module of the talkers: what it grants, its local subscribers and its rules."""
 
-    def __init__(self, world: World, talkers: Iterable[Talker]) -> None:
+    def __init__(self, world: World, talkers: tuple[Talker, ...]) -> None:
         self.world = world
         self.talkers = {one.source: one for one in talkers}
-        self.grants = DirectGrants()
         self.local: set[str] = set()
+        self.offered = {source: SimpleNamespace(type=TYPE, origin=None) for source in self.talkers}
         self.allowed = True
-        self.offered = set(self.talkers)
-        self.peers: dict[int, SubscriberModule] = {}
+        self.start()
 
-    def unmet(self, source: Source, peer: int, name: str) -> Unmet | None:
-        """As ``DirectExporter._unmet``."""
-        if source not in self.offered or not self.talkers[source].up:
-            return Unmet(Condition.OFFERED, "not offered")
-        if not self.allowed:
-            return RELAYED
-        return self.grants.judge(peer, source, name, self.local)
+    def start(self) -> None:
+        """A new run of its agent."""
+        self.peers: dict[int, Any] = {}
+        self.modules: dict[int, SubscriberModule] = {}
+        self.rpc = Rpc(1)
+        core = SimpleNamespace(
+            publishers=lambda topic: {
+                one.source.node: one.uri for one in self.talkers.values() if one.up and one.source.topic == topic
+            },
+            subscribers=lambda _: dict.fromkeys(self.local, "http://local/"),
+            suspect=lambda _: None,
+            call=lambda *_: None,
+        )
+        exports = SimpleNamespace(
+            offered=self.offered, local=lambda _, source: source if source in self.offered else None
+        )
+        self.exporter = DirectExporter(
+            cast("Any", core),
+            cast("Any", exports),
+            self.contracts,
+            cast("Any", SimpleNamespace(of_topic=self._port, forget=lambda _: None)),
+            sessions(self.peers),
+            cast("Any", self.rpc),
+            Counters(),
+        )
 
-    def asked(self, peer: int, channel: Channel, source: Source, name: str, reply: Callable[[object], None]) -> None:
-        """Answer ``direct.open`` as ``DirectExporter._find``: the node is asked in between."""
+    @property
+    def contracts(self) -> Contracts:
+        return Contracts((), Transport.AUTO if self.allowed else Transport.RELAY)
 
-        def refuse(unmet: Unmet) -> None:
-            self.act(self.grants.refused(peer, source, name))
-            channel.send(1, lambda: reply(unmet))
+    async def _port(self, _session: object, node: str, _uri: str, topic: str) -> Grant | Unmet:
+        talker = self.talkers[Source(topic, node)]
+        found: Grant | Unmet = Grant(talker.port, node)
+        if not talker.network:
+            found = Unmet(Condition.LISTENING, "loopback")
+        await self.world.pause(0.02)
+        return found
 
-        def found() -> None:
-            talker = self.talkers[source]
-            if not channel.up:
-                return  # the handlers of an ended link are cancelled
-            problem = None if talker.network else Unmet(Condition.LISTENING, "loopback")
-            problem = problem or self.unmet(source, peer, name)
-            if problem is None and talker.uri != uri:
-                problem = Unmet(Condition.NODE, "restarted")
-            if problem is not None:
-                refuse(problem)
-                return
-            self.grants.grant(peer, source, name, Granted(AUTO, talker.port, uri))
-            grant = Grant(talker.port, source.node)
-            channel.send(1, lambda: reply(grant))
-
-        unmet = self.unmet(source, peer, name)
-        if unmet is not None:
-            refuse(unmet)
-            return
-        uri = self.talkers[source].uri
-        self.world.after(self.world.rng.choice([0.001, 0.02]), found)
-
-    def act(self, actions: Iterable[GrantAction]) -> None:
-        """Send the notifications, end connections."""
-        for action in actions:
-            module = self.peers.get(action.peer)
-            if module is None:
-                continue
-            match action:
-                case EndConnections(port=port):
-                    module.end_all(port)
-                case WithdrawGrant(source=source, subscriber=name, unmet=unmet):
-                    module.tell(lambda m=module, s=source, n=name, u=unmet: m.withdrawn(s, n, u))  # type: ignore[misc]
-                case Retry(source=source):
-                    module.tell(lambda m=module, s=source: m.retried(s))  # type: ignore[misc]
+    def changed(self, kind: RegistrationKind, topic: str, node: str, *, added: bool) -> None:
+        """A registration came or went."""
+        self.exporter.graph_changed(
+            cast("Any", SimpleNamespace(kind=kind, name=topic, node=node, api="", added=added))
+        )
 
     def advertise(self) -> None:
         """Compare what is offered with the registrations, a little later than these."""
         now = {source for source, one in self.talkers.items() if one.up}
-        changed, self.offered = now ^ self.offered, now
-        for module in set(self.peers.values()):
-            for source in sorted(changed):
-                module.tell(lambda m=module, s=source, on=source in now: m.advertised(s, shown=on))  # type: ignore[misc]
+        for source in sorted(now ^ set(self.offered)):
+            if source in now:
+                self.offered[source] = SimpleNamespace(type=TYPE, origin=None)
+            else:
+                del self.offered[source]
+            for module in self.modules.values():
+                module.told(source, shown=source in now)
+        self.exporter.judge_again(refused=False)
 
 
 class SubscriberModule:
-    """A module with listeners: its decisions, and the calls that carry them out."""
+    """A module with listeners: the decisions of its agent, and the calls that carry them out."""
 
     def __init__(self, world: World, name: str, there: PublisherModule) -> None:
         self.world = world
         self.name = name
+        self.address = f"10.0.{ord(name)}.1"
+        """The publishers' machine, as it is seen from here."""
         self.there = there
-        self.routes = self._machine()
         self.listeners: dict[str, Listener] = {}
         self.allowed = True
         self.channel: Channel | None = None
-        self.here = 0
-        """The number of the publisher's module in this agent."""
-        self.there_number = 0
-        """The number of this run in the publisher's agent."""
-        self.shown: set[Source] = set()
-        self.strays: dict[tuple[Source, str], int] = {}
-        self._busy: dict[DirectKey, list[Callable[[Callable[[], None]], None]]] = {}
-        self._waiting: dict[DirectKey, list[Callable[[], None]]] = {}
-        self._life = 0
+        self.peers: dict[int, Any] = {}
+        self.shown: dict[Source, Any] = {}
+        self.here = self.there_number = 0
+        self.start()
 
-    def _machine(self) -> DirectSubscriptions:
-        return DirectSubscriptions(lambda key: self.there.talkers[key.source].latched, self._is_relayed)
+    def start(self) -> None:
+        """A new run of its agent."""
+        self.rpc = Rpc(0)
+        imports = SimpleNamespace(get=lambda _, source: self.shown.get(source), at=self._at, all=self._all)
+        core = SimpleNamespace(
+            publishers=lambda topic: {
+                f"/rmpa{one.node}": f"http://proxy{one.node}/" for one in self.shown if one.topic == topic
+            },
+            subscribers=lambda _: {name: f"http://{self.name}{name}/" for name in self.listeners},
+            suspect=lambda _: None,
+            node_host="127.0.0.1",
+        )
+        self.importer = DirectImporter(
+            cast("Any", core),
+            cast("Any", _Imports(imports)),
+            cast("Any", _Topics(self)),
+            self.contracts,
+            sessions(self.peers),
+            cast("Any", self.rpc),
+            on_warning=lambda *_: None,
+            counters=Counters(),
+        )
 
-    def _is_relayed(self, key: DirectKey) -> bool:
-        listener = self.listeners.get(key.subscriber)
-        return listener is not None and "relay" in listener.paths.get(key.source, [])
+    @property
+    def contracts(self) -> Contracts:
+        return Contracts((), Transport.AUTO if self.allowed else Transport.RELAY)
+
+    def _at(self, topic: str) -> list[tuple[int, Source]]:
+        return [(self.here, source) for source in sorted(self.shown) if source.topic == topic]
+
+    def _all(self) -> Iterator[tuple[int, Source, Any]]:
+        return iter([(self.here, source, entry) for source, entry in self.shown.items()])
 
     def paths(self, source: Source, name: str) -> list[str | int]:
         """The connections of a listener to a source."""
         return self.listeners[name].paths.setdefault(source, []) if name in self.listeners else []
 
-    def tell(self, deliver: Callable[[], None]) -> None:
-        """Deliver a notification of the publisher's agent over the present link."""
+    def told(self, source: Source, *, shown: bool) -> None:
+        """The advertisement of the publisher's agent, over the present link."""
         if self.channel is not None:
-            self.channel.send(1, deliver)
+            self.channel.send(1, lambda: self.advertised(source, shown=shown))
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -184,255 +308,243 @@ class SubscriberModule:
         """A node starts; it asks each proxy that it is named."""
         self.listeners[name] = Listener(name, leaves)
         for source in sorted(self.shown):
-            self._consider(source, name)
-            self._ask_topic(DirectKey(self.here, source, name))
+            self._register(source, name, added=True)
+            self.ask(source, name)
 
     def unsubscribe(self, name: str) -> None:
         """A node ends, and its connections with it."""
         del self.listeners[name]
         for source in sorted(self.shown):
-            self.act(self.routes.remove(DirectKey(self.here, source, name), hang_up=False))
+            self._register(source, name, added=False)
 
-    def judge(self) -> None:
-        """Judge all again after a reload."""
-        for source in sorted(self.shown):
-            for name in list(self.listeners):
-                self._consider(source, name)
+    def _register(self, source: Source, name: str, *, added: bool) -> None:
+        kind, uri = RegistrationKind.SUBSCRIBER, f"http://{self.name}{name}/"
+        change = SimpleNamespace(kind=kind, name=source.topic, node=name, api=uri, added=added)
+        self.importer.graph_changed(cast("Any", change))
+
+    def reload(self) -> None:
+        """Other rules."""
+        self.importer.reload(self.contracts)
 
     def advertised(self, source: Source, *, shown: bool) -> None:
         """A source appears in the graph here, or leaves it."""
         if shown and source not in self.shown:
-            self.shown.add(source)
+            latched = SimpleNamespace(latching=self.there.talkers[source].latched)
+            self.shown[source] = SimpleNamespace(
+                topic=source.topic, type=TYPE, shown=True, origin=None, description=latched, direct=False
+            )
+            self.importer.shown(self.here, source)
             for name in list(self.listeners):
-                self._consider(source, name)
-                self._ask_topic(DirectKey(self.here, source, name))
+                self.ask(source, name, anew=True)
         elif not shown and source in self.shown:
-            self.shown.discard(source)
-            self._hide(source, hang_up=True)
+            self.importer.hidden(self.here, source)
+            self.leave(source)
 
-    def _hide(self, source: Source, *, hang_up: bool) -> None:
+    def leave(self, source: Source) -> None:
+        """The proxy of a source is gone, and with it the relayed connections."""
+        del self.shown[source]
         for name, listener in self.listeners.items():
             paths = self.paths(source, name)
-            if "relay" in paths:
-                paths.remove("relay")
-            if listener.leaves and hang_up:
-                paths.clear()
-            key = DirectKey(self.here, source, name)
-            route = self.routes.get(key)
-            if not hang_up and route is not None and route.path is Path.DIRECT and route.endpoint is not None:
-                self.strays[source, name] = route.endpoint[1]
-            self.act(self.routes.remove(key, hang_up=hang_up))
+            paths[:] = [one for one in paths if one != "relay" and not listener.leaves]
 
-    def withdrawn(self, source: Source, name: str, unmet: Unmet) -> None:
-        """Take ``direct.closed``."""
-        self.act(self.routes.closed(self.here, source, name, unmet, self.world.now))
+    def ask(self, source: Source, name: str, *, anew: bool = False) -> None:
+        """The node calls ``requestTopic`` at a new proxy, or at one to which it has no connection."""
+        listener = self.listeners.get(name)
+        if listener is not None and (anew or not (self.paths(source, name) or source in listener.asking)):
+            listener.asking.add(source)
+            self.world.spawn(self._ask(source, listener, self.shown.get(source)))
 
-    def retried(self, source: Source) -> None:
-        """Take ``direct.retry``."""
-        self.act(self.routes.retry(self.here, source, self.world.now))
-
-    def broken(self, source: Source, name: str) -> None:
-        """A direct connection breaks by itself."""
-        paths = self.paths(source, name)
-        paths[:] = [one for one in paths if one == "relay"]
+    async def _ask(self, source: Source, listener: Listener, entry: object) -> None:
+        await self.world.pause(0.005)
+        answer: Awaitable[Any] | None = None
+        if entry is not None and self.shown.get(source) is entry and self.listeners.get(listener.name) is listener:
+            answer = self.importer.request(self.here, source, listener.name)
+        reply = await answer if answer is not None else None
+        listener.asking.discard(source)
+        await self.world.pause(0.005)
+        if entry is None or self.shown.get(source) is not entry or self.listeners.get(listener.name) is not listener:
+            return
+        if reply is None:
+            self.paths(source, listener.name).append("relay")
+            self.importer.listeners_changed(self.here, source)
+        elif reply.code == 1:
+            talker = self.there.talkers[source]
+            if talker.up and talker.reachable and talker.port == reply.value[2]:
+                self.paths(source, listener.name).append(talker.port)
 
     def end_all(self, port: int) -> None:
-        """The publisher's agent ends the connections from this module to a port."""
+        """The connections from this module to a port end."""
         for listener in self.listeners.values():
             for paths in listener.paths.values():
                 if port in paths:
                     paths.remove(port)
 
-    def restart(self) -> None:
-        """The host is switched off and on again: all that was known here is gone, and all connections."""
-        self._life += 1
-        self._busy.clear()
-        self._waiting.clear()
-        self.routes = self._machine()
-        self.strays.clear()
-        for listener in self.listeners.values():
-            listener.paths.clear()
-        self.shown.clear()
-        self.here = 0
-
     # --- links -----------------------------------------------------------------------------------------------------
 
-    def link_up(self, channel: Channel, number: int) -> None:
-        """A link; with another number of the peer it is one of another run."""
-        self.channel = channel
+    def link_up(self, channel: Channel, number: int, there_number: int) -> None:
+        """A link; with other numbers it is one of another run."""
+        there = self.there
         if number != self.here:
-            self.here = number
-            self.shown.clear()
-        self.act(self.routes.link_up(number, self.world.now))
+            self.peers[number] = session(number, "a", self.address)
+            there.peers[there_number] = session(there_number, self.name, self.address)
+        self.here, self.there_number, self.channel = number, there_number, channel
+        mine, theirs = self.peers[number], there.peers[there_number]
+        there.modules[there_number] = self
+        self.rpc.routes[number] = (channel, there.rpc, theirs)
+        there.rpc.routes[there_number] = (channel, self.rpc, mine)
+        for one in (mine, theirs):
+            one.linked = one.reachable = True
+        self.importer.link_up(mine)
+        there.exporter.link_up(theirs)
 
-    def link_down(self, *, crashed: bool, gone: bool) -> None:
-        """The link ends; ``gone``: its session too."""
-        self.channel = None
-        self.act(self.routes.link_down(self.here, self.world.now, crashed=crashed))
-        if gone:
-            for source in sorted(self.shown):
-                self._hide(source, hang_up=not crashed)
-            left = dict(self.strays)
-            self.world.after(limits.DIRECT_ADOPT, lambda: self._end_strays(left))
+    def link_down(self, *, crashed: bool) -> None:
+        """The link ends."""
+        mine, theirs = self.peers[self.here], self.there.peers[self.there_number]
+        assert self.channel is not None
+        self.channel.up, self.channel = False, None
+        for one in (mine, theirs):
+            one.linked = one.reachable = False
+            one.link.crashed = crashed
+        self.importer.link_down(mine, crashed=crashed)
+        self.there.exporter.link_down(theirs, crashed=crashed)
 
-    def _end_strays(self, left: dict[tuple[Source, str], int]) -> None:
-        for (source, name), port in left.items():
-            if self.strays.get((source, name)) == port:
-                del self.strays[source, name]
-                paths = self.paths(source, name)
-                if port in paths:
-                    paths.remove(port)
+    def gone(self) -> None:
+        """The session of the last link ends."""
+        self.importer.gone(self.peers.pop(self.here))
+        theirs = self.there.peers.pop(self.there_number)
+        self.there.exporter.gone(theirs)
+        self.there.modules.pop(self.there_number)
+        for source in list(self.shown):
+            self.leave(source)
+        self.here = 0
 
-    # --- carrying out ----------------------------------------------------------------------------------------------
 
-    def _consider(self, source: Source, name: str) -> None:
-        unmet = None if self.allowed else RELAYED
-        key = DirectKey(self.here, source, name)
-        self.act(self.routes.consider(key, Transport.AUTO, unmet, self.world.now))
+class _Imports:
+    """The double of ``Imports``."""
 
-    def act(self, actions: Iterable[DirectAction]) -> None:
-        """Carry out the machine's actions, as ``DirectImporter._act``."""
-        for action in actions:
-            match action:
-                case Ask(key, attempt):
-                    self._ask(key, attempt)
-                case ProbeNode(peer, grant):
-                    self._soon(lambda p=peer, g=grant: self._probe(p, g), 0.01)  # type: ignore[misc]
-                case Decided(key):
-                    for answer in self._waiting.pop(key, []):
-                        answer()
-                case Move(key):
-                    self._queue(key, lambda done, k=key: self._move(k, done))  # type: ignore[misc]
-                case HangUp(key, (_, port)):
-                    self._queue(key, lambda done, k=key, p=port: self._hang_up(k, p, done))  # type: ignore[misc]
-                case Release(key):
-                    self._release(key)
-                case _:
-                    pass
+    def __init__(self, parts: Any) -> None:
+        self.get, self.at, self._all = parts.get, parts.at, parts.all
 
-    def _release(self, key: DirectKey) -> None:
-        number, grants = self.there_number, self.there.grants
-        if self.channel is not None:
-            release = lambda: self.there.act(grants.release(number, key.source, key.subscriber))  # noqa: E731
-            self.channel.send(0, release)
+    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
+        found: Iterator[tuple[int, Source, Any]] = self._all()
+        return found
 
-    def _soon(self, work: Callable[[], None], most: float) -> None:
-        life = self._life
-        self.world.after(most * self.world.rng.random(), lambda: work() if life == self._life else None)
 
-    def _ask(self, key: DirectKey, attempt: int) -> None:
-        channel, life = self.channel, self._life
-        done: list[bool] = []
+class _Topics:
+    """The double of the proxies' publications."""
 
-        def reply(found: object) -> None:
-            if not done and life == self._life and isinstance(found, Grant | Unmet):
-                done.append(True)
-                self.act(self.routes.replied(key, attempt, found, self.world.now))
+    def __init__(self, module: SubscriberModule) -> None:
+        self._module = module
 
-        if channel is None or key.peer != self.here:
-            self.world.after(0.0, lambda: reply(Unmet(Condition.OFFERED, "no link")))
-            return
-        number = self.there_number
-        channel.send(0, lambda: self.there.asked(number, channel, key.source, key.subscriber, reply))
-        no_answer = Unmet(Condition.AGENT, "no answer")
-        self.world.after(limits.DIRECT_ASK_TIMEOUT, lambda: reply(no_answer))
+    def get(self, _peer: int) -> Any:
+        return SimpleNamespace(publication=self._publication)
 
-    def _probe(self, peer: int, grant: Grant) -> None:
-        talkers = self.there.talkers.values()
-        there = any(one.up and one.reachable and one.port == grant.port for one in talkers)
-        self.act(self.routes.probed(peer, grant.port, "" if there else "no connection", self.world.now))
+    def _publication(self, source: Source) -> Any:
+        module = self._module
+        callers = frozenset(name for name in module.listeners if "relay" in module.paths(source, name))
 
-    def _queue(self, key: DirectKey, work: Callable[[Callable[[], None]], None]) -> None:
-        """Calls to one node for one source go one after the other."""
-        queue = self._busy.setdefault(key, [])
-        queue.append(work)
-        if len(queue) == 1:
-            self._next(key)
+        def hang_up(name: str) -> bool:
+            paths = module.paths(source, name)
+            left = "relay" in paths
+            paths[:] = [one for one in paths if one != "relay"]
+            module.importer.listeners_changed(module.here, source)
+            return left
 
-    def _next(self, key: DirectKey) -> None:
-        def done() -> None:
-            queue = self._busy[key]
-            queue.pop(0)
-            if queue:
-                self._next(key)
-            else:
-                del self._busy[key]
+        return SimpleNamespace(callers=callers, hang_up=hang_up) if source in module.shown else None
 
-        self._soon(lambda: self._busy[key][0](done), 0.02)
 
-    def _hang_up(self, key: DirectKey, port: int, done: Callable[[], None]) -> None:
-        paths = self.paths(key.source, key.subscriber)
-        if port in paths:
-            paths.remove(port)
-        done()
+class Network:
+    """What the drivers ask of nodes and of the kernel."""
 
-    def _move(self, key: DirectKey, done: Callable[[], None]) -> None:
-        route = self.routes.get(key)
-        if route is None or key.source not in self.shown or not self.routes.misplaced(key):
-            done()
-            return
-        paths = self.paths(key.source, key.subscriber)
-        paths.clear()
-        self.routes.hung_up(key)
+    def __init__(self, world: World, modules: list[SubscriberModule]) -> None:
+        self._world = world
+        self._modules = modules
+        self._ports: dict[tuple[int, Source, int], int] = {}
 
-        def call_back() -> None:
-            self._ask_topic(key)
-            done()
+    def patches(self, patch: Any) -> list[_patch[Any]]:
+        """What stands in place of the driver's functions."""
+        names = ("bus_links", "direct_links", "end_links", "publisher_update", "forgotten", "standing", "standing_at")
+        more = {"kernel_tells": lambda: True, "probe": self._probe}
+        return [
+            patch.object(direct_importer, name, what)
+            for name, what in ({name: getattr(self, f"_{name}") for name in names} | more).items()
+        ]
 
-        self._soon(call_back, 0.02)
+    def _at(self, uri: str) -> tuple[SubscriberModule, Listener | None]:
+        module = next(one for one in self._modules if one.name == uri[7])
+        return module, module.listeners.get(uri[8:].rstrip("/"))
 
-    def _ask_topic(self, key: DirectKey) -> None:
-        """The node calls ``requestTopic`` at the proxy, and is answered as by ``DirectImporter._answer``."""
-        if self.routes.decision(key) is not None:
-            self._answer(key)
-            return
-        done: list[bool] = []
-        life = self._life
+    def _port(self, listener: Listener, source: Source, port: int) -> int:
+        return self._ports.setdefault((id(listener), source, port), len(self._ports) + 1)
 
-        def answer() -> None:
-            if not done and life == self._life:
-                done.append(True)
-                self._answer(key)
+    def _rows(self, module: SubscriberModule) -> list[tuple[Listener, Source, int]]:
+        return [
+            (listener, source, port)
+            for listener in module.listeners.values()
+            for source, paths in listener.paths.items()
+            for port in paths
+            if isinstance(port, int)
+        ]
 
-        self._waiting.setdefault(key, []).append(answer)
-        self.world.after(limits.DIRECT_HOLD, answer)
+    async def _bus_links(self, uri: str) -> list[Any]:
+        await self._world.pause(0.01)
+        module, listener = self._at(uri)
+        return [
+            SimpleNamespace(
+                inbound=True,
+                topic=source.topic,
+                connected=True,
+                other=f"http://proxy{source.node}/",
+                remote=(module.address, port),
+                local_port=self._port(one, source, port),
+            )
+            for one, source, port in self._rows(module)
+            if one is listener
+        ]
 
-    def _answer(self, key: DirectKey) -> None:
-        if self.routes.get(key) is None or key.subscriber not in self.listeners:
-            return
-        paths = self.paths(key.source, key.subscriber)
-        decision, now = self.routes.decision(key), self.world.now
-        route = self.routes.get(key)
-        before = route.endpoint[1] if route is not None and route.endpoint and route.path is Path.DIRECT else None
-        stray = self.strays.pop((key.source, key.subscriber), None)
-        direct = decision.port if isinstance(decision, Grant) else None
-        for port in [one for one in paths if one != "relay"]:
-            if port == direct:
-                self.act(self.routes.answered(key, ("b", port), now))
-                return
-            if port in {stray, before}:
-                paths.remove(port)
-        if "relay" in paths:
-            return  # it is connected, so it does not ask
-        if direct is None:
-            paths.append("relay")
-            self.act(self.routes.answered(key, None, now))
-            return
-        talker = self.there.talkers[key.source]
-        if talker.up and talker.reachable and talker.port == direct:
-            paths.append(direct)
-        self.act(self.routes.answered(key, ("b", direct), now))
+    async def _direct_links(self, uri: str, topic: str, endpoint: tuple[str, int]) -> list[Any]:
+        return [one for one in await self._bus_links(uri) if (one.topic, one.remote) == (topic, endpoint)]
 
-    def check(self) -> None:
-        """As ``DirectImporter._check``, and the machine's timer."""
-        now = self.world.now
-        due = self.routes.next_timer()
-        if due is not None and due <= now:
-            self.act(self.routes.handle_timer(now))
-        for key, route in self.routes.connected():
-            if route.endpoint is None or now - route.answered_at <= limits.DIRECT_SETTLE or key in self._busy:
+    async def _end_links(self, endpoint: tuple[str, int], links: Any) -> str:
+        await self._world.pause(0.01)
+        module = self._module_of(endpoint[0])
+        ports = {link.local_port for link in links}
+        for listener, source, port in self._rows(module):
+            if port == endpoint[1] and self._port(listener, source, port) in ports:
+                module.paths(source, listener.name).remove(port)
+        return ""
+
+    async def _publisher_update(self, uri: str, topic: str, publishers: list[str]) -> bool:
+        await self._world.pause(0.01)
+        module, listener = self._at(uri)
+        for source in sorted(module.shown) if listener is not None else ():
+            if source.topic != topic or listener is None:
                 continue
-            if self.routes.misplaced(key):
-                self.act([Move(key)])
-            elif route.endpoint[1] not in self.paths(key.source, key.subscriber):
-                self.act(self.routes.broken(key, now))
+            if f"http://proxy{source.node}/" in publishers:
+                module.ask(source, listener.name)
+            elif listener.leaves:
+                left = "relay" in module.paths(source, listener.name)
+                module.paths(source, listener.name).clear()
+                if left:
+                    module.importer.listeners_changed(module.here, source)
+        return True
+
+    async def _forgotten(self, *_: object) -> None:
+        await self._world.pause(0.01)
+
+    async def _probe(self, address: str, port: int, *_: object, **__: object) -> str:
+        await self._world.pause(0.01)
+        talkers = self._module_of(address).there.talkers.values()
+        return "" if any(one.port == port and one.up and one.reachable for one in talkers) else "no answer"
+
+    def _module_of(self, address: str) -> SubscriberModule:
+        return next(module for module in self._modules if module.address == address)
+
+    def _standing_at(self, address: str) -> dict[int, set[int]]:
+        found: dict[int, set[int]] = {}
+        for listener, source, port in self._rows(self._module_of(address)):
+            found.setdefault(port, set()).add(self._port(listener, source, port))
+        return found
+
+    def _standing(self, endpoint: tuple[str, int]) -> set[int]:
+        return self._standing_at(endpoint[0]).get(endpoint[1], set())

@@ -5,17 +5,23 @@
 
 from __future__ import annotations
 
+import asyncio
+from contextlib import ExitStack
 from itertools import count
-from typing import Final
+from typing import TYPE_CHECKING, Final
+from unittest.mock import patch
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.direct.direct_route import DirectKey, DirectState, Path
-from rmpa.bridge.direct.publisher_side import DirectGrants
+from rmpa.bridge.direct.requests import Want
 from rmpa.bridge.messages import Source
-from tests.simulation.direct_modules import Channel, PublisherModule, SubscriberModule, Talker
-from tests.simulation.network import World
+from rmpa.ros.master.effects import RegistrationKind
+from tests.bridge.io.virtual import VirtualLoop, run
+from tests.simulation.direct_modules import Channel, Network, PublisherModule, SubscriberModule, Talker, World
 from tests.simulation.scenario import Disagreement, Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
 
 NAMES: Final = ("/viewer", "/logger", "/planner")
 _TICK: Final = 0.1
@@ -36,34 +42,51 @@ class DirectScenario:
     def __init__(self, seed: int, *, keep: bool = False) -> None:
         self.seed = seed
         self.world = World(seed, keep=keep)
-        self.ports = count(40_000)
-        self.numbers = count(1)
-        plain = Talker(Source("/chatter", "/talker"), next(self.ports))
-        latched = Talker(Source("/map", "/mapper"), next(self.ports), latched=True)
-        self.there = PublisherModule(self.world, (plain, latched))
-        self.modules = [SubscriberModule(self.world, name, self.there) for name in ("b", "c")]
-        self.away_since: dict[str, float] = {}
-        for module in self.modules:
-            self.link_up(module)
-        self._tick()
 
-    def play(self) -> Outcome:
-        """Troubles, healing, and the check.
+    def play(self, story: Callable[[], Coroutine[object, object, None]] | None = None) -> Outcome:
+        """Troubles, healing, and the check; or another story.
 
         Raises:
             Disagreement: A subscriber has two paths, or in the end not the one that the conditions ask for.
         """
-        rng = self.world.rng
         try:
-            for _ in range(rng.randint(5, 40)):
-                self.world.run(self.world.now + rng.choice([0.0, 0.001, 0.01, 0.1, 1.0, 5.0]) * rng.random())
-                self.happen()
-            self.heal()
-            self.world.run(self.world.now + _SETTLED)
-            self.check()
+            run(self._play(story or self._troubles), VirtualLoop())
         except AssertionError as error:
             raise Disagreement(self._report(error)) from None
         return Outcome(self.world.trace_hash, tuple(self.world.lines), 0)
+
+    async def _play(self, story: Callable[[], Coroutine[object, object, None]]) -> None:
+        self.ports, self.numbers = count(40_000), count(1)
+        plain = Talker(Source("/chatter", "/talker"), next(self.ports))
+        latched = Talker(Source("/map", "/mapper"), next(self.ports), latched=True)
+        with ExitStack() as patches:
+            self.there = PublisherModule(self.world, (plain, latched))
+            self.modules: list[SubscriberModule] = []
+            for one in Network(self.world, self.modules).patches(patch):
+                patches.enter_context(one)
+            self.modules += [SubscriberModule(self.world, name, self.there) for name in ("b", "c")]
+            self.away_since: dict[str, float] = {}
+            for module in self.modules:
+                self.link_up(module)
+            self.done = False
+            watch = asyncio.create_task(self._watch())
+            try:
+                await story()
+            finally:
+                self.done = True
+                for module in self.modules:
+                    await module.importer.close()
+                await asyncio.gather(watch, *self.world.tasks)
+                await asyncio.sleep(2 * limits.DIRECT_LIST_AGAIN)
+
+    async def _troubles(self) -> None:
+        rng = self.world.rng
+        for _ in range(rng.randint(5, 40)):
+            await self.world.pause(rng.choice([0.0, 0.001, 0.01, 0.1, 1.0, 5.0]))
+            self.happen()
+        self.heal()
+        await asyncio.sleep(_SETTLED)
+        self.check()
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -101,35 +124,32 @@ class DirectScenario:
 
     def _restart(self, talker: Talker, what: str) -> None:
         there, old = self.there, talker.port
+        topic, node = talker.source.topic, talker.source.node
         if talker.up:
             for module in self.modules:
                 module.end_all(old)
             if what != "replace":
                 talker.up = False
-                there.grants.gone(talker.source)
+                there.changed(RegistrationKind.PUBLISHER, topic, node, added=False)
         if what != "toggle" or talker.port == 0:
             talker.up, talker.port = True, next(self.ports)
-            there.act(there.grants.published(talker.source, talker.uri))
+            there.changed(RegistrationKind.PUBLISHER, topic, node, added=True)
         elif not talker.up:
             talker.port = 0
-        self.world.after(0.02 * self.world.rng.random(), there.advertise)
+        asyncio.get_running_loop().call_later(0.02 * self.world.rng.random(), there.advertise)
 
     def _namesake(self, name: str) -> None:
         there = self.there
-        if name in there.local:
-            there.local.discard(name)
-            for talker in there.talkers.values():
-                there.act(there.grants.local_subscriber_gone(talker.source.topic))
-        else:
-            there.local.add(name)
-            for talker in there.talkers.values():
-                there.act(there.grants.local_subscriber(talker.source.topic, name))
+        added = name not in there.local
+        (there.local.add if added else there.local.discard)(name)
+        for talker in there.talkers.values():
+            there.changed(RegistrationKind.SUBSCRIBER, talker.source.topic, name, added=added)
 
     def _rules(self, module: SubscriberModule) -> None:
         if self.world.rng.random() < 0.5:
             module.allowed = not module.allowed
             self.note(module, f"allows it: {module.allowed}")
-            module.judge()
+            module.reload()
         else:
             self.set_rules(allowed=not self.there.allowed)
 
@@ -138,15 +158,15 @@ class DirectScenario:
         there = self.there
         there.allowed = allowed
         self.world.note("a", f"allows it: {allowed}")
-        there.act(there.grants.retry_all())
-        there.act(there.grants.judge_again(lambda source, peer, _: there.unmet(source, peer, "")))
+        there.exporter.reload(there.contracts)
 
     def _breaks(self, module: SubscriberModule) -> None:
         if module.listeners:
             name = self.world.rng.choice(sorted(module.listeners))
             source = self.world.rng.choice(sorted(self.there.talkers))
             self.note(module, f"the connection of {name} to {source} breaks")
-            module.broken(source, name)
+            paths = module.paths(source, name)
+            paths[:] = [one for one in paths if one == "relay"]
 
     # --- links -----------------------------------------------------------------------------------------------------
 
@@ -159,10 +179,11 @@ class DirectScenario:
         if how == "agent":
             for one in self.modules:
                 self.link_down(one, crashed=True, gone=True)
-            self.there.grants = DirectGrants()
+            self.there.start()
         elif how == "host":
             self.link_down(module, crashed=False, gone=True)
-            module.restart()
+            for listener in module.listeners.values():
+                listener.paths.clear()
         else:
             self.link_down(module, crashed=how == "replaced", gone=how == "bye")
         if how == "replaced":
@@ -170,48 +191,24 @@ class DirectScenario:
 
     def link_up(self, module: SubscriberModule) -> None:
         """Link a module, in its earlier session if that waits still."""
-        there = self.there
         waits = module.name in self.away_since
         if waits and self.world.now - self.away_since.pop(module.name) > _GRACE:
-            self._end(module, crashed=False)
+            module.gone()
             waits = False
-        number = module.here if waits else next(self.numbers)
+        numbers = (module.here, module.there_number) if waits else (next(self.numbers), next(self.numbers))
         channel = Channel(self.world)
-        self.note(module, f"link up, session {number}")
-        module.there_number = number
-        there.peers[number] = module
-        module.link_up(channel, number)
-        there.grants.link_up(number)
-        self.world.after(limits.DIRECT_ADOPT, lambda: self._expire(number, channel))
-        for source in sorted(there.talkers):
-            module.tell(lambda s=source, on=source in there.offered: module.advertised(s, shown=on))  # type: ignore[misc]
-
-    def _expire(self, number: int, channel: Channel) -> None:
-        if channel.up:
-            self.there.act(self.there.grants.expire(number))
+        self.note(module, f"link up, session {numbers[0]}")
+        module.link_up(channel, *numbers)
+        for source in sorted(self.there.talkers):
+            module.told(source, shown=source in self.there.offered)
 
     def link_down(self, module: SubscriberModule, *, crashed: bool, gone: bool) -> None:
         """End a link; its session waits unless it is ``gone``."""
-        there, number = self.there, module.there_number
-        if module.channel is None:
-            if gone and self.away_since.pop(module.name, None) is not None:
-                self._end(module, crashed=crashed)
-            return
-        module.channel.up = False
-        if not crashed:
-            there.act(there.grants.unreachable(number))
-        module.link_down(crashed=crashed, gone=False)
-        if gone:
-            self._end(module, crashed=crashed)
-        else:
+        if module.channel is not None:
+            module.link_down(crashed=crashed)
             self.away_since[module.name] = self.world.now
-
-    def _end(self, module: SubscriberModule, *, crashed: bool) -> None:
-        there, number = self.there, module.there_number
-        module.link_down(crashed=crashed, gone=True)
-        module.shown.clear()
-        there.peers.pop(number, None)
-        there.act(there.grants.peer_gone(number))
+        if gone and self.away_since.pop(module.name, None) is not None:
+            module.gone()
 
     # --- the end ---------------------------------------------------------------------------------------------------
 
@@ -227,7 +224,7 @@ class DirectScenario:
         if self.world.rng.random() < 0.7:
             for module in self.modules:
                 module.allowed = True
-                module.judge()
+                module.reload()
             self.set_rules(allowed=True)
         for talker in self.there.talkers.values():  # a node that listens elsewhere now is another process
             self._restart(talker, "restart")
@@ -238,50 +235,52 @@ class DirectScenario:
         for module in self.modules:
             for source in sorted(self.there.talkers):
                 for name in sorted(module.listeners):
-                    key = DirectKey(module.here, source, name)
-                    if self._check_one(module, key):
-                        used.add((source, module.there_number, name))
-        granted = {(source, peer, name) for source, peer, name, _ in self.there.grants}
+                    if self._check_one(module, source, name):
+                        used.add((module.there_number, Want(source.topic, source.node, name)))
+        granted = {(peer, want) for peer, want, _ in self.there.exporter}
         assert granted == used, f"granted {sorted(granted)}, used {sorted(used)}"
-        known = [key for module in self.modules for key, _ in module.routes]
-        assert len(known) == sum(len(module.listeners) * len(self.there.talkers) for module in self.modules)
+        for module in self.modules:
+            left = {path.want.user for path in module.importer} - set(module.listeners)
+            assert not left, f"{left} have left {module.name}"
 
-    def _check_one(self, module: SubscriberModule, key: DirectKey) -> bool:
-        source, name = key.source, key.subscriber
-        route, paths = module.routes.get(key), module.paths(source, name)
+    def _check_one(self, module: SubscriberModule, source: Source, name: str) -> bool:
+        path = module.importer.get(module.here, Want(source.topic, source.node, name))
+        paths = module.paths(source, name)
         who = f"{name} of {module.name} at {source}"
-        assert route is not None, f"{who} is unknown"
+        if path is None:  # relayed by rule since it came
+            assert (module.allowed, paths) == (False, ["relay"]), f"{who} is unknown"
+            return False
         talker = self.there.talkers[source]
-        why = route.unmet.condition if route.unmet else None
-        if route.state is DirectState.DIRECT:
-            assert (route.path, paths) == (Path.DIRECT, [talker.port]), f"{who}: direct by {paths}, {route.path}"
+        why = path.unmet.condition if path.unmet else None
+        if path.state == "direct":
+            assert paths == [talker.port], f"{who}: direct by {paths}"
+            assert path.endpoint == (module.address, talker.port), who
             assert module.allowed, who
             assert self.there.allowed, who
             assert name not in self.there.local, who
             return True
-        assert route.state is DirectState.RELAYED, f"{who} is {route.state}"
-        assert (route.path, paths) == (Path.RELAY, ["relay"]), f"{who}: relayed ({why}) by {paths}, {route.path}"
+        assert path.state == "relayed", f"{who} is {path.state}"
+        assert (path.endpoint, paths) == (None, ["relay"]), f"{who}: relayed ({why}) by {paths}, {path.endpoint}"
         if why is Condition.LATCHED:
             assert talker.latched, who
         elif not module.allowed or not self.there.allowed:
             assert why is Condition.TRANSPORT, f"{who}: {why}"
         else:
             assert why is Condition.CALLER_ID, f"{who}: {why}"
-            others = [peer for peer, other, _ in self.there.grants.of(source) if other == name]
+            others = [peer for peer, other, _ in self.there.exporter.of(source.topic, source.node) if other == name]
             assert name in self.there.local or others, f"{who}: no other has the name"
         return False
 
-    def _tick(self) -> None:
-        for module in self.modules:
-            module.check()
-            for listener in module.listeners.values():
-                for source, paths in listener.paths.items():
-                    assert len(paths) <= 1, f"{listener.name} of {module.name}: {paths} to {source}"
-        for source in self.there.talkers:
-            names = [name for _, name, _ in self.there.grants.of(source)]
-            assert len(names) == len(set(names)), f"granted twice: {names}"
-            assert not set(names) & self.there.local, f"granted {names} beside {self.there.local}"
-        self.world.after(_TICK, self._tick)
+    async def _watch(self) -> None:
+        while not self.done:
+            for module in self.modules:
+                for listener in module.listeners.values():
+                    for source, paths in listener.paths.items():
+                        assert len(paths) <= 1, f"{listener.name} of {module.name}: {paths} to {source}"
+            for source in self.there.talkers:
+                names = [name for _, name, _ in self.there.exporter.of(source.topic, source.node)]
+                assert len(names) == len(set(names)), f"granted twice: {names}"
+            await asyncio.sleep(_TICK)
 
     def note(self, module: SubscriberModule, what: str) -> None:
         """One line of the trace."""

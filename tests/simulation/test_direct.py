@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 
 import pytest
@@ -28,18 +29,24 @@ def test_a_seed_replays_exactly() -> None:
 
 def test_without_troubles_every_subscriber_of_a_free_name_is_direct() -> None:
     scenario = DirectScenario(1)
-    b, c = scenario.modules
-    b.subscribe("/viewer", leaves=True)
-    c.subscribe("/logger", leaves=False)
-    scenario.world.run(scenario.world.now + 1.0)
-    scenario.check()
-    assert len(list(scenario.there.grants)) == 4
-    # A second node of that name in the other module is relayed, until the first one ends.
-    c.subscribe("/viewer", leaves=True)
-    scenario.world.run(scenario.world.now + 1.0)
-    scenario.check()
-    assert len(list(scenario.there.grants)) == 4
-    b.unsubscribe("/viewer")
-    scenario.world.run(scenario.world.now + 3.0)
-    scenario.check()
-    assert len(list(scenario.there.grants)) == 3, "the latched source stays relayed until it is subscribed again"
+
+    async def story() -> None:
+        b, c = scenario.modules
+        b.subscribe("/viewer", leaves=True)
+        c.subscribe("/logger", leaves=False)
+        await asyncio.sleep(1.0)
+        scenario.check()
+        assert len(list(scenario.there.exporter)) == 4
+        # A second node of that name in the other module is relayed, until the first one ends.
+        c.subscribe("/viewer", leaves=True)
+        await asyncio.sleep(1.0)
+        scenario.check()
+        assert len(list(scenario.there.exporter)) == 4
+        b.unsubscribe("/viewer")
+        await asyncio.sleep(3.0)
+        scenario.check()
+        assert len(list(scenario.there.exporter)) == 3, (
+            "the latched source stays relayed until it is subscribed again"
+        )
+
+    scenario.play(story)

@@ -157,7 +157,7 @@ DIRECT_ASK_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
 DIRECT_ASKS: Final = 16
 """Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others
-pass. Services of one peer have as many places for themselves, which they hold until they are probed."""
+pass. Services of one peer have as many places for themselves."""
 DIRECT_NODE_TIMEOUT: Final = 2.0
 """Seconds that a local node has to answer a question about direct transport."""
 DIRECT_PORT_KNOWN: Final = 10.0
@@ -176,19 +176,16 @@ DIRECT_SETTLE: Final = 2.0
 DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
 DIRECT_ADOPT: Final = 10.0
-"""Seconds that a new run of a peer's agent has to offer again what its earlier run left connected directly; after
-that the connections are ended. Likewise the seconds that a peer has, after a new link, to ask again for what it
-uses."""
+"""Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
+direct connection from an earlier run of the agent. Likewise the seconds that a peer has, after a new link, to ask
+again for what it uses."""
 DIRECT_KEEP: Final = 30.0
 """Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
-(``core.limits.RESUME_WINDOW``). Their servers are probed each `DIRECT_CHECK` meanwhile."""
+(``core.limits.RESUME_WINDOW``)."""
 DIRECT_BREAKS: Final = 3
 """A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
 DIRECT_BREAKS_SPAN: Final = 10.0
 """Seconds; see `DIRECT_BREAKS`."""
-DIRECT_MOVE_ROUTE: Final = 1.0
-"""Seconds that a move to the relayed transport waits for the relayed route to open before the direct connection is
-ended."""
 DIRECT_MOVE_WAIT: Final = 0.5
 """Seconds that a move waits until an ended connection is gone. Without CAP_NET_ADMIN a roscpp subscriber closes it by
 itself in this time."""

@@ -203,8 +203,8 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         node: The subscriber, by its name in its own graph.
         transport: The path of its messages now: ``direct``, ``relay``, or empty while it has none.
-        state: What is decided: ``asking`` (the peer is asked), ``probing`` (the publisher's port is tried),
-            ``direct`` or ``relayed``; of outgoing routes ``granted``.
+        state: What is decided: ``asking`` (the peer is asked, and the publisher's port is tried), ``direct``
+            or ``relayed``; of outgoing routes ``granted``.
         since_ago: Seconds since a direct connection was answered, else since the state began; ``None``: not known.
         wanted: The transport that the contract of the subscriber's module asks for; empty for ``out``.
         endpoint: ``address:port`` of the publisher's node while the transport is direct; ``out``: the port alone.

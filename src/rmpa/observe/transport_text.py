@@ -25,13 +25,11 @@ _REMEDIES: Final = {
 REMEDY: Final = "docs/contracts.md explains the conditions"
 STUCK_REMEDY: Final = "give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
 _WAITS: Final = {
-    "asking": "the peer's agent is asked for a direct connection",
-    "probing": "the port of the publisher's node is tried",
+    "asking": "the peer's agent is asked for a direct connection, and its node is tried",
     "direct": "it may connect directly, and has not asked for the topic yet",
 }
 _MOVES: Final = {
     "asking": "the peer's agent is asked whether it may be direct",
-    "probing": "the port of the publisher's node is tried, for a direct connection",
     "direct": "it is moved to a direct connection",
 }
 

@@ -2,12 +2,22 @@
 
 import runpy
 import sys
+from typing import Any
 
-from rmpa.bridge.direct import requests
+from rmpa.bridge.session.peer_rpc import PeerRpc
+from rmpa.bridge.topics.io.direct_importer import DirectImporter
 
-# What nobody asks for is not answered: the names of all requests and notifications are others here.
-for name in ("OPEN", "CLOSE", "CLOSED", "RETRY"):
-    setattr(requests, name, f"earlier.{name}")
+DirectImporter.kind = "earlier"  # what nobody asks for is not answered
+_on_request = PeerRpc.on_request
+
+
+def on_request(rpc: PeerRpc, what: str, *args: Any) -> None:
+    """Know no question about direct transport."""
+    if not what.startswith("direct."):
+        _on_request(rpc, what, *args)
+
+
+PeerRpc.on_request = on_request  # type: ignore[method-assign, assignment]
 
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")

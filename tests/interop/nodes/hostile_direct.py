@@ -14,15 +14,15 @@ from typing import Any
 
 from hostile_peer import Link, say
 
-from rmpa.bridge.direct.requests import OpenDirect, write
+from rmpa.bridge.direct.requests import DirectAsk, write
 from rmpa.bridge.messages import Advertise, TopicOffer, encode
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.guid import Guid
 from rmpa.mesh.frames import Frame, FrameKind
 
 AUTO = Contract(transport=Transport.AUTO)
-EVIL = {"topic": "/evil", "node": "/eve"}
-OPEN = write(OpenDirect("/to_b", "/speaker", "/viewer", AUTO))
+EVIL = {"name": "/evil", "node": "/eve", "user": "/gullible"}
+OPEN = write(DirectAsk("/to_b", "/speaker", "/viewer", AUTO))
 
 
 def tell(link: Link, what: str, args: dict[str, Any]) -> None:
@@ -31,8 +31,8 @@ def tell(link: Link, what: str, args: dict[str, Any]) -> None:
 
 
 def ask(link: Link, number: int, args: dict[str, Any]) -> bytes:
-    """The frame of a ``direct.open``."""
-    message = {"op": "ask", "number": number, "what": "direct.open", "args": args}
+    """The frame of a ``direct.topic``."""
+    message = {"op": "ask", "number": number, "what": "direct.topic", "args": args}
     return Frame(FrameKind.CONTROL, json.dumps(message).encode(), 0, 1, 1).serialize()
 
 
@@ -80,7 +80,7 @@ def false_endpoints(here: str, victim: Guid) -> int:
             offer(link)
             asked = False
             for message in controls(link, 15.0):
-                if message["op"] == "ask" and message["what"] == "direct.open":
+                if message["op"] == "ask" and message["what"] == "direct.topic":
                     asked = True
                     reply = {"op": "answer", "number": message["number"], "ok": True, "value": answer}
                     link.send(FrameKind.CONTROL, json.dumps(reply).encode())
@@ -111,16 +111,16 @@ def flood(here: str, victim: Guid) -> Counter[str]:
                     return
 
     for start in range(0, 1500, 30):
-        asked([OPEN | {"subscriber": f"/s{start + k}"} for k in range(30)], "many")
+        asked([OPEN | {"user": f"/s{start + k}"} for k in range(30)], "many")
     for start in range(0, 3000, 30):
-        asked([OPEN | {"topic": f"/none{start + k}"} for k in range(30)], "none")
-    asked([OPEN | {"subscriber": f"/q{k}"} for k in range(2000)], "at once")
+        asked([OPEN | {"name": f"/none{start + k}"} for k in range(30)], "none")
+    asked([OPEN | {"user": f"/q{k}"} for k in range(2000)], "at once")
     asked(
-        [OPEN | bad for bad in ({"subscriber": "/a\n"}, {"topic": "/\x1b[2J"}, {"contract": 5}, {"node": None})],
+        [OPEN | bad for bad in ({"user": "/a\n"}, {"name": "/\x1b[2J"}, {"contract": 5}, {"node": None})],
         "bad",
     )
     for k in range(3000):
-        tell(link, "direct.close", {"topic": "/to_b", "node": "/speaker", "subscriber": f"/s{k}", "broken": True})
+        tell(link, "direct.topic_release", {"name": "/to_b", "node": "/speaker", "user": f"/s{k}"})
     found["lived"] = link.outlives()
     link.sock.close()
     return found
@@ -133,12 +133,10 @@ def storm(here: str, victim: Guid) -> int:
     asks = 0
     ends = time.monotonic() + 4.0
     while time.monotonic() < ends:
-        for _ in range(50):
-            tell(link, "direct.retry", EVIL)
-            tell(link, "direct.closed", EVIL | {"subscriber": "", "why": "node", "text": "again\n"})
-            tell(link, "direct.closed", EVIL | {"subscriber": "", "why": "what", "text": "\x1b"})
+        for _ in range(150):
+            tell(link, "direct.topic_again", EVIL)
         for message in controls(link, 0.02):
-            if message["op"] == "ask" and message["what"] == "direct.open":
+            if message["op"] == "ask" and message["what"] == "direct.topic":
                 asks += 1
                 answer = {"why": "caller_id", "text": "another"}
                 reply = {"op": "answer", "number": message["number"], "ok": True, "value": answer}
@@ -152,11 +150,11 @@ def storm(here: str, victim: Guid) -> int:
 def malformed(here: str, victim: Guid) -> int:
     """Notifications that no agent sends, each on a link of its own; return how many of them ended their link."""
     bad: list[tuple[str, dict[str, Any]]] = [
-        ("direct.closed", {}),
-        ("direct.closed", EVIL | {"subscriber": "/a\n", "why": "node", "text": ""}),
-        ("direct.closed", EVIL | {"subscriber": "", "why": "node", "text": "x" * 1_000_000}),
-        ("direct.retry", {"topic": "evil", "node": "/eve"}),
-        ("direct.close", {"topic": 1, "node": 2, "subscriber": 3}),
+        ("direct.topic_again", {}),
+        ("direct.topic_again", EVIL | {"user": "/a\n"}),
+        ("direct.topic_again", EVIL | {"name": "/" + "x" * 1_000_000}),
+        ("direct.topic_again", EVIL | {"name": "evil"}),
+        ("direct.topic_release", {"name": 1, "node": 2, "user": 3}),
     ]
     ended = 0
     for number, (what, args) in enumerate(bad):

@@ -617,25 +617,3 @@ async def test_one_subscriber_is_hung_up_on_and_the_others_stay(known: Owner) ->
     assert known.said == ["first", "last"]
     for link in links.values():
         link.close()
-
-
-@pytest.mark.trap(42)
-async def test_a_latched_message_that_was_had_by_another_path_is_not_sent_again() -> None:
-    owner = Owner(LATCHED)
-    owner.publication.publish_framed(frame_message(b"old"))
-    owner.publication.spare("/moved", owner.publication.latched)
-    links = {name: await owner.subscriber(callerid=name) for name in ("/moved", "/late")}
-    for link in links.values():
-        await link.header()
-    owner.publication.publish_framed(frame_message(b"new"))
-    assert await links["/late"].message() == b"old"
-    assert await links["/moved"].message() == b"new"
-    # Once only: it has missed nothing the next time.
-    links["/moved"].close()
-    await until(lambda: owner.publication.subscribers == 1)
-    again = await owner.subscriber(callerid="/moved")
-    await again.header()
-    assert await again.message() == b"new"
-    for link in (again, links["/late"]):
-        link.close()
-    owner.close()

@@ -226,11 +226,6 @@ class ServiceImports:
                 actions += self._remove(peer, wire, f"{known.name} is gone")
         return actions
 
-    def lost(self, peer: int, service: str, reason: str) -> list[ImportAction]:
-        """Remove a service that ``keep`` has kept: its server does not answer any more."""
-        remote = self.get(peer, service)
-        return self._remove(peer, remote.wire, reason) if remote is not None else []
-
     # --- what peers offer --------------------------------------------------------------------------------------
 
     def portions(self, peer: int, message: AdvertiseServices) -> Iterator[Change[ServiceOffer, str]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.bridge.direct.conditions import Condition, unmet_by_contract
-from rmpa.bridge.direct.direct_route import DirectState, Path
+from rmpa.bridge.direct.requests import Want
 from rmpa.core.contract import Transport
 from rmpa.observe.io.direct_sampler import DirectFlow, DirectSampler
 from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
@@ -16,15 +16,12 @@ from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.direct.direct_route import DirectRoute, Interruption
-    from rmpa.bridge.direct.publisher_side import Granted
+    from rmpa.bridge.direct.paths import Interruption, Path
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.core.contract import Contract
     from rmpa.observe.io.direct_sampler import DirectSample
     from rmpa.ros.core.api import Core
-
-_PATHS = {Path.NONE: "", Path.RELAY: "relay", Path.DIRECT: "direct"}
 
 
 class DirectSection:
@@ -44,28 +41,27 @@ class DirectSection:
     def _flows(self, topics: Collection[str] | None) -> Iterator[DirectFlow]:
         """The direct connections of local nodes, of some topics or of all."""
         part = self._bridge.topics
-        for key, route in part.direct_imports.routes.connected():
-            entry = part.imports.get(key.peer, key.source)
-            if entry is not None and (topics is None or entry.topic in topics):
-                yield self._flow_in(entry.topic, key.subscriber, route)
-        for source, _, name, granted in part.direct_exports.grants:
-            if topics is None or source.topic in topics:
-                yield _flow_out(source, name, granted)
+        for path in part.direct_imports:
+            if path.endpoint is not None and (topics is None or path.want.name in topics):
+                yield self._flow_in(path, path.endpoint)
+        for _, want, _ in part.direct_exports:
+            if topics is None or want.name in topics:
+                yield self._flow_out(want)
 
-    def _flow_in(self, topic: str, subscriber: str, route: DirectRoute) -> DirectFlow:
-        uri = self._core.state().subscribers.get(topic, {}).get(subscriber, "")
-        return DirectFlow(subscriber, uri, topic, subscriber, route.endpoint or ("", 0))
+    def _flow_in(self, path: Path, endpoint: tuple[str, int]) -> DirectFlow:
+        topic, node = path.want.name, path.want.user
+        return DirectFlow(node, self._core.subscribers(topic).get(node, ""), topic, node, endpoint)
 
-    def inbound(
-        self, info: RouteInfo, peer: int, source: Source, topic: str, contract: Contract, now: float
-    ) -> RouteInfo:
+    def _flow_out(self, want: Want) -> DirectFlow:
+        return DirectFlow(want.node, self._core.publishers(want.name).get(want.node, ""), want.name, want.user)
+
+    def inbound(self, info: RouteInfo, peer: int, source: Source, contract: Contract, now: float) -> RouteInfo:
         """Add the transport to a route from a peer.
 
         Args:
             info: The route.
             peer: The number of the peer's session.
             source: The source, by its wire name.
-            topic: Its local name.
             contract: This module's for the topic.
             now: Monotonic seconds.
         """
@@ -73,15 +69,14 @@ class DirectSection:
         session = self._bridge.sessions.get(peer)
         publication = topics.of(session).publication(source) if session is not None else None
         relayed = publication is not None and publication.subscribers > 0
-        routes = topics.direct_imports.routes.of(peer, source)
         known = topics.direct_imports.interruptions
         subscribers = tuple(
             _interrupted(
-                self._measured(_subscriber(name, route, now), topic, route),
-                known.get(session.link.name, source, name) if session is not None else None,
+                self._measured(_subscriber(path, now), path),
+                known.get(session.link.name, path.want) if session is not None else None,
                 now,
             )
-            for name, route in routes
+            for path in topics.direct_imports.of(peer, source.topic, source.node)
         )
         direct = any(one.transport == "direct" for one in subscribers)
         condition, text = _condition(subscribers)
@@ -96,8 +91,8 @@ class DirectSection:
             subscribers=subscribers,
         )
 
-    def _measured(self, one: SubscriberTransport, topic: str, route: DirectRoute) -> SubscriberTransport:
-        return _with(one, self.sampler[self._flow_in(topic, one.node, route)]) if route.path is Path.DIRECT else one
+    def _measured(self, one: SubscriberTransport, path: Path) -> SubscriberTransport:
+        return _with(one, self.sampler[self._flow_in(path, path.endpoint)]) if path.endpoint is not None else one
 
     def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
         """Add the transport to a route to a peer that is relayed at present."""
@@ -107,35 +102,36 @@ class DirectSection:
 
     def granted(self, source: Source) -> list[int]:
         """The peers that have subscribers with a direct connection to a local source."""
-        grants = self._bridge.topics.direct_exports.grants
-        return list(dict.fromkeys(peer for peer, _, _ in grants.of(source)))
+        grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
+        return list(dict.fromkeys(peer for peer, _, _ in grants))
 
     def granted_to(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
         """A peer's subscribers that may connect to a local source directly, by name."""
         exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
-        grants, known = exports.grants, exports.interruptions
+        wants = [
+            (Want(source.topic, source.node, name), grant)
+            for owner, name, grant in exports.of(source.topic, source.node)
+            if owner == peer
+        ]
         return tuple(
             _interrupted(
                 _with(
-                    SubscriberTransport(node=name, transport="direct", state="granted", endpoint=str(granted.port)),
-                    self.sampler[_flow_out(source, name, granted)],
+                    SubscriberTransport(
+                        node=want.user, transport="direct", state="granted", endpoint=str(grant.port)
+                    ),
+                    self.sampler[self._flow_out(want)],
                 ),
-                known.get(session.link.name, source, name) if session is not None else None,
+                exports.interruptions.get(session.link.name, want) if session is not None else None,
                 asyncio.get_running_loop().time(),
             )
-            for owner, name, granted in sorted(grants.of(source), key=lambda grant: grant[:2])
-            if owner == peer
+            for want, grant in wants
         )
 
 
 def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
     """The number of direct connections to a peer's publishers, and of the grants that it has here."""
-    there = sum(1 for key, _ in bridge.topics.direct_imports.routes.connected() if key.peer == peer)
-    return there, sum(1 for _, owner, _, _ in bridge.topics.direct_exports.grants if owner == peer)
-
-
-def _flow_out(source: Source, subscriber: str, granted: Granted) -> DirectFlow:
-    return DirectFlow(source.node, granted.uri, source.topic, subscriber)
+    there = sum(path.peer == peer and path.endpoint is not None for path in bridge.topics.direct_imports)
+    return there, sum(owner == peer for owner, _, _ in bridge.topics.direct_exports)
 
 
 def _with(one: SubscriberTransport, sample: DirectSample) -> SubscriberTransport:
@@ -171,17 +167,17 @@ def _condition(subscribers: tuple[SubscriberTransport, ...]) -> tuple[str, str]:
     return (relayed[0].condition, relayed[0].text) if relayed else ("", "")
 
 
-def _subscriber(name: str, route: DirectRoute, now: float) -> SubscriberTransport:
-    direct = route.path is Path.DIRECT
-    unmet = route.unmet if route.state is DirectState.RELAYED else None
+def _subscriber(path: Path, now: float) -> SubscriberTransport:
+    endpoint = path.endpoint
+    unmet = path.unmet
     return SubscriberTransport(
-        node=name,
-        transport=_PATHS[route.path],
-        state=route.state.name.lower(),
-        since_ago=now - (route.answered_at if direct else route.since),
-        wanted=route.wanted.value,
-        endpoint=f"{route.endpoint[0]}:{route.endpoint[1]}" if direct and route.endpoint is not None else "",
+        node=path.want.user,
+        transport="direct" if endpoint is not None else "relay" if path.answered else "",
+        state=path.state,
+        since_ago=now - (path.answered_at if endpoint is not None else path.since),
+        wanted=path.wanted.value,
+        endpoint=f"{endpoint[0]}:{endpoint[1]}" if endpoint is not None else "",
         condition=unmet.condition.value if unmet is not None else "",
         text=unmet.text if unmet is not None else "",
-        stuck=route.stuck,
+        stuck=path.stuck,
     )

@@ -86,7 +86,7 @@ class ServicesSection:
             direct_callers=tuple(
                 sorted(
                     self._services.imports.peer_name(peer)
-                    for peer in self._services.direct_exports.grants.peers(service)
+                    for peer, _, _ in self._services.direct_exports.of(service, server.node)
                 )
             ),
             crosses=decision.allowed,

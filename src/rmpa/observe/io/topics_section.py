@@ -206,7 +206,7 @@ class TopicsSection:
             **_events(flow.watch if flow is not None else past, now),
         )
         own = self._contracts.of(entry.topic, entry.type)
-        info = self._direct.inbound(info, at.peer, source, entry.topic, own, now)
+        info = self._direct.inbound(info, at.peer, source, own, now)
         if flow is None:
             return info
         return msgspec.structs.replace(

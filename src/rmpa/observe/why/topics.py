@@ -345,7 +345,7 @@ def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
     topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
     listed = topics[0].subscribers if topics else ()
     direct = connected_directly(route)
-    undecided = [one.node for one in route.subscribers if one.state in ("asking", "probing")]
+    undecided = [one.node for one in route.subscribers if one.state == "asking"]
     if not connections and not direct:
         if refused:
             yield Check("subscriber", OK, f"{', '.join(listed) or 'a node'} wants it")

@@ -83,7 +83,6 @@ class Publication:
     __slots__ = (
         "_description",
         "_dropped_before",
-        "_had",
         "_held",
         "_latched",
         "_left",
@@ -121,7 +120,6 @@ class Publication:
         self._description: TopicDescription | None = None
         self._reply: Mapping[str, str] = _NOTHING
         self.events = events
-        self._had: dict[str, tuple[bytes, ...]] | None = None
         """Latched messages that a subscriber has had by another path, by its caller id."""
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
@@ -322,7 +320,6 @@ class Publication:
         """Drop the latched messages, because their source is gone or will send them again."""
         if self._latched is not None:
             self._latched.clear()
-        self._had = None
 
     def hang_up(self, caller_id: str) -> bool:
         """Close the connections of one subscriber; return whether there was one."""
@@ -331,18 +328,6 @@ class Publication:
             connection.close()
             self._gone(connection, None)
         return bool(gone)
-
-    def spare(self, caller_id: str, had: tuple[bytes, ...]) -> None:
-        """Send a subscriber none of these latched messages when it connects next: it has had them by another path.
-
-        Args:
-            caller_id: The subscriber.
-            had: As ``latched`` returned them; empty: it gets all again.
-        """
-        if had:
-            self._had = {**(self._had or {}), caller_id: had}
-        elif self._had is not None:
-            self._had.pop(caller_id, None)
 
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all published messages are sent, at most ``timeout`` seconds."""
@@ -370,10 +355,8 @@ class Publication:
             "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
         )
         connection.accept(self._reply, self._queue_messages, self._queue_bytes)
-        had = self._had.pop(connection.caller_id, ()) if self._had is not None else ()
         for framed in self.latched:
-            if framed not in had:
-                connection.send(framed)
+            connection.send(framed)
         if not connection.stream.closed:
             self._open += (connection,)
             self.events.listeners_changed()

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.bridge.direct import service_requests as requests
 from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.direct.service_requests import AskService
+from rmpa.bridge.direct.requests import DirectAsk, write
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
 from rmpa.config.settings import TrustSettings
@@ -20,6 +19,7 @@ from rmpa.trust.permissions import Permissions
 if TYPE_CHECKING:
     from rmpa.bridge.services.actions import LocalService
 
+AGAIN = "direct.service_again"
 URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"
 
 
@@ -56,10 +56,10 @@ class Module:
     def _on(self, what: str, handler: object, _needs: object) -> None:
         self.handlers[what] = handler
 
-    def ask(self) -> str:
+    async def ask(self) -> str:
         """Peer 1 asks for a direct call; returns the condition that is not met."""
-        args = requests.write(AskService("/add", "/adder", Transport.AUTO))
-        return str(self.handlers[requests.SERVICE](self.session, args)["why"])
+        reply = await self.handlers["direct.service"](self.session, write(DirectAsk("/add", "/adder")))
+        return str(reply["why"])
 
     def restart(self) -> None:
         """The server is registered again, at another port."""
@@ -67,25 +67,25 @@ class Module:
 
 
 @pytest.mark.parametrize("secured", [True, False])
-def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(*, secured: bool) -> None:
+async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(*, secured: bool) -> None:
     module = Module(secured=secured)
-    assert module.ask() == Condition.OFFERED
+    assert await module.ask() == Condition.OFFERED
     module.restart()
-    assert module.told == ([] if secured else [requests.SERVICE_RETRY])
+    assert module.told == ([] if secured else [AGAIN])
 
 
-def test_a_secured_peer_is_told_when_to_ask_again_for_a_service_that_it_may_have() -> None:
+async def test_a_secured_peer_is_told_when_to_ask_again_for_a_service_that_it_may_have() -> None:
     module = Module(secured=True)
     module.permitted = True
-    assert module.ask() == Condition.TRUST
+    assert await module.ask() == Condition.TRUST
     module.restart()
-    assert module.told == [requests.SERVICE_RETRY]
+    assert module.told == [AGAIN]
 
 
-def test_what_a_reload_forbids_is_forgotten() -> None:
+async def test_what_a_reload_forbids_is_forgotten() -> None:
     module = Module(secured=True)
     module.permitted = True
-    assert module.ask() == Condition.TRUST
+    assert await module.ask() == Condition.TRUST
     module.permitted = False
     module.sut.reload(module.sut._rules)
     module.restart()

@@ -9,13 +9,11 @@ from typing import Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct import requests
+from rmpa.bridge.direct import grants, requests
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.publisher_side import Granted
-from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
+from rmpa.bridge.direct.requests import DirectAsk, Want
 from rmpa.bridge.messages import Source
 from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.topics.io import direct_exporter
 from rmpa.bridge.topics.io.direct_exporter import DirectExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
@@ -27,6 +25,8 @@ from tests.ros.node.peers import until
 
 SOURCE = Source("/chatter", "/talker")
 URI = "http://10.0.0.1:1234/"
+WANT = Want("/chatter", "/talker", "/viewer")
+AGAIN = "direct.topic_again"
 AUTO = Contract(transport=Transport.AUTO)
 
 
@@ -68,7 +68,7 @@ class Module:
         self.sessions = {number: self._session(number) for number in (1, 2)}
         self.permissions = PermissionGate()
         state = SimpleNamespace(publishers=self.publishers, subscribers=self.subscribers)
-        monkeypatch.setattr(direct_exporter, "end_from", self._end_from)
+        monkeypatch.setattr(grants, "end_from", self._end_from)
         self.sut = DirectExporter(
             cast(
                 "Any",
@@ -130,14 +130,21 @@ class Module:
         await self.gate.wait()
         return self.found
 
-    async def open(self, peer: int = 1, subscriber: str = "/viewer", contract: Contract = AUTO) -> dict[str, Any]:
-        args = requests.write(OpenDirect("/chatter", "/talker", subscriber, contract))
-        reply: dict[str, Any] = await self.handlers[requests.OPEN](self.sessions[peer], args)
+    async def open(
+        self,
+        peer: int = 1,
+        subscriber: str = "/viewer",
+        contract: Contract = AUTO,
+        *,
+        node: str = "/talker",
+        broken: bool = False,
+    ) -> dict[str, Any]:
+        args = requests.write(DirectAsk("/chatter", node, subscriber, contract, broken))
+        reply: dict[str, Any] = await self.handlers["direct.topic"](self.sessions[peer], args)
         return reply
 
-    def close(self, peer: int = 1, subscriber: str = "/viewer", *, broken: bool = False) -> None:
-        args = requests.write(CloseDirect("/chatter", "/talker", subscriber, broken))
-        self.handlers[requests.CLOSE](self.sessions[peer], args)
+    def close(self, peer: int = 1, subscriber: str = "/viewer") -> None:
+        self.handlers["direct.topic_release"](self.sessions[peer], Want("/chatter", "/talker", subscriber)._asdict())
 
     def change(self, kind: RegistrationKind, node: str, uri: str, *, added: bool) -> None:
         graph = self.publishers if kind is RegistrationKind.PUBLISHER else self.subscribers
@@ -152,7 +159,7 @@ class Module:
 
     @property
     def granted(self) -> list[tuple[int, str]]:
-        return [(peer, name) for _, peer, name, _ in self.sut.grants]
+        return [(peer, want.user) for peer, want, _ in self.sut]
 
 
 @pytest.fixture
@@ -160,12 +167,13 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Module:
     return Module(monkeypatch)
 
 
+@pytest.mark.trap(12)
 async def test_a_subscriber_is_granted_the_publishers_port(module: Module) -> None:
     assert await module.open() == {"port": 45225, "probe": ""}
     assert module.granted == [(1, "/viewer")]
     assert (await module.open(2))["why"] == Condition.CALLER_ID
     module.close()
-    assert [(peer, what) for peer, what, _ in module.told] == [(2, requests.RETRY)]
+    assert [(peer, what) for peer, what, _ in module.told] == [(2, AGAIN)]
     assert await module.open(2) == {"port": 45225, "probe": ""}
 
 
@@ -176,7 +184,7 @@ async def test_what_is_not_offered_or_not_allowed_is_refused(module: Module) -> 
     assert (await module.open())["why"] == Condition.OFFERED
     assert module.asked == []
     with pytest.raises(RemoteProtocolError):
-        await module.handlers[requests.OPEN](module.sessions[1], {"topic": "x"})
+        await module.handlers["direct.topic"](module.sessions[1], {"name": "x"})
 
 
 async def test_a_refusal_ends_the_earlier_grant(module: Module) -> None:
@@ -203,24 +211,27 @@ async def test_a_restarted_publisher_and_a_namesake_withdraw_grants(module: Modu
     await module.open()
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
     module.change(RegistrationKind.PUBLISHER, "/talker", "http://10.0.0.1:9/", added=True)
-    assert [(what, args["why"]) for _, what, args in module.told] == [(requests.CLOSED, "node")]
+    assert module.told[-1] == (1, AGAIN, Want("/chatter", "/talker", "/viewer")._asdict())
     await module.open()
+    module.told.clear()
     module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=True)
-    assert module.told[-1][2]["why"] == "caller_id"
+    assert [what for _, what, _ in module.told] == [AGAIN]
     assert (await module.open())["why"] == Condition.CALLER_ID
     module.told.clear()
     module.change(RegistrationKind.SUBSCRIBER, "/viewer", "http://10.0.0.1:7/", added=False)
-    assert [what for _, what, _ in module.told] == [requests.RETRY]
+    assert [what for _, what, _ in module.told] == [AGAIN]
 
 
 async def test_only_a_peer_with_a_grant_may_have_a_node_examined(module: Module) -> None:
-    module.close(broken=True)
+    module.found = Unmet(Condition.LISTENING, "loopback")
+    await module.open(broken=True)
     assert (module.suspected, module.forgotten) == ([], [])
+    module.found = Grant(45225, "/talker")
     await module.open()
-    module.close(2, broken=True)
-    module.close(subscriber="/other", broken=True)
+    await module.open(2, broken=True)
+    await module.open(subscriber="/other", broken=True)
     assert module.suspected == []
-    module.close(broken=True)
+    await module.open(broken=True)
     assert (module.suspected, module.forgotten) == (["/talker"], [URI])
 
 
@@ -246,6 +257,17 @@ async def test_connections_end_where_a_host_may_have_vanished(
     assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
 
 
+async def test_only_the_crash_of_a_peers_agent_leaves_its_grants_until_it_is_gone(module: Module) -> None:
+    await module.open()
+    module.sut.link_down(module.sessions[1], crashed=True)
+    assert module.granted == [(1, "/viewer")]
+    module.sut.gone(module.sessions[1])
+    assert module.granted == []
+    await module.open()
+    module.sut.link_down(module.sessions[1], crashed=False)
+    assert module.granted == []
+
+
 async def test_what_a_peer_does_not_ask_for_after_a_new_link_ends(
     module: Module, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,24 +278,34 @@ async def test_what_a_peer_does_not_ask_for_after_a_new_link_ends(
     module.sut.link_up(module.sessions[1])
     await module.open(subscriber="/logger")
     await until(lambda: module.granted == [(1, "/logger")])
-    # A link that ends before does not count.
-    module.sut.link_up(module.sessions[1])
-    module.sut.link_down(module.sessions[1], crashed=True)
-    assert module.sut._expiries == {}
-    module.sut.gone(module.sessions[1])
+
+
+async def test_what_is_released_while_the_node_is_asked_is_not_granted(module: Module) -> None:
+    module.gate.clear()
+    opening = asyncio.create_task(module.open())
+    await until(lambda: module.asked)
+    module.close()
+    module.gate.set()
+    assert "why" in await opening
     assert module.granted == []
+
+
+async def test_the_grants_and_the_remembered_refusals_of_a_peer_are_bounded(
+    module: Module, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "DIRECT_MAX", 3)
+    replies = [await module.open(subscriber=f"/s{number}") for number in range(10)]
+    assert [reply.get("why") for reply in replies] == [None] * 3 + [Condition.LIMIT] * 7
+    assert await module.open(2) == {"port": 45225, "probe": ""}, "each peer has its own bound"
+    assert len(module.sut._all(1)) == 6
 
 
 async def test_new_rules_withdraw_and_let_others_try_again(module: Module) -> None:
     await module.open()
     module.sut.reload(Contracts((), Transport.RELAY))
     assert module.granted == []
-    assert module.told[-1][1:] == (
-        requests.CLOSED,
-        {**module.told[-1][2], "why": "transport", "subscriber": "/viewer"},
-    )
     module.sut.reload(Contracts((), Transport.AUTO))
-    assert module.told[-1][:2] == (1, requests.RETRY)
+    assert [told[:2] for told in module.told] == [(1, AGAIN), (1, AGAIN)]
     assert await module.open() == {"port": 45225, "probe": ""}
 
 
@@ -297,10 +329,10 @@ async def test_a_reload_of_a_secured_mesh_withdraws_grants_and_ends_their_connec
     module.permit(TrustSettings(direct=False))
     module.sut.reload(Contracts((), AUTO.transport))
     assert module.granted == [(2, "/other")], "the other one is on this machine"
-    assert [(peer, what, args["why"]) for peer, what, args in module.told] == [(1, requests.CLOSED, Condition.TRUST)]
+    assert [told[:2] for told in module.told] == [(1, AGAIN)]
     assert module.ended == [(45225, "10.0.0.1")]
     module.offered.clear()
-    module.sut.policy_changed()
+    module.sut.judge_again(refused=False)
     assert module.granted == []
     assert module.ended == [(45225, "10.0.0.1")], "all nodes of a machine have one address"
 
@@ -308,7 +340,7 @@ async def test_a_reload_of_a_secured_mesh_withdraws_grants_and_ends_their_connec
 async def test_without_trust_a_withdrawn_connection_is_left_to_the_peers_agent(module: Module) -> None:
     await module.open(1)
     module.offered.clear()
-    module.sut.policy_changed()
+    module.sut.judge_again(refused=False)
     assert (module.granted, module.ended) == ([], [])
 
 
@@ -326,10 +358,9 @@ async def test_a_secured_peer_learns_no_more_of_a_topic_after_it_was_withdrawn(m
     module.permit(TrustSettings(direct=True))
     await module.open()
     module.offered.clear()
-    module.sut.policy_changed()
-    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+    module.sut.judge_again(refused=False)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert [what for _, what, _ in module.told] == [requests.CLOSED]
+    assert (module.granted, module.told) == ([], [])
 
 
 async def test_a_secured_peer_tries_again_what_it_may_have(module: Module) -> None:
@@ -337,7 +368,7 @@ async def test_a_secured_peer_tries_again_what_it_may_have(module: Module) -> No
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
     assert (await module.open())["text"] == "/talker has just left"
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, AGAIN)]
 
 
 async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module: Module) -> None:
@@ -346,15 +377,15 @@ async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module
     assert (await module.open())["why"] == Condition.OFFERED
     module.offered.update(offered)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    assert [(peer, what) for peer, what, _ in module.told] == [(1, requests.RETRY)]
+    assert [(peer, what) for peer, what, _ in module.told] == [(1, AGAIN)]
 
 
 async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
     await module.open()
     module.sut.link_down(module.sessions[1], crashed=True)
-    assert module.sut.interruptions.get("peer1", SOURCE, "/viewer") is None, "the nodes go on"
+    assert module.sut.interruptions.get("peer1", WANT) is None, "the nodes go on"
     module.sut.link_down(module.sessions[1], crashed=False)
-    lasting = module.sut.interruptions.get("peer1", SOURCE, "/viewer")
+    lasting = module.sut.interruptions.get("peer1", WANT)
     assert lasting is not None
     assert lasting.ended is None
     module.sut.gone(module.sessions[1])
@@ -377,10 +408,11 @@ async def test_a_subscriber_stands_in_the_graph_as_its_proxy_while_it_is_granted
 
 
 async def test_one_publisher_of_two_that_goes_leaves_the_subscriber_in_the_graph(module: Module) -> None:
-    other = Source("/chatter", "/other")
+    module.publishers["/chatter"]["/other"] = URI
+    module.offered[Source("/chatter", "/other")] = module.offered[SOURCE]
     await module.open()
-    module.sut.grants.grant(1, other, "/viewer", Granted(AUTO, 1, URI))
-    module.sut.grants.gone(SOURCE)
+    await module.open(node="/other")
+    module.close()
     assert len(module.registered) == 1
-    module.sut.grants.gone(other)
+    module.sut.gone(module.sessions[1])
     assert [method for method, *_ in module.registered] == ["registerSubscriber", "unregisterSubscriber"]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import Condition, Unmet
-from rmpa.bridge.direct.direct_route import DirectKey, DirectState, Path
-from rmpa.bridge.direct.requests import DirectClosed
+from rmpa.bridge.direct.conditions import Condition
+from rmpa.bridge.direct.requests import Want
 from rmpa.bridge.messages import Source
 from rmpa.bridge.topics.io import direct_importer
 from rmpa.bridge.topics.io.direct_importer import DirectImporter
@@ -23,12 +22,33 @@ from rmpa.ros.wire.xmlrpc import RosReply
 from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator
+
+    from rmpa.bridge.direct.paths import Path
 
 SOURCE = Source("/chatter", "/talker")
-KEY = DirectKey(1, SOURCE, "/viewer")
+WANT = Want("/chatter", "/talker", "/viewer")
 END = ("10.0.0.1", 45225)
+LINK = SimpleNamespace(
+    inbound=True, topic="/chatter", connected=True, other="http://10.0.0.2:9/", remote=END, local_port=40_000
+)
 DIRECT = RosReply(1, "ready on 10.0.0.1:45225", ["TCPROS", "10.0.0.1", 45225])
+
+
+class Imports:
+    """The one source of the peer."""
+
+    def __init__(self, module: Module) -> None:
+        self._module = module
+
+    def __iter__(self) -> Iterator[tuple[int, Source, Any]]:
+        yield 1, SOURCE, self._module.entry
+
+    def get(self, *_: object) -> Any:
+        return self._module.entry
+
+    def at(self, _topic: str) -> list[tuple[int, Source]]:
+        return [(1, SOURCE)]
 
 
 class Module:
@@ -44,22 +64,30 @@ class Module:
         self.reachable.set()
         self.asking = self.most = 0
         self.probed: list[tuple[str, int]] = []
-        self.moved: list[DirectKey] = []
+        self.moved: list[str] = []
         self.told: list[str] = []
         self.warned: list[str] = []
         self.connected: list[object] = []
         self.checked = asyncio.Event()
-        link = SimpleNamespace(name="a", reachable=True)
+        link = SimpleNamespace(name="a", reachable=True, crashed=True)
         self.session: Any = SimpleNamespace(
-            peer=1, link=link, linked=True, reachable=True, same_machine=False, address="10.0.0.1"
+            peer=1,
+            link=link,
+            linked=True,
+            reachable=True,
+            same_machine=False,
+            address="10.0.0.1",
+            proxies=SimpleNamespace(get=lambda _: None),
         )
         self.callers: frozenset[str] = frozenset()
         publication = SimpleNamespace(callers=self.callers, listeners=())
         monkeypatch.setattr(direct_importer, "probe", self._probe)
         monkeypatch.setattr(direct_importer, "standing", lambda _: {40_000} if self.connected else set())
-        monkeypatch.setattr(direct_importer, "direct_links", self._direct_links)
+        monkeypatch.setattr(direct_importer, "standing_at", lambda _: {45225: {40_000}} if self.connected else {})
+        monkeypatch.setattr(direct_importer, "bus_links", self._bus_links)
+        monkeypatch.setattr(direct_importer, "direct_links", self._bus_links)
         monkeypatch.setattr(direct_importer, "end_links", self._end_links)
-        self.imports = SimpleNamespace(get=lambda *_: self.entry, at=lambda _: [(1, SOURCE)])
+        self.imports = Imports(self)
         state = SimpleNamespace(subscribers=self.subscribers, publishers={}, nodes={})
         self.sut = DirectImporter(
             cast(
@@ -84,11 +112,14 @@ class Module:
                     notify=lambda _session, what, _args: self.told.append(what),
                 ),
             ),
-            on_demand=lambda *_: None,
             on_warning=lambda _kind, _subject, text: self.warned.append(text),
             counters=Counters(),
         )
-        monkeypatch.setattr(self.sut._moves, "move", self.moved.append)
+        monkeypatch.setattr(self.sut, "_renew", self._renew)
+
+    async def _renew(self, path: Path) -> bool:
+        self.moved.append(path.want.user)
+        return False
 
     @staticmethod
     def _entry() -> Any:
@@ -113,7 +144,7 @@ class Module:
         await self.reachable.wait()
         return "" if link.reachable else "no answer"
 
-    async def _direct_links(self, *_: object) -> list[object]:
+    async def _bus_links(self, *_: object) -> list[object]:
         self.checked.set()
         await asyncio.sleep(0)
         return self.connected
@@ -127,10 +158,14 @@ class Module:
         return await answer if answer is not None else None
 
     @property
-    def state(self) -> tuple[DirectState, Path]:
-        route = self.sut.routes.get(KEY)
-        assert route is not None
-        return route.state, route.path
+    def path(self) -> Path:
+        found = self.sut.get(1, WANT)
+        assert found is not None
+        return found
+
+    @property
+    def state(self) -> tuple[str, tuple[str, int] | None]:
+        return self.path.state, self.path.endpoint
 
 
 @pytest.fixture
@@ -148,7 +183,7 @@ async def test_a_subscriber_waits_for_the_decision_and_is_sent_to_the_links_own_
     module.gate.set()
     assert await asking == DIRECT, "not to the address in the peer's answer"
     assert module.probed == [END]
-    assert module.state == (DirectState.DIRECT, Path.DIRECT)
+    assert module.state == ("direct", END)
 
 
 async def test_one_that_has_waited_for_too_long_is_relayed_and_moved_later(
@@ -158,32 +193,34 @@ async def test_one_that_has_waited_for_too_long_is_relayed_and_moved_later(
     module.gate.clear()
     module.sut.shown(1, SOURCE)
     assert await module.ask() is None
-    assert module.state == (DirectState.ASKING, Path.RELAY)
+    assert module.state == ("asking", None)
     module.gate.set()
-    await until(lambda: module.moved == [KEY])
+    await until(lambda: module.moved == ["/viewer"])
 
 
 async def test_a_withdrawal_while_the_answer_is_made_is_not_overlooked(module: Module) -> None:
     module.sut.shown(1, SOURCE)
-    await until(lambda: module.state[0] is DirectState.DIRECT)
-    module.connected = [SimpleNamespace(local_port=40_000)]
+    await until(lambda: module.state[0] == "direct")
+    module.connected = [LINK]
     asking = asyncio.create_task(module.ask())
     await module.checked.wait()
-    args = requests.write(DirectClosed("/chatter", "/talker", "", "caller_id", "another"))
-    module.sut._closed_there(module.session, args)
-    assert await asking is None
-    assert module.state == (DirectState.RELAYED, Path.RELAY)
-    assert module.connected == [], "the direct connection has ended before"
+    module.value = {"why": "caller_id", "text": "another"}
+    module.path.asked_at = -math.inf
+    module.sut._asked_again(module.session, WANT._asdict())
+    await until(lambda: module.state[0] == "relayed")
+    module.gate.set()
+    await asking
+    assert module.moved == ["/viewer"]
 
 
 async def test_one_that_is_connected_already_gets_no_second_connection(module: Module) -> None:
     module.sut.shown(1, SOURCE)
-    await until(lambda: module.state[0] is DirectState.DIRECT)
-    module.connected = [SimpleNamespace(local_port=40_000)]
+    await until(lambda: module.state[0] == "direct")
+    module.connected = [LINK]
     reply = await module.ask()
     assert reply is not None
     assert reply.code == 0
-    assert module.state == (DirectState.DIRECT, Path.DIRECT)
+    assert module.state == ("direct", END)
 
 
 async def test_only_so_many_requests_wait_for_a_peer(module: Module) -> None:
@@ -192,15 +229,15 @@ async def test_only_so_many_requests_wait_for_a_peer(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     await until(lambda: module.asking == limits.DIRECT_ASKS)
     module.gate.set()
-    await until(lambda: all(route.state is DirectState.DIRECT for _, route in module.sut.routes))
+    await until(lambda: all(path.state == "direct" for path in module.sut))
     assert module.most == limits.DIRECT_ASKS
-    assert module.probed == [END], "a port is probed once"
+    assert len(module.probed) < limits.DIRECT_ASKS, "those that ask at a time share a probe"
 
 
 @pytest.mark.parametrize(
     ("value", "condition"),
     [
-        (PeerRefused("a", "this agent does not know the question 'direct.open'"), Condition.RELEASE),
+        (PeerRefused("a", "this agent does not know the question 'direct.topic'"), Condition.RELEASE),
         (PeerRefused("a", "too many questions at once"), Condition.AGENT),
         (UnreachableError("agent", "a"), Condition.AGENT),
         ({"port": 0}, Condition.RELEASE),
@@ -213,10 +250,10 @@ async def test_why_a_peer_grants_nothing_decides_whether_it_is_asked_again(
     module.value = value
     module.sut.shown(1, SOURCE)
     assert await module.ask() is None
-    decision = module.sut.routes.decision(KEY)
-    assert isinstance(decision, Unmet)
-    assert decision.condition is condition
-    assert (module.sut.routes.next_timer() is None) is decision.lasting
+    unmet = module.path.unmet
+    assert unmet is not None
+    assert unmet.condition is condition
+    assert (module.path.retry is None) is unmet.lasting
 
 
 async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module) -> None:
@@ -229,17 +266,17 @@ async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module)
     assert module.entry.direct, "the link of another peer changes nothing"
     module.sut.link_up(module.session)
     assert not module.entry.direct
-    await until(lambda: module.state == (DirectState.DIRECT, Path.DIRECT))
+    await until(lambda: module.state == ("direct", END))
     assert module.moved == []
 
 
 async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
-    assert module.sut.interruptions.get("a", *KEY[1:]) is None
+    assert module.sut.interruptions.get("a", WANT) is None
     module.sut.link_down(module.session, crashed=False)
     module.sut.hidden(1, SOURCE)
-    lasting = module.sut.interruptions.get("a", *KEY[1:])
+    lasting = module.sut.interruptions.get("a", WANT)
     assert lasting is not None
     assert (lasting.count, lasting.ended) == (1, None)
     module.sut.shown(1, SOURCE)
@@ -261,44 +298,23 @@ async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(modu
     early.set()  # it has reached the port, before the link was lost
     await asyncio.sleep(0)
     module.reachable.set()
-    await until(lambda: module.state[0] is DirectState.RELAYED)
+    await until(lambda: module.state[0] == "relayed")
 
 
 async def test_a_subscriber_that_ends_frees_its_grant(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
     module.sut.hidden(1, SOURCE)
-    assert requests.CLOSE in module.told
-    assert list(module.sut.routes) == []
-
-
-@pytest.mark.parametrize("taken_over", [True, False])
-async def test_what_a_crashed_agent_left_is_taken_over_or_ended(
-    module: Module, monkeypatch: pytest.MonkeyPatch, *, taken_over: bool
-) -> None:
-    monkeypatch.setattr(limits, "DIRECT_ADOPT", 0.05)
-    module.sut.shown(1, SOURCE)
-    assert await module.ask() == DIRECT
-    module.connected = [SimpleNamespace(local_port=40_000)]
-    module.sut.link_down(module.session, crashed=True)
-    module.sut.gone(module.session, hang_up=False)
-    if taken_over:
-        module.sut.shown(1, SOURCE)
-        reply = await module.ask()
-        assert reply is not None
-        assert reply.code == 0, "it stays connected"
-        assert module.sut._strays == {}
-        assert module.connected
-    else:
-        await until(lambda: not module.connected)
+    assert "direct.topic_release" in module.told
+    assert list(module.sut) == []
 
 
 async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_connection_before(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
-    module.connected = [SimpleNamespace(local_port=40_000)]
+    module.connected = [LINK]
     module.sut.link_down(module.session, crashed=True)
-    module.sut.gone(module.session, hang_up=False)
+    module.sut.gone(module.session)
     module.value = {"why": "listening", "text": "loopback"}
     module.sut.shown(1, SOURCE)
     assert await module.ask() is None

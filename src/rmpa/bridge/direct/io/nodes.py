@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -17,11 +16,9 @@ from rmpa.runtime.tcp_connections import connections, end_connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from rmpa.core.counters import Counters
     from rmpa.ros.wire.bus import BusLink
     from rmpa.runtime.tcp_connections import TcpConnection
 
-_log = logging.getLogger(__name__)
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
 _STANDING: Final = frozenset({"ESTABLISHED", "SYN_SENT", "CLOSE_WAIT"})
@@ -170,10 +167,3 @@ def end_these(found: list[TcpConnection] | None) -> str:
     except OSError as error:
         return error.strerror or str(error)
     return ""
-
-
-def report_failure(task: asyncio.Task[None], counters: Counters) -> None:
-    """Log and count the exception of a task that has ended, if there is one."""
-    if not task.cancelled() and (error := task.exception()) is not None:
-        counters.add("direct.failed")
-        _log.error("! %s failed", task.get_name(), exc_info=error)

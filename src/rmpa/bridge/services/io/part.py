@@ -175,7 +175,6 @@ class Services(Part):
             sessions,
             rpc,
             proxy_uri=self._proxy_uri,
-            on_lost=lambda peer, service, problem: self._act(self.imports.lost(peer, service, problem)),
             on_warning=self._driver.warn,
             counters=counters,
             gate=gate,
@@ -256,6 +255,7 @@ class Services(Part):
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
             self._want(shown)
         self.direct_imports.link_up(session)
+        self.direct_exports.link_up(session)
         self._driver.schedule()
 
     def link_down(self, session: PeerSession) -> None:
@@ -268,16 +268,16 @@ class Services(Part):
 
     def grace_over(self, session: PeerSession) -> bool:
         """Remove the peer's services; if its agent has crashed, those that are called directly stay for a time."""
-        adrift = self.direct_imports.adrift(session.peer)
-        if not adrift:
+        called = self.direct_imports.called(session.peer)
+        if not called:
             self._act(self.imports.gone(session.peer))
             return False
-        self._act(self.imports.keep(session.peer, adrift))
+        self._act(self.imports.keep(session.peer, called))
         return True
 
     def outlasted(self, session: PeerSession, seconds: float) -> float | None:
         """Remove services that were kept for direct calls; return until when they stay."""
-        if seconds < limits.DIRECT_KEEP and self.direct_imports.adrift(session.peer):
+        if seconds < limits.DIRECT_KEEP and self.direct_imports.called(session.peer):
             return limits.DIRECT_KEEP
         self._act(self.imports.gone(session.peer))
         return None
@@ -285,6 +285,7 @@ class Services(Part):
     def gone(self, session: PeerSession) -> None:
         """Remove the peer's services, and what else is known of the peer."""
         self.direct_imports.gone(session)
+        self.direct_exports.gone(session)
         self._act(self.imports.gone(session.peer))
         self._act(self.imports.unlinked(session.peer))
         self._budgets.pop(session.peer, None)
@@ -331,8 +332,7 @@ class Services(Part):
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        granted = (key.peer == session.peer and each.grant for key, each in self.direct_imports.services)
-        return self._driver.waits(session) or any(granted)
+        return self._driver.waits(session) or bool(self.direct_imports.called(session.peer))
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
@@ -405,9 +405,10 @@ class Services(Part):
                 self._ended(action)
             case ForgetAbout():
                 shown = self._shown.get((action.peer, action.service))
-                if shown is not None and shown.endpoint is not None:
-                    shown.endpoint.description = None
-                self.direct_imports.renewed(action.peer, action.service)
+                if shown is not None:
+                    if shown.endpoint is not None:
+                        shown.endpoint.description = None
+                    self.direct_imports.renewed(action.peer, action.service, shown.node)
 
     # --- peers' services here ----------------------------------------------------------------------------------
 
@@ -466,7 +467,8 @@ class Services(Part):
         if shown is None:
             return
         remote = self.imports.get(action.peer, action.service)
-        self.direct_imports.hidden(action.peer, action.service, end=remote is not None and remote.denied)
+        denied = remote is not None and remote.denied
+        self.direct_imports.hidden(action.peer, action.service, action.node, end=denied)
         proxy = shown.proxy
         text = f"service [{shown.service}] of {shown.peer_name}: {action.reason}"
         self._fail_waiting(shown, text)

@@ -1,46 +1,35 @@
-"""The subscriber's side of direct transport for topics: answers, moves and watches the subscribers of this module."""
+"""The subscriber's side of direct transport for topics: answers, moves and watches the subscribers of this module.
+
+TCPROS has no way to redirect a connection. A subscriber is made to leave: roscpp by a list of publishers without the
+proxy, rospy by ending its connection. Then it is called back by a list with the proxy, and gets the other answer.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import logging
+import math
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct import requests
-from rmpa.bridge.direct.conditions import (
-    NO_LINK,
-    Condition,
-    Grant,
-    Unmet,
-    read_reply,
-    read_unmet,
-    unmet_by_contract,
-    unmet_by_trust,
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, unmet_by_contract, unmet_by_trust
+from rmpa.bridge.direct.io.nodes import (
+    bus_links,
+    direct_links,
+    end_links,
+    forgotten,
+    kernel_tells,
+    publisher_update,
+    standing,
+    standing_at,
 )
-from rmpa.bridge.direct.direct_route import (
-    Ask,
-    Decided,
-    DirectKey,
-    Fallback,
-    HangUp,
-    Interruptions,
-    Move,
-    Path,
-    ProbeNode,
-    Release,
-)
-from rmpa.bridge.direct.io.nodes import direct_links, end_links, kernel_tells, report_failure, standing, standing_at
-from rmpa.bridge.direct.requests import CloseDirect, OpenDirect
-from rmpa.bridge.direct.subscriber_side import DirectSubscriptions
+from rmpa.bridge.direct.paths import Interruptions, Path, Paths
+from rmpa.bridge.direct.requests import Want
+from rmpa.bridge.messages import Source
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
 from rmpa.bridge.topics.audience import compares_names
-from rmpa.bridge.topics.io.direct_moves import SubscriberMoves
 from rmpa.core.contract import Transport
-from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.http.client import is_own_name
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
@@ -48,13 +37,10 @@ from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.node.probe import probe
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.xmlrpc import RosReply
-from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.direct.direct_route import DirectAction
-    from rmpa.bridge.messages import Source
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.session.peer_sessions import PeerSessions
@@ -66,12 +52,14 @@ if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
 
-_log = logging.getLogger(__name__)
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
+_TWICE: Final = Unmet(
+    Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
+)
 
 
-class DirectImporter:
+class DirectImporter(Paths):
     """Direct connections of local subscribers to nodes of peers.
 
     Args:
@@ -81,11 +69,12 @@ class DirectImporter:
         contracts: The contracts of this module; replaced by ``reload``.
         sessions: The peers.
         rpc: Carries the requests.
-        on_demand: ``(peer, source, wanted)``: opens the relayed route of a source, or lets it close.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
         counters: Count ``direct.moved`` and others.
         gate: Whether the mesh is secured.
     """
+
+    kind = "topic"
 
     def __init__(
         self,
@@ -96,67 +85,34 @@ class DirectImporter:
         sessions: PeerSessions,
         rpc: PeerRpc,
         *,
-        on_demand: Callable[[int, Source, bool], None],
         on_warning: Callable[[str, str, str], None],
         counters: Counters,
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
-        self._gate = gate
+        super().__init__(sessions, rpc, on_warning, counters, gate)
+        own = Needs((), "the peer's own topics that come directly")
+        rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._core = core
         self._imports = imports
         self._topics = topics
         self._contracts = contracts
-        self._sessions = sessions
-        self._rpc = rpc
-        self._on_warning = on_warning
-        self._counters = counters
-        self.routes = DirectSubscriptions(self._is_latched, self._is_relayed)
-        """The state of each subscriber."""
         self.interruptions = Interruptions()
         """When subscribers were without their path."""
-        self._timer = MachineTimer(self.routes.next_timer, lambda now: self._act(self.routes.handle_timer(now)))
-        self._waiting: dict[DirectKey, list[asyncio.Future[None]]] = {}
-        self._moves = SubscriberMoves(
-            core,
-            imports,
-            topics,
-            sessions,
-            self.routes,
-            on_demand=on_demand,
-            on_left=self._interrupted,
-            on_warning=on_warning,
-            counters=counters,
-        )
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._adrift: dict[int, list[RemoteTopic]] = {}
-        """The sources of each peer that are kept because of direct subscribers while its agent is gone."""
-        self._strays: dict[tuple[Source, str], tuple[str, int]] = {}
-        """Direct connections that a crashed agent left, by source and subscriber: the publisher's endpoint."""
-        self._asking: dict[int, asyncio.Semaphore] = {}
         self._checking: asyncio.TimerHandle | None = None
-        self._closed = False
         self._kernel_tells = kernel_tells()
+        self._left: set[str] = set()
+        """The names of modules to which direct connections were left when their agents crashed."""
         self._started = self._now()
         """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
-        own = Needs((), "the peer's own topics that come directly")
-        rpc.on_notification(requests.CLOSED, self._closed_there, own)
-        rpc.on_notification(requests.RETRY, self._retry, own)
-
-    @staticmethod
-    def _now() -> float:
-        return asyncio.get_running_loop().time()
 
     # --- the local graph --------------------------------------------------------------------------------------------
 
     def reload(self, contracts: Contracts) -> None:
         """Take new contracts, and judge every subscriber again."""
         self._contracts = contracts
-        self.judge_all()
-
-    def judge_all(self) -> None:
-        """Judge the subscribers of every remote source."""
         for topic in {entry.topic for _, _, entry in self._imports}:
-            self._judge(topic)
+            for peer, source in list(self._imports.at(topic)):
+                self.shown(peer, source)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Judge a local subscriber that came, or forget one that went."""
@@ -165,43 +121,34 @@ class DirectImporter:
         for peer, source in list(self._imports.at(change.name)):
             if change.added:
                 self._consider(peer, source, change.node, change.api)
-            else:
-                # It ends its connections itself; it may subscribe again while a call from here is on its way.
-                self._act(self.routes.remove(DirectKey(peer, source, change.node), hang_up=False))
+            elif (path := self.get(peer, Want(source.topic, source.node, change.node))) is not None:
+                self.forget(path)  # it ends its connections itself
 
     def shown(self, peer: int, source: Source) -> None:
-        """Judge the subscribers of a source that appears in the local graph."""
+        """Judge the subscribers of a source that appears in the local graph, or to which other rules apply."""
         entry = self._imports.get(peer, source)
         if entry is not None:
             for node, uri in self._core.subscribers(entry.topic).items():
                 self._consider(peer, source, node, uri)
 
-    def hidden(self, peer: int, source: Source, *, hang_up: bool = True) -> None:
-        """Forget the subscribers of a source that leaves the local graph.
-
-        Args:
-            peer: The peer.
-            source: The source.
-            hang_up: End their direct connections.
-        """
-        for name, _ in self.routes.of(peer, source):
-            self._act(self.routes.remove(DirectKey(peer, source, name), hang_up=hang_up))
-
-    def _judge(self, topic: str) -> None:
-        subscribers = self._core.subscribers(topic)
-        for peer, source in list(self._imports.at(topic)):
-            for node, uri in subscribers.items():
-                self._consider(peer, source, node, uri)
+    def hidden(self, peer: int, source: Source) -> None:
+        """Forget the subscribers of a source that leaves the local graph, and end their direct connections."""
+        for path in self.of(peer, source.topic, source.node):
+            self.forget(path)
+            self._hang_up(path)
 
     def _consider(self, peer: int, source: Source, node: str, uri: str) -> None:
         session, entry = self._sessions.get(peer), self._imports.get(peer, source)
         if session is None or entry is None or not entry.shown or is_own(node):
             return
-        key, contract = DirectKey(peer, source, node), self._contracts.of(entry.topic, entry.type)
-        if contract.transport is Transport.RELAY and self.routes.get(key) is None:
+        want, contract = Want(source.topic, source.node, node), self._contracts.of(entry.topic, entry.type)
+        before = self.get(peer, want)
+        if contract.transport is Transport.RELAY and before is None:
             return  # nothing is kept of topics that are relayed by rule
         unmet = self._unmet(session, source, entry, node, uri)
-        self._act(self.routes.consider(key, contract.transport, unmet, self._now()))
+        self.judge(peer, want, contract.transport, unmet, contract)
+        if before is None and (path := self.get(peer, want)) is not None:
+            path.answered = self._is_relayed(path)  # until now it was relayed by rule
 
     def _unmet(self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str) -> Unmet | None:
         unmet = unmet_by_contract(self._contracts.of(entry.topic, entry.type), "this module")
@@ -226,349 +173,294 @@ class DirectImporter:
             return Unmet(Condition.SUBSCRIBER, text)
         return None
 
-    def _is_latched(self, key: DirectKey) -> bool:
-        entry = self._imports.get(key.peer, key.source)
-        return entry is not None and entry.description is not None and entry.description.latching
+    def _unmet_now(self, path: Path) -> Unmet | None:
+        """A latched source that is relayed to a subscriber stays so until it subscribes again."""
+        entry = self._imports.get(path.peer, self._source(path))
+        latched = entry is not None and entry.description is not None and entry.description.latching
+        return _TWICE if latched and self._is_relayed(path) else None
 
-    def _is_relayed(self, key: DirectKey) -> bool:
-        publication = self._publication(key.peer, key.source)
-        return publication is not None and key.subscriber in publication.callers
+    @staticmethod
+    def _source(path: Path) -> Source:
+        return Source(path.want.name, path.want.node)
+
+    def _is_relayed(self, path: Path) -> bool:
+        publication = self._publication(path)
+        return publication is not None and path.want.user in publication.callers
+
+    def _publication(self, path: Path) -> Publication | None:
+        topics = self._topics.get(path.peer)
+        return topics.publication(self._source(path)) if topics is not None else None
+
+    def _uri(self, path: Path) -> str:
+        """The slave API of a path's subscriber; empty if it is not registered."""
+        return self._core.subscribers(path.want.name).get(path.want.user, "")
+
+    def _proxy_uri(self, path: Path) -> str:
+        session = self._sessions.get(path.peer)
+        proxy = session.proxies.get(path.want.node) if session is not None else None
+        return proxy.uri if proxy is not None else ""
 
     # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
-        key = DirectKey(peer, source, subscriber)
-        if self.routes.get(key) is None and not self._is_new and not self._moves.is_stuck(key):
-            return None
-        return self._answer(key)
+        want = Want(source.topic, source.node, subscriber)
+        path, session = self.get(peer, want), self._sessions.get(peer)
+        if path is None:
+            left = session is not None and session.link.name in self._left
+            if not left and self._now() >= self._started + limits.DIRECT_ADOPT:
+                return None
+            path = Path(peer, want, Transport.RELAY, found=Unmet(Condition.TRANSPORT, ""))
+            path.decided.set()
+        return self._answer(path)
 
-    @property
-    def _is_new(self) -> bool:
-        """Whether subscribers may still have direct connections of an earlier run of this agent."""
-        return self._now() < self._started + limits.DIRECT_ADOPT
+    async def _answer(self, path: Path) -> RosReply | None:
+        await self.decision(path)
+        direct = self.target(path) if path.decided.is_set() else None
+        stays, problem = await self._end_earlier(path, direct)
+        if stays is not None:
+            path.stuck = problem
+            self._answered(path, stays)
+            return RosReply(0, "connected to the publisher already", [])
+        if direct is None or self.target(path) != direct:
+            direct = None  # it is moved if it is direct by now
+        self._answered(path, direct)
+        return RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, *direct]) if direct is not None else None
 
-    async def _answer(self, key: DirectKey) -> RosReply | None:
-        if self.routes.decision(key) is None:
-            await self._decision(key)
-        entry, topic = self._imports.get(key.peer, key.source), key.source.topic
-        uri = self._moves.uri(key.subscriber, topic)
-        stray = self._strays.get((key.source, key.subscriber))
-        session = self._sessions.get(key.peer)
-        decision = self.routes.decision(key)
-        direct = (session.address, decision.port) if session is not None and isinstance(decision, Grant) else None
-        for endpoint in dict.fromkeys(one for one in (stray, self._endpoint(key), direct) if one is not None):
-            # A connection from an earlier answer, or an earlier run of an agent: a second one would double messages.
-            if not uri or not standing(endpoint) or not (links := await direct_links(uri, topic, endpoint)):
+    def _answered(self, path: Path, endpoint: tuple[str, int] | None) -> None:
+        path.answered, path.answered_at, path.endpoint, path.stranded = True, self._now(), endpoint, None
+        self._has_path(path)
+        self._place(path)
+        self._watch()
+
+    async def _end_earlier(self, path: Path, direct: tuple[str, int] | None) -> tuple[tuple[str, int] | None, str]:
+        """Ends connections of a subscriber to a peer's nodes from an earlier answer, or an earlier run of an agent.
+
+        A second connection would double messages.
+
+        Returns:
+            The other end of one that stays; and why, if it cannot be ended.
+        """
+        session, uri, topic = self._sessions.get(path.peer), self._uri(path), path.want.name
+        if session is None or not uri or not standing_at(session.address):
+            return None, ""
+        own = self._proxy_uri(path)
+        others = {one for one in self._core.publishers(topic).values() if one != own}
+        known = {one.endpoint for one in self if one is not path and one.want.user == path.want.user}
+        for link in await bus_links(uri) or ():
+            end = link.remote
+            if not (link.inbound and link.topic == topic and link.connected) or link.other in others or end is None:
                 continue
-            if endpoint == direct and self.routes.decision(key) == decision:
-                _log.info("= %s: %s is connected directly already", key.source, key.subscriber)
-                return self._answered(key, direct, RosReply(0, "connected to the publisher already", []))
-            if problem := await end_links(endpoint, links):
-                self._act(self.routes.answered(key, endpoint, self._now()))
-                self._moves.stuck(key, endpoint, problem)
-                return RosReply(0, "connected to the publisher directly still", [])
-        if direct is None and entry is not None and session is not None:
-            left = await self._left_by_others(key, entry.topic, session.address)
-            if left is not None:
-                return left
-        if self.routes.decision(key) != decision or direct is None:
-            return self._answered(key, None, None)  # it is moved if it is direct by now
-        reply = RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, direct[0], direct[1]])
-        return self._answered(key, direct, reply)
+            if end[0] != session.address or end in known or self._is_own_port(path, end):
+                continue
+            if link.local_port not in standing(end):
+                continue
+            if end == direct:
+                return end, ""
+            if problem := await end_links(end, [link]):
+                self._warn_stuck(path, end, problem)
+                return end, problem
+        return None, ""
 
-    async def _left_by_others(self, key: DirectKey, topic: str, address: str) -> RosReply | None:
-        """Ends direct connections that no present decision knows of; the answer to give if one cannot be ended."""
-        if not self._is_new and not self._moves.is_stuck(key):
-            return None
-        endpoint, problem = await self._moves.end_unknown(key, topic, address)
-        if endpoint is None:
-            return None
-        self._act(self.routes.answered(key, endpoint, self._now()))
-        if (route := self.routes.get(key)) is not None:
-            route.stuck = problem
-        self._watch()
-        return RosReply(0, f"connected to {endpoint[0]}:{endpoint[1]} still", [])
-
-    def _endpoint(self, key: DirectKey) -> tuple[str, int] | None:
-        """Where a subscriber was connected directly by its last answer."""
-        route = self.routes.get(key)
-        return route.endpoint if route is not None and route.path is Path.DIRECT else None
-
-    def _answered(self, key: DirectKey, endpoint: tuple[str, int] | None, reply: RosReply | None) -> RosReply | None:
-        self._strays.pop((key.source, key.subscriber), None)
-        self._has_path(key)
-        self._act(self.routes.answered(key, endpoint, self._now()))
-        self._watch()
-        return reply
-
-    async def _decision(self, key: DirectKey) -> None:
-        """Waits for the decision about a subscriber, at most ``limits.DIRECT_HOLD``."""
-        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(key, []).append(future)
-        try:
-            async with asyncio.timeout(limits.DIRECT_HOLD):
-                await future
-        except TimeoutError:
-            self._counters.add("direct.undecided")
-        finally:
-            waiting = self._waiting.get(key, [])
-            if future in waiting:
-                waiting.remove(future)
-            if not waiting:
-                self._waiting.pop(key, None)
+    def _is_own_port(self, path: Path, end: tuple[str, int]) -> bool:
+        """Whether a connection leads to the proxy, on this machine."""
+        session = self._sessions.get(path.peer)
+        proxy = session.proxies.get(path.want.node) if session is not None else None
+        address = proxy.address_of(path.want.name) if proxy is not None else None
+        return address is not None and address[1] == end[1]
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
-        routes = self.routes.of(peer, source)
-        if not routes:
-            return
-        publication = self._publication(peer, source)
-        there = publication.callers if publication is not None else frozenset()
-        for name, _ in routes:
-            key = DirectKey(peer, source, name)
-            if key in self._moves:
-                continue
-            if name not in there:
-                self._act(self.routes.left(key, self._now()))
-            else:
-                self._has_path(key)
-                self._act(self.routes.arrived(key, self._now()))
+        for path in self.of(peer, source.topic, source.node):
+            if self._is_relayed(path):
+                if not path.answered:
+                    self._answered(path, None)
+            elif path.answered and path.endpoint is None:
+                path.answered = False
+                if path.unmet is _TWICE:
+                    self._start(path)
 
-    def _interrupted(self, key: DirectKey) -> None:
-        if (session := self._sessions.get(key.peer)) is not None:
-            self.interruptions.begin(session.link.name, key.source, key.subscriber, self._now())
+    def _interrupted(self, path: Path) -> None:
+        if (session := self._sessions.get(path.peer)) is not None:
+            self.interruptions.begin(session.link.name, path.want, self._now())
 
-    def _has_path(self, key: DirectKey) -> None:
-        if (session := self._sessions.get(key.peer)) is not None:
-            self.interruptions.end(session.link.name, key.source, key.subscriber, self._now())
+    def _has_path(self, path: Path) -> None:
+        if (session := self._sessions.get(path.peer)) is not None:
+            self.interruptions.end(session.link.name, path.want, self._now())
 
     # --- links ------------------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
-        """Ask again for the subscribers of a peer that was without a link."""
-        for key, route in self.routes.connected():
-            if key.peer == session.peer and route.endpoint is not None and route.endpoint[0] != session.address:
-                self._act([Move(key)])  # the peer has another address now
-        for entry in self._adrift.pop(session.peer, ()):
-            entry.direct = False
-        self._act(self.routes.link_up(session.peer, self._now()))
+        """As of ``Paths``."""
+        for peer, _, entry in self._imports:
+            if peer == session.peer:
+                entry.direct = False
+        super().link_up(session)
 
     def link_down(self, session: PeerSession, *, crashed: bool) -> None:
-        """End direct connections to a peer that cannot be reached; unless only its agent has died."""
-        for key, _ in self.routes.connected() if not crashed else ():
-            if key.peer == session.peer:
-                self._interrupted(key)
-        self._act(self.routes.link_down(session.peer, self._now(), crashed=crashed))
-        for _, source in {(key.peer, key.source) for key, _ in self.routes if key.peer == session.peer}:
-            entry = self._imports.get(session.peer, source)
-            direct = any(route.path is Path.DIRECT for _, route in self.routes.of(session.peer, source))
-            if entry is not None and direct:
-                entry.direct = True  # they were made to hang up above unless only the agent has died
-                self._adrift.setdefault(session.peer, []).append(entry)
+        """As of ``Paths``; sources with direct subscribers stay in the graph if only the peer's agent has died."""
+        for path in self._direct(session):
+            entry = self._imports.get(path.peer, self._source(path))
+            if crashed and entry is not None:
+                entry.direct = True
+            elif not crashed:
+                self._interrupted(path)
+        super().link_down(session, crashed=crashed)
 
-    def gone(self, session: PeerSession, *, hang_up: bool) -> None:
-        """Forget every subscriber of a peer.
+    def gone(self, session: PeerSession) -> None:
+        """As of ``Paths``; what is direct goes on if only the peer's agent has died."""
+        direct = self._direct(session)
+        if direct and session.link.crashed:
+            self._left.add(session.link.name)
+        super().gone(session)
+        for path in direct if not session.link.crashed else ():
+            self._hang_up(path)
 
-        Args:
-            session: The peer.
-            hang_up: End their connections, rather than leave them to the peer's next agent.
-        """
-        left: dict[tuple[Source, str], tuple[str, int]] = {}
-        for key, route in self.routes:
-            if key.peer == session.peer:
-                if not hang_up and route.path is Path.DIRECT and route.endpoint is not None:
-                    left[key.source, key.subscriber] = route.endpoint
-                self._act(self.routes.remove(key, hang_up=hang_up))
-        self._adrift.pop(session.peer, None)
-        self._asking.pop(session.peer, None)
-        if left and not self._closed:
-            self._strays |= left
-            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._end_strays, left)
+    def _direct(self, session: PeerSession) -> list[Path]:
+        return [path for path in self if path.peer == session.peer and path.endpoint is not None]
 
-    def _end_strays(self, left: Mapping[tuple[Source, str], tuple[str, int]]) -> None:
-        """Ends direct connections from before a crash of the peer's agent that its next run has not taken over."""
-        for (source, subscriber), endpoint in left.items():
-            if not self._closed and self._strays.get((source, subscriber)) == endpoint:
-                del self._strays[source, subscriber]
-                self._start(self._end_stray(source.topic, subscriber, endpoint), f"end {subscriber}'s connection")
-
-    async def _end_stray(self, topic: str, subscriber: str, endpoint: tuple[str, int]) -> None:
-        uri = self._moves.uri(subscriber, topic)
-        links = await direct_links(uri, topic, endpoint) if uri and standing(endpoint) else None
-        await end_links(endpoint, links or ())
-
-    # --- the peer ---------------------------------------------------------------------------------------------------
-
-    def _closed_there(self, session: PeerSession, args: dict[str, Any]) -> None:
-        told = requests.read_closed(args)
-        unmet = read_unmet(told.why, told.text)
-        self._act(self.routes.closed(session.peer, told.source, told.subscriber, unmet, self._now()))
-
-    def _retry(self, session: PeerSession, args: dict[str, Any]) -> None:
-        self._act(self.routes.retry(session.peer, requests.read_retry(args).source, self._now()))
-
-    async def _ask(self, key: DirectKey, attempt: int) -> None:
-        try:
-            await self._ask_peer(key, attempt)
-        except Exception:
-            self._act(self.routes.replied(key, attempt, Unmet(Condition.AGENT, "this agent failed"), self._now()))
-            raise
-
-    async def _ask_peer(self, key: DirectKey, attempt: int) -> None:
-        session, entry = self._sessions.get(key.peer), self._imports.get(key.peer, key.source)
-        found: Grant | Unmet
-        if session is None or not session.reachable or entry is None:
-            found = NO_LINK
-        else:
-            limit = self._asking.setdefault(key.peer, asyncio.Semaphore(limits.DIRECT_ASKS))
-            async with limit:
-                route = self.routes.get(key)
-                if route is None or route.attempt != attempt:
-                    return  # no request has been sent for this attempt
-                found = await self._request(session, key, entry)
-        self._act(self.routes.replied(key, attempt, found, self._now()))
-
-    async def _request(self, session: PeerSession, key: DirectKey, entry: RemoteTopic) -> Grant | Unmet:
-        contract = self._contracts.of(entry.topic, entry.type)
-        asked = OpenDirect(key.source.topic, key.source.node, key.subscriber, contract)
-        try:
-            value = await self._rpc.request(session, requests.OPEN, requests.write(asked), limits.DIRECT_ASK_TIMEOUT)
-            return read_reply(value, key.source.node)
-        except PeerRefused as error:
-            older = UNKNOWN_QUESTION in error.reason
-            return Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
-        except RemoteProtocolError as error:
-            return Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
-        except RmpaError as error:
-            return Unmet(Condition.AGENT, str(error))
-
-    async def _probe(self, peer: int, grant: Grant) -> None:
-        session = self._sessions.get(peer)
-        if session is None:
-            return
-        address, link = session.address, session.link
-        try:
-            timeout = limits.DIRECT_PROBE_TIMEOUT
-            problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=timeout)
-        except Exception:
-            self._act(self.routes.probed(peer, grant.port, "this agent failed", self._now()))
-            raise
-        if problem:
-            problem = f"no connection to {address}:{grant.port}: {problem}"
-        if session.link is not link:
-            return  # the next link has probes of its own
-        self._act(self.routes.probed(peer, grant.port, problem, self._now()))
+    def _hang_up(self, path: Path) -> None:
+        """Makes a subscriber leave its direct connection; it is not called back."""
+        if path.endpoint is not None and not self._closed:
+            self._counters.add("direct.hung_up")
+            self._spawn(self._leave(path, path.endpoint), f"hang up {path.want.user}")
 
     # --- carrying out -----------------------------------------------------------------------------------------------
 
-    def _act(self, actions: Iterable[DirectAction]) -> None:
-        if self._closed:
-            return
-        for action in actions:
-            match action:
-                case Ask(key, attempt):
-                    self._start(self._ask(key, attempt), f"ask for {key.source}")
-                case ProbeNode(peer, grant):
-                    self._start(self._probe(peer, grant), f"probe {grant.node}")
-                case Decided(key):
-                    self._decided(key)
-                case Move(key):
-                    self._moves.move(key)
-                case HangUp(key, endpoint):
-                    self._counters.add("direct.hung_up")
-                    self._moves.hang_up(key, endpoint)
-                case Release(key, broken):
-                    self._release(key, broken=broken)
-                case Fallback(key, unmet) if unmet.condition is not Condition.MEASURES:
-                    subject = f"{key.source} to {key.subscriber}"
-                    text = f'{subject}: relayed although transport is "direct": {unmet.text}'
-                    self._on_warning("direct.relayed", f"{key.peer} {subject} {unmet.condition}", text)
-        self._timer.arm()
+    async def _probe(self, session: PeerSession, path: Path, grant: Grant) -> str:  # noqa: ARG002 - of topics all alike
+        timeout = limits.DIRECT_PROBE_TIMEOUT
+        problem = await probe(session.address, grant.port, grant.probe, node=grant.node, timeout=timeout)
+        return f"no connection to {session.address}:{grant.port}: {problem}" if problem else ""
 
-    def _decided(self, key: DirectKey) -> None:
-        for future in self._waiting.pop(key, ()):
-            if not future.done():
-                future.set_result(None)
+    def _subject(self, path: Path) -> str:
+        return f"{self._source(path)} to {path.want.user}"
+
+    def _decided(self, path: Path) -> None:
+        if path.endpoint == self.target(path):
+            path.stuck = ""
+            if path.endpoint is not None:
+                self._has_path(path)
+        self._place(path)
         self._watch()
 
-    def _release(self, key: DirectKey, *, broken: bool) -> None:
-        session = self._sessions.get(key.peer)
-        if session is not None and session.linked:
-            closed = CloseDirect(key.source.topic, key.source.node, key.subscriber, broken)
-            self._rpc.notify(session, requests.CLOSE, requests.write(closed))
+    def _is_misplaced(self, path: Path) -> bool:
+        """Whether a subscriber has another connection than was decided, or waits for being called back."""
+        if not path.decided.is_set() or self.get(path.peer, path.want) is not path:
+            return False
+        if path.stranded is not None:
+            return self._now() - path.stranded > limits.DIRECT_SETTLE
+        return path.answered and path.endpoint != self.target(path)
 
-    def _start(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
-        task = asyncio.create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._ended)
-        return task
+    def _place(self, path: Path) -> None:
+        if path.mover is None and not self._closed and self._is_misplaced(path):
+            path.mover = self._spawn(self._move(path), f"move {path.want.user}")
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        report_failure(task, self._counters)
+    async def _move(self, path: Path) -> None:
+        """Makes a subscriber leave its connection, and calls it back to get the answer that was decided."""
+        try:
+            while self._is_misplaced(path) and await self._renew(path):
+                self._counters.add("direct.moved")
+        finally:
+            path.mover = None
+
+    async def _renew(self, path: Path) -> bool:
+        """Ends the present connection of a subscriber, and calls it back; return whether that was done."""
+        uri, proxy, publication = self._uri(path), self._proxy_uri(path), self._publication(path)
+        if not uri or not proxy or publication is None:
+            return False
+        if path.endpoint is not None:
+            if not await self._leave(path, path.endpoint):
+                return False
+        else:
+            stays, problem = await self._end_earlier(path, self.target(path))
+            if stays is not None:
+                path.stuck = problem
+                self._answered(path, stays)
+                return False
+            await self._list(path, without=proxy)
+            publication.hang_up(path.want.user)
+        await forgotten(uri, path.want.name, proxy)
+        path.answered, path.endpoint, path.stranded, path.stuck = False, None, self._now(), ""
+        self._interrupted(path)
+        await self._list(path)
+        asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
+        return True
+
+    async def _leave(self, path: Path, endpoint: tuple[str, int]) -> bool:
+        """Ends the direct connection of a subscriber; return whether it has none any more."""
+        uri, topic = self._uri(path), path.want.name
+        links = await direct_links(uri, topic, endpoint) if uri else None
+        if links is None and standing(endpoint):
+            return False  # the node is stopped: ``_check`` tries again
+        await self._list(path, without=self._proxy_uri(path))
+        if problem := await end_links(endpoint, links or ()):
+            if endpoint != self.target(path):  # it may be allowed again meanwhile
+                path.stuck = problem
+                self._warn_stuck(path, endpoint, problem)
+            return False
+        return True
+
+    async def _list(self, path: Path, *, without: str = "") -> None:
+        """Tells a subscriber the publishers of its topic, as its master does."""
+        uri, topic = self._uri(path), path.want.name
+        if uri:
+            await publisher_update(
+                uri, topic, [one for one in self._core.publishers(topic).values() if one != without]
+            )
+
+    def _list_again(self, path: Path) -> None:
+        """Repeats the list of publishers: a roscore's graph is known here with a delay, and calls may be lost."""
+        if not self._closed and path.mover is None:
+            self._spawn(self._list(path), f"call back {path.want.user}")
+
+    def _warn_stuck(self, path: Path, endpoint: tuple[str, int], problem: str) -> None:
+        source, user = self._source(path), path.want.user
+        text = (
+            f"{source}: {user} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves only when "
+            f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
+        )
+        self._on_warning("direct.stuck", f"{path.peer} {source} {user}", text)
+
+    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _watch(self) -> None:
         """Begins to watch direct connections."""
-        if self._checking is None and (self.routes.connected() or any(route.stranded for _, route in self.routes)):
+        watched = any(path.endpoint is not None or path.stranded is not None for path in self)
+        if self._checking is None and not self._closed and watched:
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
-
-    def _publication(self, peer: int, source: Source) -> Publication | None:
-        topics = self._topics.get(peer)
-        return topics.publication(source) if topics is not None else None
-
-    # --- watching direct connections --------------------------------------------------------------------------------
 
     def _check(self) -> None:
         """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
         self._checking = None
-        now, connected = self._now(), self.routes.connected()
-        stranded = self.routes.waiting(now)
-        if self._closed or not (connected or stranded):
-            return
-        self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
-        for key in stranded:
-            self._moves.move(key)  # its call-back was lost
-        settled = [
-            (key, route.endpoint)
-            for key, route in connected
-            if route.endpoint is not None
-            and now - route.answered_at > limits.DIRECT_SETTLE
-            and key not in self._moves
-        ]
+        self._watch()
+        settled: list[tuple[Path, tuple[str, int]]] = []
+        for path in self:
+            if not path.stuck:
+                self._place(path)
+            is_settled = path.mover is None and self._now() - path.answered_at > limits.DIRECT_SETTLE
+            if path.endpoint is not None and is_settled:
+                settled.append((path, path.endpoint))
         wanted = Counter(endpoint for _, endpoint in settled)
         there = {address: standing_at(address) for address in {endpoint[0] for endpoint in wanted}}
         short = {end for end, count in wanted.items() if len(there[end[0]].get(end[1], ())) < count}
-        for key, endpoint in settled:
-            route = self.routes.get(key)
-            if route is not None and not route.stuck and self.routes.misplaced(key):
-                self._moves.move(key)
-            elif endpoint in short:
-                self._start(self._check_one(key, endpoint), f"check {key.subscriber}")
+        for path, endpoint in settled:
+            if endpoint in short:
+                self._spawn(self._check_one(path, endpoint), f"check {path.want.user}")
 
-    async def _check_one(self, key: DirectKey, endpoint: tuple[str, int]) -> None:
-        entry = self._imports.get(key.peer, key.source)
-        uri = self._moves.uri(key.subscriber, entry.topic) if entry is not None else ""
-        if entry is None or not uri:
-            return
-        links = await direct_links(uri, entry.topic, endpoint)
-        route = self.routes.get(key)
-        if links or route is None or route.endpoint != endpoint:
+    async def _check_one(self, path: Path, endpoint: tuple[str, int]) -> None:
+        uri = self._uri(path)
+        links = await direct_links(uri, path.want.name, endpoint) if uri else []
+        if not uri or links or path.endpoint != endpoint or self.get(path.peer, path.want) is not path:
             return
         if links is None:
-            self._core.suspect(key.subscriber)
+            self._core.suspect(path.want.user)
         self._counters.add("direct.broken")
-        self._interrupted(key)
-        actions = self.routes.broken(key, self._now())
-        self._act(actions)
+        self._interrupted(path)
+        path.answered, path.endpoint, path.stranded, path.stuck = False, None, -math.inf, ""
+        self.broke(path)
 
     async def close(self) -> None:
-        """Stop everything; direct connections go on."""
-        self._closed = True
-        self._timer.close()
+        """As of ``Paths``."""
         if self._checking is not None:
             self._checking.cancel()
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, self._moves.close(), return_exceptions=True)
+        await super().close()

@@ -167,7 +167,6 @@ class Topics(Part):
             contracts,
             sessions,
             rpc,
-            on_demand=lambda peer, source, wanted: self._demand(peer, source, wanted=wanted),
             on_warning=self._driver.warn,
             counters=counters,
             gate=gate,
@@ -296,7 +295,7 @@ class Topics(Part):
     def gone(self, session: PeerSession) -> None:
         """Retracts the rest of a peer's sources."""
         peer = session.peer
-        self.direct_imports.gone(session, hang_up=not session.link.crashed)
+        self.direct_imports.gone(session)
         self.direct_exports.gone(session)
         self.outbound.gone(peer)
         topics = self._peers.pop(peer)
@@ -312,7 +311,7 @@ class Topics(Part):
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return self._driver.waits(session) or any(key.peer == session.peer for key, _ in self.direct_imports.routes)
+        return self._driver.waits(session) or any(path.peer == session.peer for path in self.direct_imports)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
@@ -430,7 +429,7 @@ class Topics(Part):
     def _settled(self) -> None:
         """Drops what belongs to sources that are gone, or that new rules keep home."""
         self._mismatches.forget_gone()
-        self.direct_exports.policy_changed()
+        self.direct_exports.judge_again(refused=False)
         self._sessions.offers.changed()
 
     # --- carrying out ------------------------------------------------------------------------------------------
