@@ -6,7 +6,6 @@ from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo, ProbesInfo
 from rmpa.observe.snapshot import (
     AgentInfo,
     DetectorInfo,
-    DirectFigures,
     EventInfo,
     FilesInfo,
     LatencyInfo,
@@ -174,8 +173,6 @@ VIEWER = SubscriberTransport(
     interruptions=2,
     interrupted=39.0,
     interrupted_ago=12.0,
-    connected=True,
-    figures=DirectFigures(messages=1801, bytes=180_100, dropped=0, rate=10.0, bandwidth=1000.0, window=3.0),
 )
 """A subscriber that is connected directly."""
 DIRECT = RouteInfo(

@@ -21,7 +21,6 @@ from rmpa.runtime.sock_diag import (
     SockDiag,
     destroy_request,
     dump_request,
-    read_carried,
     read_dump,
     read_status,
 )
@@ -70,30 +69,6 @@ def test_golden_request_for_a_dump() -> None:
     # linux/inet_diag.h: INET_DIAG_BC_D_COND, family, prefix and port (-1: any) of the condition, and the address.
     program = "1400 0100 08 10 1400 02 20 0000 ffffffff 0a580002"
     assert asked == bytes.fromhex("5c000000" + head) + rest + bytes.fromhex(program)
-
-
-@little_endian
-def test_golden_request_with_tcp_info() -> None:
-    plain, asked = (dump_request(socket.AF_INET, 1 << 1, info=info, sequence=5) for info in (False, True))
-    # struct inet_diag_req_v2: idiag_ext has the bit of INET_DIAG_INFO (2) less one.
-    assert (plain[18], asked[18]) == (0, 1 << 1)
-    assert plain[:18] + plain[19:] == asked[:18] + asked[19:]
-
-
-@little_endian
-def test_what_a_connection_has_carried_stands_in_its_tcp_info() -> None:
-    # Attributes: INET_DIAG_SHUTDOWN (8) of one byte and padding, INET_DIAG_INFO (2) with acknowledged and received.
-    counts = struct.pack("=QQ", 5_000_000_000, 7)
-    attributes = bytes.fromhex("0500 0800 00 000000") + struct.pack("=HH", 4 + 136, 2) + bytes(120) + counts
-    body = BODY + attributes
-    found: list[bytes] = []
-    message = struct.pack("=IHHII", 16 + len(body), 20, 2, 5, 0) + body
-    assert not read_dump(message + DONE, found, 5, info=True)
-    assert [InetSocket.parse(one) for one in found] == [SOCKET]
-    assert read_carried(found[0]) == (5_000_000_000, 7)
-    older = BODY + struct.pack("=HH", 4 + 104, 2) + bytes(104)
-    for without in (BODY, older, body[:-1], BODY + bytes(4), BODY + b"\1"):
-        assert read_carried(without) is None
 
 
 @little_endian
@@ -213,11 +188,11 @@ class Interrupting:
     def __init__(self, times: int) -> None:
         self.times = times
 
-    def __call__(self, data: bytes, found: list[bytes], sequence: int, *, info: bool) -> bool:
+    def __call__(self, data: bytes, found: list[bytes], sequence: int) -> bool:
         if self.times:
             self.times -= 1
             raise InterruptedDump(errno.EINTR, "changed")
-        return read_dump(data, found, sequence, info=info)
+        return read_dump(data, found, sequence)
 
 
 def test_an_interrupted_dump_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,6 @@ from rmpa.runtime.sock_diag import SockDiag
 from rmpa.runtime.tcp_connections import (
     TcpConnection,
     ask_listening_ports,
-    carried,
     connections,
     end_connections,
     listening_addresses,
@@ -128,29 +127,6 @@ def test_connections_are_found_by_either_end(stack: ExitStack) -> None:
         assert seen(remote=("127.0.0.1", impossible)) == []
     with pytest.raises(ValueError, match="is no IP address"):
         seen(remote=("localhost", None))
-
-
-def test_the_bytes_that_a_connection_has_carried(stack: ExitStack) -> None:
-    listener = listen(stack)
-    client, server = pair(stack, listener)
-    ends_of = ((client, server), (server, client))
-
-    def counts() -> list[tuple[int, int]]:
-        found = [carried(own.getsockname()[1], other.getsockname()) for own, other in ends_of]
-        # The side that dialled counts its SYN as a byte that was acknowledged.
-        return [(one[0] - turn, one[1]) for one, turn in zip(found, (1, 0), strict=True) if one is not None]
-
-    assert counts() == [(0, 0), (0, 0)]
-    client.sendall(bytes(70_000))
-    server.sendall(b"thanks")
-    deadline = time.monotonic() + DEADLINE
-    wanted = [(70_000, 6), (6, 70_000)]
-    while counts() != wanted:
-        assert time.monotonic() < deadline
-        select.select([], [], [], 0.01)
-    client.close()
-    assert carried(client.fileno(), ("127.0.0.1", 1)) is None
-    assert carried(1, server.getsockname()) is None
 
 
 def test_states_while_a_connection_closes(stack: ExitStack) -> None:

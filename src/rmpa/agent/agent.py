@@ -206,7 +206,6 @@ class Agent:
             diagnostics = Diagnostics(self.core, self.bridge, self.snapshots, self._clocks)
             diagnostics.start()
             undo.callback(diagnostics.close)
-            undo.push_async_callback(self.snapshots.sampler.close)
             loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)
             loggers.start()
             undo.callback(loggers.close)

@@ -52,7 +52,6 @@ class Master:
         topics: tuple[str, ...] | None = None,
         services: tuple[str, ...] | bool | None = None,
         peers: bool = True,
-        figures: bool = False,
     ) -> Snapshot | None:
         """The snapshot of the master's agent; ``None`` without an agent, or if it does not answer.
 
@@ -60,13 +59,10 @@ class Master:
             topics: Only these topics are in it; ``None``: all, which takes the agent longer.
             services: Only these are in it; ``True``: all; ``None``: all if all topics are in it, else none.
             peers: Whether peers are in it.
-            figures: Wait for the figures of direct connections, half a second at the first look.
         """
         if self.agent is not None:
             with contextlib.suppress(RmpaError), ControlClient(self.agent) as client:
-                return client.call(
-                    "snapshot", Snapshot, topics=topics, services=services, peers=peers, figures=figures
-                )
+                return client.call("snapshot", Snapshot, topics=topics, services=services, peers=peers)
         return None
 
 

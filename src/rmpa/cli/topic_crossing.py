@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
-from rmpa.observe.transport_text import route_texts, subscriber_text
+from rmpa.observe.transport_text import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
@@ -13,18 +13,17 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import GraphName
     from rmpa.cli.master import Master
-    from rmpa.observe.snapshot import DirectFigures, LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
+    from rmpa.observe.snapshot import LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
 
 
-def ask_agent(master: Master, topic: str, *, figures: bool = False) -> TopicInfo | None:
+def ask_agent(master: Master, topic: str) -> TopicInfo | None:
     """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer.
 
     Args:
         master: The master.
         topic: The topic.
-        figures: Wait for the figures of direct connections.
     """
-    snapshot = master.snapshot(topics=(topic,), peers=False, figures=figures)
+    snapshot = master.snapshot(topics=(topic,), peers=False)
     return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 
@@ -96,7 +95,7 @@ def shown_state(route: RouteInfo) -> str:
 
 
 def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
-    """The transport of each subscriber, and the figures of the direct ones: label and text of each line."""
+    """The transport of each subscriber: label and text of each line."""
     if not route.subscribers:
         yield from (("transport", text) for text in route_texts(route))
     for one in route.subscribers:
@@ -104,10 +103,8 @@ def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield "transport", subscriber_text(one, since)
         if one.interruptions:
             yield "", interruption_text(one)
-        if one.figures is not None:
-            yield "", figures_text(one.figures, route.node if one.state == "granted" else one.node)
-        if one.unmeasured:
-            yield "", one.unmeasured
+        if one.transport == "direct":
+            yield "", UNMEASURED
 
 
 def interruption_text(one: SubscriberTransport) -> str:
@@ -121,20 +118,6 @@ def interruption_text(one: SubscriberTransport) -> str:
 
 def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
-
-
-def figures_text(figures: DirectFigures, node: str) -> str:
-    """The figures of a direct connection, by the statistics of a node at its end."""
-    flow = [f"{figures.rate:.1f} Hz"] if figures.rate is not None else []
-    if figures.bandwidth is not None:
-        flow.append(f"{size(figures.bandwidth)}/s over {duration(figures.window)}")
-    if figures.messages is not None:
-        flow.append(f"{figures.messages} messages")
-    if figures.dropped is not None:
-        flow.append(f"{figures.dropped} dropped by its queue")
-    if figures.counted_by == "kernel":
-        return f"{', '.join(flow)}, as the kernel counts"
-    return f"{', '.join(flow)}, as {node} counts"
 
 
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:

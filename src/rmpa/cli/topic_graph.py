@@ -129,7 +129,7 @@ def info(topic: str, options: GraphOptions) -> None:
     master, graph = options.graph()
     require_peer(master, graph, wanted)
     graph.require_topic(wanted.name)
-    crossing = ask_agent(master, wanted.name, figures=True)
+    crossing = ask_agent(master, wanted.name)
     if options.as_json:
         print_json(_topic_json(graph, wanted.name) | {"mesh": crossing})
         return

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.observe.check import CheckLevel
     from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
+    from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
 
 HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
@@ -265,16 +265,10 @@ def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple
 
 
 def _flowing(route: RouteInfo) -> str:
-    direct = [_directly(one) for one in route.subscribers if one.transport == "direct"]
+    direct = [subscriber_text(one) for one in route.subscribers if one.transport == "direct"]
     if direct and route.transport == "direct":
         return "; ".join(direct)
     return "; ".join([_relayed(route), *direct])
-
-
-def _directly(one: SubscriberTransport) -> str:
-    """A direct subscriber, with its rate where it is known."""
-    rate = f", {one.figures.rate:.1f} Hz" if one.figures is not None and one.figures.rate is not None else ""
-    return f"{subscriber_text(one)}{rate}"
 
 
 def _relayed(route: RouteInfo) -> str:

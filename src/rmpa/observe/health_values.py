@@ -114,17 +114,10 @@ def route_values(route: RouteInfo) -> dict[str, str]:
 
 
 def _direct_values(one: SubscriberTransport) -> dict[str, str]:
-    """The figures of a subscriber that is connected directly."""
+    """What is known of a subscriber that is connected directly."""
     if one.transport != "direct":
         return {}
     known = {"to": one.endpoint, "since (s)": number(one.since_ago), "interruptions": str(one.interruptions or "")}
-    if (figures := one.figures) is not None:
-        known |= {
-            "rate (Hz)": number(figures.rate),
-            "bandwidth (B/s)": number(figures.bandwidth),
-            "messages": "" if figures.messages is None else str(figures.messages),
-            "dropped": "" if figures.dropped is None else str(figures.dropped),
-        }
     return {f"direct {one.node} {key}": value for key, value in known.items()}
 
 

@@ -51,22 +51,6 @@ DIAGNOSTICS_TOPICS: Final = 2000
 DIAGNOSTICS_QUEUE: Final = 10
 """Messages that wait for a slow subscriber of /diagnostics; a newer one repeats all of an older one."""
 
-# --- figures of direct connections ------------------------------------------------------------------------------
-DIRECT_LOOK: Final = 5.0
-"""The nodes of direct connections are sampled for this long after the last look at them."""
-DIRECT_SAMPLE_INTERVAL: Final = 1.0
-"""Time between two samples."""
-DIRECT_SAMPLE_FIRST: Final = 0.4
-"""Time between the first two samples: somebody waits for the figures."""
-DIRECT_FIRST_LOOK: Final = 0.6
-"""A look waits at most this long for figures; then it shows what is known."""
-DIRECT_SAMPLE_TIMEOUT: Final = 0.5
-"""Time-out of a question to a node, which is on this machine."""
-DIRECT_SAMPLES: Final = 11
-"""Samples of a connection that are kept: rate and bandwidth are those of the last ten seconds."""
-DIRECT_SAMPLE_NODES: Final = 8
-"""Nodes that are asked at the same time."""
-
 # --- doctor -----------------------------------------------------------------------------------------------------
 DOCTOR_HEAR: Final = 1.0
 """Time-out for a multicast packet to return to its sender; where that works, it takes less than a millisecond."""

@@ -175,28 +175,6 @@ class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
     ago: float
 
 
-class DirectFigures(msgspec.Struct, kw_only=True, frozen=True):
-    """The figures of a direct connection, by the statistics of a node at its end (``getBusStats``).
-
-    Attributes:
-        messages: Since the connection was made, by the node's counter of 32 bits; ``None`` if the node does not say.
-        bytes: Of these, likewise.
-        dropped: Messages that a subscriber's own queue dropped; ``None``: not known, as for all of rospy.
-        rate: Messages a second.
-        bandwidth: Bytes a second.
-        window: The time that both are measured over, seconds.
-        counted_by: ``node``, or ``kernel`` where the node does not tell: bytes alone.
-    """
-
-    messages: int | None = None
-    bytes: int = 0
-    dropped: int | None = None
-    rate: float | None = None
-    bandwidth: float | None = None
-    window: float = 0.0
-    counted_by: str = "node"
-
-
 class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     """The transport of one subscriber of a route: of a local one (``in``), or of a peer's (``out``).
 
@@ -215,10 +193,6 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
         interrupted: How long the last of these lasted, or lasts, in seconds.
         interrupted_ago: Seconds since it was over; ``None`` while it lasts.
         stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
-        connected: Whether its direct connection stands, by the node and the kernel; ``None``: not looked at.
-        figures: Of its direct connection, while somebody looks; see ``unmeasured``.
-        unmeasured: Why the node tells no figures although somebody looks, ready to read.
-        silent: Whether the node that was asked for them did not answer.
     """
 
     node: str
@@ -233,18 +207,13 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     interrupted: float | None = None
     interrupted_ago: float | None = None
     stuck: str = ""
-    connected: bool | None = None
-    figures: DirectFigures | None = None
-    unmeasured: str = ""
-    silent: bool = False
 
 
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The route of one source, a publisher of a topic at one node, between this module and a peer.
 
     Figures are of the messages that an open route brought in the last minute, within the bounds of its statistics.
-    Messages of direct transport do not pass the agents: ``state`` and all figures are of the relayed transport alone,
-    those of direct connections stand in ``subscribers``.
+    Messages of direct transport do not pass the agents: ``state`` and all figures are of the relayed transport alone.
 
     Attributes:
         peer: The peer it comes from, or goes to.

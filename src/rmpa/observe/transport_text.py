@@ -23,6 +23,8 @@ _REMEDIES: Final = {
 }
 """What a user may do about some of the conditions; the others say it themselves, or pass."""
 REMEDY: Final = "docs/contracts.md explains the conditions"
+UNMEASURED: Final = "not measured: the nodes are connected directly"
+"""In place of figures."""
 STUCK_REMEDY: Final = "give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
 _WAITS: Final = {
     "asking": "the peer's agent is asked for a direct connection, and its node is tried",

@@ -50,11 +50,6 @@ _BYTECODE: Final = 1
 _OPERATION: Final = struct.Struct("=BBH")
 _DESTINATION_IS: Final = 8
 _CONDITION: Final = struct.Struct("=BBxxi")
-_INFO: Final = 2
-"""Attribute ``INET_DIAG_INFO``: ``struct tcp_info``. A request has the bit of its number less one."""
-_CARRIED: Final = struct.Struct("=QQ")
-_CARRIED_AT: Final = 120
-"""Offset of ``tcpi_bytes_acked`` in ``struct tcp_info``, with ``tcpi_bytes_received`` behind it (Linux 4.1)."""
 _NO_COOKIE: Final = 0xFFFFFFFF
 _NO_ADDRESS: Final = bytes(_ADDRESS)
 
@@ -126,7 +121,6 @@ def dump_request(
     source_port: int = 0,
     destination_port: int = 0,
     destination: bytes = b"",
-    info: bool = False,
     sequence: int = 0,
 ) -> bytes:
     """A request for all TCP sockets of a family.
@@ -137,11 +131,10 @@ def dump_request(
         source_port: Only sockets with this local port; 0 for any.
         destination_port: Only sockets with this remote port; 0 for any.
         destination: Only sockets with this remote address, of 4 or 16 bytes; one of 4 bytes fits v4-mapped ones too.
-        info: Whether each answer shall have its ``struct tcp_info``; see ``read_carried``.
         sequence: The number that the answers repeat.
     """
     none = (_NO_ADDRESS, _NO_ADDRESS, 0, (_NO_COOKIE,) * 2)
-    body = _query(family, states, source_port, destination_port, *none, extensions=1 << _INFO - 1 if info else 0)
+    body = _query(family, states, source_port, destination_port, *none)
     return _message(BY_FAMILY, _REQUEST | _DUMP, sequence, body + (_filter(destination) if destination else b""))
 
 
@@ -151,14 +144,13 @@ def destroy_request(found: InetSocket, sequence: int = 0) -> bytes:
     return _message(DESTROY, _REQUEST | _ACK, sequence, _query(found.family, 0, *at))
 
 
-def read_dump(data: bytes, found: list[bytes], sequence: int = 0, *, info: bool = False) -> bool:
+def read_dump(data: bytes, found: list[bytes], sequence: int = 0) -> bool:
     """Append the bodies of one part of a dump; return whether more parts follow.
 
     Args:
         data: The part.
-        found: The bodies, of ``FOUND_SIZE`` bytes each, or longer by their attributes.
+        found: The bodies, of ``FOUND_SIZE`` bytes each.
         sequence: The number of the request.
-        info: Whether to keep the attributes.
 
     Raises:
         MalformedAnswer: The bytes are not an answer to such a request, or end too early.
@@ -177,27 +169,8 @@ def read_dump(data: bytes, found: list[bytes], sequence: int = 0, *, info: bool 
             raise MalformedAnswer("a dump was answered by a mere acknowledgement")
         if kind != BY_FAMILY or end - start < FOUND_SIZE:
             raise MalformedAnswer(f"an answer of kind {kind} and {end - start} bytes")
-        found.append(data[start : end if info else start + FOUND_SIZE])
+        found.append(data[start : start + FOUND_SIZE])
     return True
-
-
-def read_carried(body: bytes) -> tuple[int, int] | None:
-    """The bytes that a connection has sent (and its peer has acknowledged) and received, by its ``struct tcp_info``.
-
-    ``None`` where the body of the answer has none, as for a socket that is closing, or on a kernel before 4.1.
-    """
-    at = FOUND_SIZE
-    while len(body) - at >= _ATTRIBUTE.size:
-        length, kind = _ATTRIBUTE.unpack_from(body, at)
-        if not _ATTRIBUTE.size <= length <= len(body) - at:
-            return None
-        if kind == _INFO:
-            if length < _ATTRIBUTE.size + _CARRIED_AT + _CARRIED.size:
-                return None
-            sent, received = _CARRIED.unpack_from(body, at + _ATTRIBUTE.size + _CARRIED_AT)
-            return sent, received
-        at += length + 3 & ~3
-    return None
 
 
 def read_status(data: bytes, sequence: int = 0) -> int:
@@ -252,13 +225,11 @@ def _query(
     destination: bytes,
     interface: int,
     cookie: tuple[int, ...],
-    *,
-    extensions: int = 0,
 ) -> bytes:
     """``struct inet_diag_req_v2``."""
     ports = _PORTS.pack(source_port, destination_port)
     place = _PLACE.pack(interface, *cookie)
-    return _QUERY.pack(family, socket.IPPROTO_TCP, extensions, 0, states) + ports + source + destination + place
+    return _QUERY.pack(family, socket.IPPROTO_TCP, 0, 0, states) + ports + source + destination + place
 
 
 def _filter(destination: bytes) -> bytes:
@@ -315,7 +286,6 @@ class SockDiag:
         source_port: int = 0,
         destination_port: int = 0,
         destination: bytes = b"",
-        info: bool = False,
     ) -> list[bytes]:
         """The bodies of all sockets that ``dump_request`` with these arguments asks for; see ``InetSocket.parse``.
 
@@ -335,10 +305,8 @@ class SockDiag:
                         source_port=source_port,
                         destination_port=destination_port,
                         destination=destination,
-                        info=info,
                         sequence=self._sequence,
-                    ),
-                    info=info,
+                    )
                 )
             except InterruptedDump:
                 self._drain()
@@ -357,10 +325,10 @@ class SockDiag:
         self._sock.send(destroy_request(found, self._sequence))
         return read_status(self._receive(), self._sequence)
 
-    def _dump(self, request: bytes, *, info: bool) -> list[bytes]:
+    def _dump(self, request: bytes) -> list[bytes]:
         self._sock.send(request)
         found: list[bytes] = []
-        while read_dump(self._receive(), found, self._sequence, info=info):
+        while read_dump(self._receive(), found, self._sequence):
             pass
         return found
 

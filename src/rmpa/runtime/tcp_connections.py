@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.runtime.sock_diag import InetSocket, SockDiag, read_carried
+from rmpa.runtime.sock_diag import InetSocket, SockDiag
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -35,7 +35,6 @@ _STATES: Final = {
 """The states of ``connections``, by their number in ``linux/tcp_states.h``."""
 _CONNECTED: Final = sum(1 << number for number in _STATES)
 _LISTEN: Final = 1 << 10
-_ESTABLISHED: Final = 1 << 1
 _FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 _ADDRESS: Final = 16
 _MAPPED: Final = bytes(10) + b"\xff\xff"
@@ -172,25 +171,8 @@ def connections(
     return [made for body in found if (made := _connection(InetSocket.parse(body))) is not None]
 
 
-def carried(local_port: int, remote: tuple[str, int]) -> tuple[int, int] | None:
-    """The bytes that one established connection has carried, as the kernel counts them; it takes some 0.1 ms.
-
-    Args:
-        local_port: Its local port.
-        remote: The address (IPv4 or IPv6, no name) and port of its other end.
-
-    Returns:
-        Sent (and acknowledged; the side that dialled counts one for its SYN) and received; ``None`` where there is no
-        such connection, or the kernel does not tell.
-    """
-    if local_port not in _PORTS or remote[1] not in _PORTS:
-        return None
-    found = _dump(_ESTABLISHED, local_port, remote[1], _packed(remote[0]), info=True)
-    return read_carried(found[0]) if found else None
-
-
 def _dump(
-    states: int, source_port: int = 0, destination_port: int = 0, destination: bytes = b"", *, info: bool = False
+    states: int, source_port: int = 0, destination_port: int = 0, destination: bytes = b""
 ) -> list[bytes] | None:
     try:
         with SockDiag() as kernel:
@@ -203,7 +185,6 @@ def _dump(
                     source_port=source_port,
                     destination_port=destination_port,
                     destination=destination,
-                    info=info,
                 )
             ]
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""``getBusInfo`` and ``getBusStats`` of other nodes: what rospy and roscpp answer, and whatever else may come."""
+"""``getBusInfo`` of other nodes: what rospy and roscpp answer, and whatever else may come."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.wire.bus import BusLink, BusTraffic, read_bus_info, read_bus_stats
+from rmpa.ros.wire.bus import BusLink, read_bus_info
 from rmpa.ros.wire.slave_api import BusConnection, SlaveApi
 from rmpa.ros.wire.xmlrpc import parse_response
 
@@ -60,19 +60,6 @@ ROSCPP_TALKER_INFO = (
     b"<value>TCPROS connection on port 52309 to [127.0.0.1:34736 on socket 11]</value></data></array></value>"
     b"</data></array></value></data></array></value>\n</param></params></methodResponse>\n"
 )
-ROSCPP_TALKER_STATS = (
-    b'<?xml version="1.0"?>\n<methodResponse><params><param>\n\t'
-    b"<value><array><data><value><array><data><value><array><data><value>/rosout</value><value><array><data>"
-    b"<value><array><data><value><i4>0</i4></value><value><i4>0</i4></value><value><i4>0</i4></value>"
-    b"<value><i4>0</i4></value><value><i4>0</i4></value></data></array></value></data></array></value>"
-    b"</data></array></value><value><array><data><value>/chatter</value><value><array><data>"
-    b"<value><array><data><value><i4>1</i4></value><value><i4>800</i4></value><value><i4>800</i4></value>"
-    b"<value><i4>10</i4></value><value><i4>0</i4></value></data></array></value>"
-    b"<value><array><data><value><i4>2</i4></value><value><i4>-1894964896</i4></value>"
-    b"<value><i4>-1894964896</i4></value><value><i4>150</i4></value><value><i4>0</i4></value></data></array></value>"
-    b"</data></array></value></data></array></value></data></array></value>"
-    b"<value><array><data></data></array></value></data></array></value>\n</param></params></methodResponse>\n"
-)
 # The others as they are parsed.
 ROSPY_LISTENER_INFO: XmlRpcValue = [
     *(1, "bus info"),
@@ -110,15 +97,6 @@ OURS_INFO: XmlRpcValue = [
         ]
     ],
 ]
-ROSPY_TALKER_STATS: XmlRpcValue = [
-    *(1, ""),
-    [[["/rosout", 0, [[1, 1261, 0, True]]], ["/chatter", 800, [[2, 2449, 10, True], [3, 2449, 10, True]]]], [], []],
-]
-ROSPY_LISTENER_STATS: XmlRpcValue = [
-    *(1, ""),
-    [[["/rosout", 0, [[1, 1263, 0, True]]]], [["/chatter", [[2, 2454, 10, -1, True], [3, 2454, 10, -1, True]]]], []],
-]
-ROSCPP_LISTENER_STATS: XmlRpcValue = [[["/rosout", [[0, 0, 0, 0, 0]]]], [["/chatter", [[2, 760, 10, 0, 0]]]]]
 
 
 @pytest.mark.parametrize(
@@ -164,47 +142,6 @@ def test_the_connections_of_each_library_are_read(answer: XmlRpcValue, links: li
     assert read_bus_info(answer) == links
 
 
-@pytest.mark.parametrize(
-    ("answer", "traffic"),
-    [
-        pytest.param(
-            ROSPY_TALKER_STATS,
-            [
-                BusTraffic(1, "/rosout", False, 1261, 0, None),
-                BusTraffic(2, "/chatter", False, 2449, 10, None),
-                BusTraffic(3, "/chatter", False, 2449, 10, None),
-            ],
-            id="rospy, publisher",
-        ),
-        pytest.param(
-            parse_response(ROSCPP_TALKER_STATS),
-            [
-                BusTraffic(0, "/rosout", False, 0, 0, None),
-                BusTraffic(1, "/chatter", False, 800, 10, None),
-                BusTraffic(2, "/chatter", False, 150 * 16_000_016, 150, None),
-            ],
-            id="roscpp, publisher; its second subscriber got 2.4 GB",
-        ),
-        pytest.param(
-            ROSPY_LISTENER_STATS,
-            [
-                BusTraffic(1, "/rosout", False, 1263, 0, None),
-                BusTraffic(2, "/chatter", True, 2454, 10, None),
-                BusTraffic(3, "/chatter", True, 2454, 10, None),
-            ],
-            id="rospy, subscriber",
-        ),
-        pytest.param(
-            ROSCPP_LISTENER_STATS,
-            [BusTraffic(0, "/rosout", False, 0, 0, None), BusTraffic(2, "/chatter", True, 760, 10, 0)],
-            id="roscpp, subscriber",
-        ),
-    ],
-)
-def test_the_traffic_of_each_library_is_read(answer: XmlRpcValue, traffic: list[BusTraffic]) -> None:
-    assert read_bus_stats(answer) == traffic
-
-
 class Connections:
     """A node of ours, with one connection each way."""
 
@@ -228,11 +165,8 @@ def test_a_node_of_ours_is_read_too() -> None:
         BusLink(1, "/s", False, "/out", True, 1, ("10.0.0.2", 2)),
         BusLink(2, "http://10.0.0.2:3/", True, "/in", False, 4, ("10.0.0.2", 5)),
     ]
-    traffic = [BusTraffic(1, "/out", False, 70, 7, None), BusTraffic(2, "/in", True, 50, 5, None)]
     assert read_bus_info([*api.dispatch("getBusInfo", ["/c"])]) == links
     assert read_bus_info(api.dispatch("getBusInfo", ["/c"]).value) == links
-    assert read_bus_stats([*api.dispatch("getBusStats", ["/c"])]) == traffic
-    assert read_bus_stats(api.dispatch("getBusStats", ["/c"]).value) == traffic
 
 
 ROW: tuple[XmlRpcValue, ...] = (
@@ -293,25 +227,6 @@ def test_a_connection_is_read_as_far_as_it_can_be(written: XmlRpcValue, read: li
     assert read_bus_info([1, "", [5, written, None, row(number=8)]]) == [*read, link(number=8)]
 
 
-@pytest.mark.parametrize(
-    ("stats", "read"),
-    [
-        ([], []),
-        ([[["/a", [[1, 10, 10, 2, 0]]]]], [BusTraffic(1, "/a", False, 10, 2, None)]),
-        ([[["/a", 10, [[1, 10]]]], []], [BusTraffic(1, "/a", False, 10, None, None)]),
-        ([None, [["/a", [[1, 10]]]]], [BusTraffic(1, "/a", True, 10, None, None)]),
-        ([5, [["/a", [[1, 10, "x", "y"]]]]], [BusTraffic(1, "/a", True, 10, None, None)]),
-        ([[["/a", [[1, -1, 0, -2, 0]]]]], [BusTraffic(1, "/a", False, 2**32 - 1, 2**32 - 2, None)]),
-        ([[["/a", [[1, 2**33, 0, 0, 0]]]]], []),
-        ([[["/a", [[1], [True, 5], ["x", 5], "no", None]], ["/b"], "/c", [5, [[1, 2]]]], 7], []),
-    ],
-)
-def test_traffic_is_read_as_far_as_it_can_be(stats: XmlRpcValue, read: list[BusTraffic]) -> None:
-    assert read_bus_stats(stats) == read
-    assert read_bus_stats([1, "", stats]) == read
-    assert read_bus_stats([-1, "no", stats]) == []
-
-
 SCALARS = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary() | st.sampled_from(["i", "o"])
 )
@@ -325,8 +240,6 @@ def test_whatever_is_answered_is_read(answer: XmlRpcValue) -> None:
     for found in read_bus_info(answer):
         assert found.local_port is None or 0 < found.local_port < 65536
         assert found.remote is None or 0 < found.remote[1] < 65536
-    for traffic in read_bus_stats(answer):
-        assert 0 <= traffic.bytes < 2**32
 
 
 HOSTS = st.from_regex(r"[a-z0-9.:-]{1,30}[a-z0-9]", fullmatch=True)

@@ -27,7 +27,7 @@ from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.node_info import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Collection
+    from collections.abc import Collection
 
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.io.node_requests import NodeRequests
@@ -71,7 +71,7 @@ class ControlOperations:
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
         return {
-            "snapshot": self.snapshot_or_figures,
+            "snapshot": self.snapshot,
             "ping": self.ping,
             "param": self.param,
             "followed": self.followed,
@@ -93,20 +93,6 @@ class ControlOperations:
             raise ConfigError("most", f"{most!r} is not a number of topics")
         wanted = frozenset(map(str, services)) if isinstance(services, list) else services is True or None
         return self._snapshots.build(topics, services=wanted, peers=args.get("peers") is not False, most=most)
-
-    def snapshot_or_figures(self, args: Args) -> Snapshot | Awaitable[Snapshot]:
-        """As ``snapshot``, with figures of direct connections, for which their nodes are asked.
-
-        ``figures``: true waits until there are some; ``"newest"`` takes what is there, and has the nodes asked for
-        the next snapshot.
-        """
-        if args.get("figures") == "newest":
-            self._snapshots.sampler.look(_topics(args))
-        return self._with_figures(args) if args.get("figures") is True else self.snapshot(args)
-
-    async def _with_figures(self, args: Args) -> Snapshot:
-        await self._snapshots.sampler.settle(_topics(args))
-        return self.snapshot(args)
 
     async def ping(self, args: Args) -> PingReply:
         """``peer``: its name or GUID; ``count``: the number of pings."""

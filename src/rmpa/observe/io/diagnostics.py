@@ -93,7 +93,6 @@ class Diagnostics(PublicationEvents):
 
     def _publish(self) -> None:
         self._sequence += 1
-        self._snapshots.sampler.look(None)
         snapshot, parts = self._snapshots.build(most=limits.DIAGNOSTICS_TOPICS), []
         for check in self._health.judge(snapshot, self._clock.now()):
             parts.append(diagnostic_status(check, snapshot.agent.name).serialize())

@@ -10,50 +10,24 @@ import msgspec
 from rmpa.bridge.direct.conditions import Condition, unmet_by_contract
 from rmpa.bridge.direct.requests import Want
 from rmpa.core.contract import Transport
-from rmpa.observe.io.direct_sampler import DirectFlow, DirectSampler
 from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-
     from rmpa.bridge.direct.paths import Interruption, Path
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.core.contract import Contract
-    from rmpa.observe.io.direct_sampler import DirectSample
-    from rmpa.ros.core.api import Core
 
 
 class DirectSection:
     """Reads what the bridge knows of direct transport; changes nothing.
 
     Args:
-        core: The agent's ROS core.
-        bridge: Its bridge.
+        bridge: The agent's bridge.
     """
 
-    def __init__(self, core: Core, bridge: Bridge) -> None:
-        self._core = core
+    def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
-        self.sampler = DirectSampler(self._flows)
-        """The figures of direct connections."""
-
-    def _flows(self, topics: Collection[str] | None) -> Iterator[DirectFlow]:
-        """The direct connections of local nodes, of some topics or of all."""
-        part = self._bridge.topics
-        for path in part.direct_imports:
-            if path.endpoint is not None and (topics is None or path.want.name in topics):
-                yield self._flow_in(path, path.endpoint)
-        for _, want, _ in part.direct_exports:
-            if topics is None or want.name in topics:
-                yield self._flow_out(want)
-
-    def _flow_in(self, path: Path, endpoint: tuple[str, int]) -> DirectFlow:
-        topic, node = path.want.name, path.want.user
-        return DirectFlow(node, self._core.subscribers(topic).get(node, ""), topic, node, endpoint)
-
-    def _flow_out(self, want: Want) -> DirectFlow:
-        return DirectFlow(want.node, self._core.publishers(want.name).get(want.node, ""), want.name, want.user)
 
     def inbound(self, info: RouteInfo, peer: int, source: Source, contract: Contract, now: float) -> RouteInfo:
         """Add the transport to a route from a peer.
@@ -72,7 +46,7 @@ class DirectSection:
         known = topics.direct_imports.interruptions
         subscribers = tuple(
             _interrupted(
-                self._measured(_subscriber(path, now), path),
+                _subscriber(path, now),
                 known.get(session.link.name, path.want) if session is not None else None,
                 now,
             )
@@ -90,9 +64,6 @@ class DirectSection:
             condition_text=text,
             subscribers=subscribers,
         )
-
-    def _measured(self, one: SubscriberTransport, path: Path) -> SubscriberTransport:
-        return _with(one, self.sampler[self._flow_in(path, path.endpoint)]) if path.endpoint is not None else one
 
     def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
         """Add the transport to a route to a peer that is relayed at present."""
@@ -115,12 +86,7 @@ class DirectSection:
         ]
         return tuple(
             _interrupted(
-                _with(
-                    SubscriberTransport(
-                        node=want.user, transport="direct", state="granted", endpoint=str(grant.port)
-                    ),
-                    self.sampler[self._flow_out(want)],
-                ),
+                SubscriberTransport(node=want.user, transport="direct", state="granted", endpoint=str(grant.port)),
                 exports.interruptions.get(session.link.name, want) if session is not None else None,
                 asyncio.get_running_loop().time(),
             )
@@ -132,13 +98,6 @@ def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
     """The number of direct connections to a peer's publishers, and of the grants that it has here."""
     there = sum(path.peer == peer and path.endpoint is not None for path in bridge.topics.direct_imports)
     return there, sum(owner == peer for owner, _, _ in bridge.topics.direct_exports)
-
-
-def _with(one: SubscriberTransport, sample: DirectSample) -> SubscriberTransport:
-    """A subscriber with what its node, or its publisher, said last."""
-    return msgspec.structs.replace(
-        one, connected=sample.connected, figures=sample.figures, unmeasured=sample.problem, silent=sample.silent
-    )
 
 
 def _interrupted(one: SubscriberTransport, found: Interruption | None, now: float) -> SubscriberTransport:

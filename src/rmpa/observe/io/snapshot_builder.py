@@ -86,10 +86,8 @@ class SnapshotBuilder:
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
         self._peers = PeersSection(sources.bridge, sources.services, sources.twins)
-        self.direct = DirectSection(sources.core, sources.bridge)
+        self.direct = DirectSection(sources.bridge)
         """What is known of direct transport."""
-        self.sampler = self.direct.sampler
-        """The figures of direct connections, which are read only while somebody looks."""
         self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, self.direct)
         self._services = ServicesSection(sources.services)
 

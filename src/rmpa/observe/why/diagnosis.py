@@ -9,7 +9,6 @@ import msgspec
 
 from rmpa.config.permission_rules import Access
 from rmpa.observe.check import FAIL, OK, Check
-from rmpa.observe.snapshot import SubscriberTransport  # noqa: TC001 - msgspec reads the annotation
 from rmpa.trust.permissions import prohibition, refusal
 
 if TYPE_CHECKING:
@@ -137,8 +136,6 @@ class PublisherReport(msgspec.Struct, frozen=True, kw_only=True):
         oversized_bytes: The length of the last of these, in bytes.
         beyond: ``limits.topics`` of its module, if it is not offered because there are more; else 0.
         unreachable: Why its agent cannot connect to it, ready to read; empty where it can.
-        direct: The subscribers in the module that asks that may connect to it directly, with the figures that the
-            publisher tells.
     """
 
     node: str
@@ -155,7 +152,6 @@ class PublisherReport(msgspec.Struct, frozen=True, kw_only=True):
     oversized_bytes: int = 0
     beyond: int = 0
     unreachable: str = ""
-    direct: tuple[SubscriberTransport, ...] = ()
 
 
 class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):

@@ -29,7 +29,7 @@ from rmpa.observe.why.diagnosis import (
     permission_there,
     until_failure,
 )
-from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, direct_stages, transport
+from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, connection, transport
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str,
     relayed = bool(ends.here.proxy(node).connections)
     yield transport(now)
     if connected_directly(now):
-        yield from direct_stages(now, report_now, relayed=relayed)
+        yield connection(now)
         if not relayed:
             return
     yield _open_route(now, report_now, peer)

@@ -1,18 +1,7 @@
-"""What other nodes answer to ``getBusInfo`` and ``getBusStats``: their topic connections, and the traffic of each.
+"""What other nodes answer to ``getBusInfo``: their topic connections. Pure.
 
-Pure. The wiki (wiki.ros.org/ROS/Slave_API) leaves much open, and the libraries differ:
-
-* roscpp's ``getBusStats`` answers ``[publications, subscriptions]`` alone, without code, status and services. Of a
-  subscription it lists only the publisher that connected last.
-* A connection of a publication is ``[number, bytes, messages, connected]`` in rospy (as on the wiki), and
-  ``[number, bytes, bytes of messages, messages, 0]`` in roscpp.
-* rospy counts the bytes of the connection headers too; roscpp counts only messages, and at the receiver without the
-  4-byte length in front of each.
-* XML-RPC's integers are signed and have 32 bits. roscpp's numbers wrap: after 2 GiB they are negative. rospy's cannot
-  be written then: once a publication has sent 2 GiB or a connection has carried as much, ``getBusStats`` of that node
-  is a fault ("int exceeds XML-RPC limits") until the publication or the connection ends.
-
-A row that cannot be read is left out, and so is what is unknown in one that can: a node may be of any library.
+The wiki (wiki.ros.org/ROS/Slave_API) leaves much open, and the libraries differ. A row that cannot be read is left
+out, and so is what is unknown in one that can: a node may be of any library.
 """
 
 from __future__ import annotations
@@ -21,11 +10,10 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import INT32_MIN, UINT32_MAX
 from rmpa.ros.wire.slave_api import INBOUND, OUTBOUND, TCPROS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -36,7 +24,6 @@ _CLOSED: Final = "Closed "
 _PORT_MAX: Final = 65535
 _SUCCESS: Final = 1
 _REPLY_LENGTH: Final = 3
-_ROSCPP_SENT_LENGTH: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +31,7 @@ class BusLink:
     """One connection of a node, as ``getBusInfo`` has it.
 
     Args:
-        number: Its number within the node; ``BusTraffic`` has the same one.
+        number: Its number within the node.
         other: The other side: a subscriber's caller id, or a publisher's slave API URI.
         inbound: Whether it is from a publisher; else it is to a subscriber.
         topic: The topic.
@@ -63,27 +50,6 @@ class BusLink:
     remote: tuple[str, int] | None
 
 
-@dataclass(frozen=True, slots=True)
-class BusTraffic:
-    """The traffic of one connection of a node since it began, as ``getBusStats`` has it.
-
-    Args:
-        number: The connection's number within the node.
-        topic: The topic.
-        inbound: Whether it is from a publisher; else it is to a subscriber.
-        bytes: Bytes carried, modulo 2**32: of two readings take the difference modulo 2**32.
-        messages: Messages carried, likewise; ``None`` if the node does not say it.
-        dropped: Messages dropped because the node's own queue was full; ``None``: unknown, as always outbound.
-    """
-
-    number: int
-    topic: str
-    inbound: bool
-    bytes: int
-    messages: int | None
-    dropped: int | None
-
-
 def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
     """The connections of a node.
 
@@ -91,16 +57,6 @@ def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
         answer: The node's answer to ``getBusInfo``: code, status and value, or the value alone.
     """
     return [link for row in _list(_value_of(answer)) if (link := _link(_list(row))) is not None]
-
-
-def read_bus_stats(answer: XmlRpcValue) -> list[BusTraffic]:
-    """The traffic of a node's connections.
-
-    Args:
-        answer: The node's answer to ``getBusStats``: code, status and value, or the value alone.
-    """
-    value = _list(_value_of(answer))
-    return [*_traffic(_at(value, 0), inbound=False), *_traffic(_at(value, 1), inbound=True)]
 
 
 def _value_of(answer: XmlRpcValue) -> XmlRpcValue:
@@ -132,34 +88,6 @@ def _addresses(info: str) -> tuple[int | None, tuple[str, int] | None]:
     return (local if 0 < local <= _PORT_MAX else None, (host, port) if 0 < port <= _PORT_MAX else None)
 
 
-def _traffic(topics: XmlRpcValue, *, inbound: bool) -> Iterator[BusTraffic]:
-    """The traffic of all connections of the publications, or of the subscriptions."""
-    for entry in map(_list, _list(topics)):
-        # Between topic and connections rospy's publications have the bytes of all.
-        if len(entry) > 1 and isinstance(topic := entry[0], str):
-            for row in map(_list, _list(entry[-1])):
-                read = _received(topic, row) if inbound else _sent(topic, row)
-                if read is not None:
-                    yield read
-
-
-def _sent(topic: str, row: Sequence[XmlRpcValue]) -> BusTraffic | None:
-    messages = 3 if len(row) >= _ROSCPP_SENT_LENGTH else 2
-    number, size = _int(_at(row, 0)), _count(_at(row, 1))
-    if number is None or size is None:
-        return None
-    return BusTraffic(number, topic, False, size, _count(_at(row, messages)), None)
-
-
-def _received(topic: str, row: Sequence[XmlRpcValue]) -> BusTraffic | None:
-    number, size, dropped = _int(_at(row, 0)), _count(_at(row, 1)), _int(_at(row, 3))
-    if number is None or size is None:
-        return None
-    # rospy has -1: it does not count what it drops.
-    known = dropped if dropped is not None and dropped >= 0 else None
-    return BusTraffic(number, topic, True, size, _count(_at(row, 2)), known)
-
-
 def _list(value: XmlRpcValue) -> Sequence[XmlRpcValue]:
     return value if isinstance(value, list | tuple) else ()
 
@@ -170,9 +98,3 @@ def _at(row: Sequence[XmlRpcValue], index: int) -> XmlRpcValue:
 
 def _int(value: XmlRpcValue) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) else None
-
-
-def _count(value: XmlRpcValue) -> int | None:
-    """A number that only grows, modulo 2**32: roscpp's are negative from 2**31 on."""
-    number = _int(value)
-    return number % (UINT32_MAX + 1) if number is not None and INT32_MIN <= number <= UINT32_MAX else None

@@ -344,7 +344,7 @@ class StateBuilder:
         ends: list[tuple[str, bool]] = []
         flows: list[tuple[tuple[str, bool], float, float]] = []
         for route in topic.routes:
-            rate, bytes_ = _figures(route) if route.subscribers else (route.rate or 0.0, route.bandwidth or 0.0)
+            rate, bytes_ = route.rate or 0.0, route.bandwidth or 0.0
             bandwidth += bytes_
             lost += route.lost + route.expired
             dropped += route.dropped + route.oversized
@@ -398,19 +398,6 @@ def _is_lost(module: Value) -> bool:
 
 def _is_direct(subscriber: SubscriberTransport) -> bool:
     return subscriber.transport == "direct"
-
-
-def _figures(route: RouteInfo) -> tuple[float, float]:
-    """Messages and bytes a second of a route: relayed, or of its direct connections, whichever has more messages.
-
-    Each direct subscriber has a copy of its own, which is so many bytes more.
-    """
-    if not route.subscribers:
-        return route.rate or 0.0, route.bandwidth or 0.0
-    direct = [subscriber.figures for subscriber in route.subscribers if subscriber.figures is not None]
-    rate = max((figures.rate or 0.0 for figures in direct), default=0.0)
-    bandwidth = sum(figures.bandwidth or 0.0 for figures in direct)
-    return max(route.rate or 0.0, rate), (route.bandwidth or 0.0) + bandwidth
 
 
 def _said(entry: Mapping[str, object]) -> Tree:

@@ -156,8 +156,6 @@ class ControlReader:
         self._client: ControlClient | None = None
         self._decoder = SnapshotDecoder()
         self._used = 0.0
-        self.figures = False
-        """Whether the agent is to ask nodes for the figures of their direct connections."""
 
     def __call__(self) -> Snapshot:
         """Ask for a snapshot, with ``limits.WEB_TOPICS`` topics and services if most of them are not used.
@@ -189,7 +187,7 @@ class ControlReader:
 
     def _ask(self, client: ControlClient, args: dict[str, object]) -> Snapshot:
         try:
-            snapshot = client.snapshot(self._decoder, **args, **({"figures": "newest"} if self.figures else {}))
+            snapshot = client.snapshot(self._decoder, **args)
         except RmpaError:
             self.close()
             raise

@@ -187,10 +187,7 @@ async def serve(
     watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
 
-    def watched(is_open: bool) -> None:
-        reader.figures = is_open
-
-    monitor = Monitor(hub, watch, agent=agent, watched=watched)
+    monitor = Monitor(hub, watch, agent=agent)
     changes = GraphSignal(os.environ, lambda: agent or monitor.mesh.agent or None, hub.graph)
     gateways = Gateways(
         hub,

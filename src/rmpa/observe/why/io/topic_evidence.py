@@ -139,7 +139,6 @@ class TopicEvidence:
         topics = [topic for topic in names.locals_of(wire) if self._may_know(asker, topic)]
         if not topics:
             return TopicAtPublisher(permitted=False)
-        await self._snapshots.sampler.settle(topics)
         for topic in topics:
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
             sources += [self._report(session, Source(topic, node), wire) for node in nodes]
@@ -205,7 +204,6 @@ class TopicEvidence:
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=self._bridge.topics.imports.limit_settings.topics if exports.is_beyond(source) else 0,
             unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
-            direct=self._snapshots.direct.granted_to(session.peer, source),
         )
 
     def _unreachable(self, node: str) -> str:

@@ -240,7 +240,7 @@ class WhyService:
         ends = await self._both_ends(peer, topic)
         later = None
         routes = [r for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"]
-        if any(route.state in _MOVING or connected_directly(route) for route in routes):
+        if any(route.state in _MOVING for route in routes):
             # Only a second count shows whether messages flow.
             await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
@@ -249,7 +249,6 @@ class WhyService:
     async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
         """What both ends know now."""
         session = self._carrier(peer)
-        await self._snapshots.sampler.settle((topic,))
         if session is None:
             return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)

@@ -27,7 +27,6 @@ class MeshFeed:
     Args:
         watch: Asks the agent.
         resources: Knows the Smart Resources.
-        watched: Called with whether pages are open.
         parameters: Says how often the parameters of this module's core have changed.
         clock: Seconds since the epoch.
     """
@@ -36,11 +35,9 @@ class MeshFeed:
         self,
         watch: AgentWatch,
         resources: ResourceWatch,
-        watched: Callable[[bool], None],
         parameters: Callable[[], int] = lambda: 0,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._watched = watched
         self._parameters = parameters
         self._watch = watch
         self._resources = resources
@@ -70,7 +67,6 @@ class MeshFeed:
     def follow(self, page: object, show: Callable[[Tree], None]) -> None:
         """Give a page each new state, beginning with the last one."""
         self._pages[page] = show
-        self._watched(True)
         self._resources.show_all(wanted=True)
         if self._state is not None:
             show(self._state)
@@ -80,7 +76,6 @@ class MeshFeed:
         """End a ``follow``."""
         self._pages.pop(page, None)
         if not self._pages:
-            self._watched(False)
             self._resources.show_all(wanted=False)
 
     async def close(self) -> None:

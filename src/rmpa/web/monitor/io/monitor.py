@@ -12,7 +12,7 @@ from rmpa.web.monitor.io.resource_watch import ResourceWatch
 from rmpa.web.monitor.io.values import MessageValues
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.server.agent_watch import AgentWatch
@@ -26,7 +26,6 @@ class Monitor:
         watch: Asks the agent.
         environ: Says where the agents' sockets are; the process's environment unless it is given.
         agent: The agent's name; ``None``: the one that answers.
-        watched: Called with whether pages are open: figures that cost something are wanted only then.
     """
 
     def __init__(
@@ -35,13 +34,12 @@ class Monitor:
         watch: AgentWatch,
         environ: Mapping[str, str] | None = None,
         agent: str | None = None,
-        watched: Callable[[bool], None] = lambda _: None,
     ) -> None:
         self._hub = hub
         self.values = MessageValues(hub)
         self.resources = ResourceWatch(hub, self.values)
         self.log = LogFeed(hub, self.values)
-        self.mesh = MeshFeed(watch, self.resources, watched, lambda: hub.params.changes)
+        self.mesh = MeshFeed(watch, self.resources, lambda: hub.params.changes)
         self.answers = Answers(
             hub,
             self.resources,

@@ -82,12 +82,11 @@ const Route = memo(({ route, own }) => {
     ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
 });
 
-// A subscriber of a route where its transport is known: direct ones do not pass the agents, and their nodes tell the figures.
+// A subscriber of a route where its transport is known: the agents see no message of direct ones.
 const Subscriber = ({ one }) => {
-  const figures = section(one, "figures");
-  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.unmeasured, one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
-  return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">${hertz(figures.rate)}<div class="muted">${bandwidth(figures.bandwidth)}</div></td>
-    <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">${figures.dropped === undefined ? "–" : count(figures.dropped)}</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
+  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.transport === "direct" && "not measured: the nodes are connected directly", one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
+  return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">–</td>
+    <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">–</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
 };
 
 const MEANINGS = {
