@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.bridge.data.io.export_flow import ExportFlow
 from rmpa.bridge.data.io.import_flow import ImportFlow
@@ -294,6 +294,6 @@ class TrafficPeer(MeshPeer):
         if inbox.flow is not None:
             inbox.flow.rebind(acknowledge)
         else:
-            inbox.flow = ImportFlow(inbox, inbox.contract, self.times[link], on_ack=acknowledge)
+            inbox.flow = ImportFlow(cast("Any", inbox), inbox.contract, self.times[link], on_ack=acknowledge)
         inbox.breaks += not inbox.flow.begin_epoch(said["epoch"], said["first"])
         self.flows[link, 1] = inbox.flow

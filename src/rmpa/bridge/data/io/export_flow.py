@@ -19,7 +19,7 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.data.io.route_sender import DataLink
+    from rmpa.mesh.io.link import PeerLink
 
 
 class ExportFlow:
@@ -81,7 +81,7 @@ class ExportFlow:
         if depth > (self._history.maxlen or 0):
             self._history = deque(self._history, maxlen=min(depth, ros_limits.LATCHED_MAX))
 
-    def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> RouteSender:
+    def add(self, peer: int, link: PeerLink, route: int, contract: Contract, epoch: int) -> RouteSender:
         """Send to one more peer; first the kept messages that its contract, or the latching publisher, allows."""
         self.remove(peer)
         sender = make_route_sender(link, route, contract, epoch, large=self.large)

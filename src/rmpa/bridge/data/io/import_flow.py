@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.losses import ReceptionHistory
 from rmpa.bridge.data.qos_events import QosWatch
@@ -30,31 +30,11 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.io.link_time import LinkTime
     from rmpa.bridge.data.qos_events import QosEvent
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.ros.node.publication import Publication
 
 _LENGTH: Final = 4
 _NONE: Final = -1
 """No expected sequence: no message came yet, or one is coming in parts, so each sequence is checked closely."""
-
-
-class LocalOutput(Protocol):
-    """What the data path needs of a publication, to reach its local subscribers."""
-
-    def publish_framed(self, framed: Buffer) -> object:
-        """Send one message, with its length in front, to each subscriber."""
-        ...
-
-    def begin(self, size: int) -> None:
-        """Begin a message of ``size`` bytes that comes in parts."""
-        ...
-
-    def extend(self, part: Buffer) -> None:
-        """Send a part of the message to each subscriber that has its beginning."""
-        ...
-
-    def abort(self) -> int:
-        """Abort the message; return how many subscribers were disconnected because they have its beginning."""
-        ...
 
 
 class ImportFlow:
@@ -74,7 +54,7 @@ class ImportFlow:
 
     def __init__(
         self,
-        output: LocalOutput,
+        output: Publication,
         contract: Contract,
         link_time: LinkTime,
         *,

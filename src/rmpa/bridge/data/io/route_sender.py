@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from rmpa.bridge.data.downsampling import Downsampler
 from rmpa.bridge.data.lane_switch import EXPRESS, LaneSwitch
@@ -22,53 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.outbox import QueuedMessage
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.runtime.buffers import Buffer
-
-
-class DataLane(Protocol):
-    """What the data path needs of one lane of a link."""
-
-    def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message; return how many older ones were dropped for it."""
-        ...
-
-    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        """Begin a message whose bytes follow by ``extend``."""
-        ...
-
-    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of a message; return how many older messages were dropped for them."""
-        ...
-
-    def abandon(self, parcel: QueuedMessage) -> None:
-        """Abort a message that was opened: the rest will not come."""
-        ...
-
-    def fence(self, route: int, number: int) -> None:
-        """Send a fence after the messages of a route."""
-        ...
-
-    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound the waiting messages of a route: ``depth`` of them, each for ``max_age`` seconds."""
-        ...
-
-    def discard(self, route: int) -> None:
-        """Drop the waiting messages of a route, and its bounds."""
-        ...
-
-
-class DataLink(Protocol):
-    """What the data path needs of a link."""
-
-    @property
-    def express(self) -> DataLane:
-        """The lane for small and urgent messages."""
-        ...
-
-    @property
-    def bulk(self) -> DataLane:
-        """The lane for large messages."""
-        ...
 
 
 class RouteSender:
@@ -83,8 +39,8 @@ class RouteSender:
 
     reliable = False
 
-    def __init__(self, link: DataLink, route: int, contract: Contract, *, large: bool = False) -> None:
-        self.link: DataLink | None = link
+    def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
+        self.link: PeerLink | None = link
         self.route = route
         self.contract = contract
         self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
@@ -92,7 +48,7 @@ class RouteSender:
         self.dropped = 0
         """Messages dropped here because a bound was reached; those dropped by the lane are counted there."""
         self._loop = asyncio.get_running_loop()
-        self._lane: DataLane = link.express
+        self._lane: LaneSender = link.express
         self._switch = LaneSwitch(contract, large=large)
         self._small = mesh_limits.EXPRESS_MESSAGE_MAX
         self._held: deque[tuple[int, int, bytes]] = deque()
@@ -283,7 +239,7 @@ class ReliableRouteSender(RouteSender):
 
     reliable = True
 
-    def __init__(self, link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
+    def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
         depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sender = ReliableSender(
             depth,
@@ -329,7 +285,7 @@ class ReliableRouteSender(RouteSender):
         self._keep = keep
         self.sender.suspend()
 
-    def resume(self, link: DataLink, route: int, after: int) -> None:
+    def resume(self, link: PeerLink, route: int, after: int) -> None:
         """Continue on a new link; the peer has everything up to ``after``.
 
         If a later message is already acknowledged, that one counts: with two links at once, the older one's request
@@ -390,7 +346,7 @@ class ReliableRouteSender(RouteSender):
                 lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
 
-def make_route_sender(link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
+def make_route_sender(link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
     """Make the kind of sender that the contract's reliability needs."""
     if contract.reliability is Reliability.RELIABLE:
         return ReliableRouteSender(link, route, contract, epoch, large=large)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.core import limits as core_limits
@@ -21,7 +21,8 @@ from rmpa.ros import limits as ros_limits
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
-    from rmpa.core.outbox import Outbox, QueuedMessage
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.runtime.buffers import Buffer
 
 _LENGTH: Final = 4
@@ -35,52 +36,6 @@ _WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
 """Bytes of a body, head included, up to which it is sent in one frame."""
 _PAUSE: Final = 0.005
 """Seconds between two checks of how much waits on the bulk lane."""
-
-
-class BodyLane(Protocol):
-    """The methods of a link's lane that bodies are sent by (``mesh.io.lane.LaneSender``)."""
-
-    outbox: Outbox
-    ended: bool
-
-    def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message as a whole."""
-        ...
-
-    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        """Begin a message of ``size`` bytes, which ``extend`` sends."""
-        ...
-
-    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of a message that ``open`` began."""
-        ...
-
-    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Set how many messages of a route may wait, and for how many seconds (``None``: any time)."""
-        ...
-
-
-class BodyLink(Protocol):
-    """The methods of a link that bodies are sent by (``mesh.io.link.PeerLink``)."""
-
-    @property
-    def abandoned(self) -> bool:
-        """Whether the peer has given up what it asked over this link."""
-        ...
-
-    @property
-    def express(self) -> BodyLane:
-        """The lane for small bodies."""
-        ...
-
-    @property
-    def bulk(self) -> BodyLane:
-        """The lane for large bodies."""
-        ...
-
-    def close_route(self, route: int) -> int:
-        """Drop what waits of a route."""
-        ...
 
 
 class Budget:
@@ -116,8 +71,8 @@ class BodySender:
         route: The route's number, chosen by the receiver.
     """
 
-    def __init__(self, link: BodyLink, route: int) -> None:
-        self._link: BodyLink | None = link
+    def __init__(self, link: PeerLink, route: int) -> None:
+        self._link: PeerLink | None = link
         self._route = route
         self._large: deque[tuple[int, bytes, Buffer, Budget | None]] = deque()
         self._task: asyncio.Task[None] | None = None
@@ -166,7 +121,7 @@ class BodySender:
         if budget is not None:
             budget.give(len(body))
 
-    def _send_whole(self, lane: BodyLane) -> None:
+    def _send_whole(self, lane: LaneSender) -> None:
         sequence, head, body, _ = self._large[0]
         size = len(head) + len(body)
         framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))

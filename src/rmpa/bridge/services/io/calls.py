@@ -18,8 +18,8 @@ from rmpa.ros.wire.services import ServiceDescription
 if TYPE_CHECKING:
     from rmpa.bridge.data.io.link_time import LinkTime
     from rmpa.bridge.services.actions import ServiceAbout
-    from rmpa.bridge.services.io.bodies import BodyLink
     from rmpa.bridge.services.io.connection_pool import ServicePool
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.buffers import Buffer
 
@@ -84,7 +84,7 @@ class Caller(BodyReceiver):
 
     def __init__(
         self,
-        link: BodyLink,
+        link: PeerLink,
         requests: int,
         what: str,
         budgets: Budgets,
@@ -204,7 +204,7 @@ class Server(BodyReceiver):
 
     def __init__(
         self,
-        link: BodyLink,
+        link: PeerLink,
         route: int,
         pool: ServicePool,
         timeout: float,

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
-    from rmpa.bridge.data.io.route_sender import DataLink, RouteSender
+    from rmpa.bridge.data.io.route_sender import RouteSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.publication import Publication
@@ -137,7 +138,7 @@ class LocalSubscriptions:
             connection.close()
         self._drop(source)
 
-    def add_route(self, action: AddRoute, link: DataLink) -> None:
+    def add_route(self, action: AddRoute, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
 
         Raises:
