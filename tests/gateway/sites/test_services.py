@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.io.service_part import SiteServices
+from rmpa.gateway.sites.io.service_exports import SiteServiceExports
+from rmpa.gateway.sites.io.service_imports import SiteServiceImports
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.part import SiteExport, SiteImport
 from rmpa.gateway.sites.services import asked_type, read_description, write_description
@@ -70,20 +71,15 @@ class Sites:
     def __init__(self, timeout: float = 30.0, why_not: str = "") -> None:
         self.session = LoopbackSession()
         self.there, self.here = ServiceGraph(), ServiceGraph()
-        self.exporter = self._part("warehouse", self.there, timeout, why_not)
-        self.importer = self._part("office", self.here, timeout, "")
+        session, there, here = (cast("Any", each) for each in (self.session, self.there, self.here))
+
+        def refusal(asker: str, _source: object) -> str:
+            return f"{asker}: {why_not}" if why_not else ""
+
+        self.exporter = SiteServiceExports("warehouse", session, there, lambda _: timeout, refusal)
+        self.importer = SiteServiceImports("office", session, here, lambda _: timeout, lambda: 1)
         self.exporter.export(EXPORT)
         self.importer.show(IMPORT)
-
-    def _part(self, site: str, graph: ServiceGraph, timeout: float, why_not: str) -> SiteServices:
-        return SiteServices(
-            site,
-            cast("Any", self.session),
-            cast("Any", graph),
-            lambda _: timeout,
-            lambda asker, _: f"{asker}: {why_not}" if why_not else "",
-            lambda: 1,
-        )
 
     async def call(self, request: bytes = b"") -> bytes:
         answer: bytes = await self.here.shown[FOREIGN][0](request)

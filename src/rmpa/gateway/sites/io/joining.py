@@ -16,7 +16,8 @@ from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.io.neighbour import SiteNeighbour
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports
-from rmpa.gateway.sites.io.service_part import SiteServices
+from rmpa.gateway.sites.io.service_exports import SiteServiceExports
+from rmpa.gateway.sites.io.service_imports import SiteServiceImports
 from rmpa.gateway.sites.io.site_answers import SiteAnswers
 from rmpa.gateway.sites.io.site_why import SiteWhy
 from rmpa.gateway.sites.io.topic_part import SiteTopics
@@ -46,7 +47,8 @@ def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
 
     parts: list[SitePart] = [
         SiteTopics(gateway.site, graph, session, rules, settings.make_contracts(), clock, counters),
-        SiteServices(gateway.site, session, graph, policy.timeout, why_not, clock.wall_ns),
+        SiteServiceExports(gateway.site, session, graph, policy.timeout, why_not),
+        SiteServiceImports(gateway.site, session, graph, policy.timeout, clock.wall_ns),
         SiteActions(graph.attend),
     ]
     own = SiteGateway(gateway.site, gateway.rank, secrets.token_hex(16))

@@ -108,12 +108,15 @@ class SiteNeighbour:
 
     def report(self) -> dict[str, object]:
         """Sites, modules, what crosses and what does not, as JSON values."""
+        parts: dict[str, dict[str, object]] = {}
+        for part in self._parts:
+            parts.setdefault(part.name, {}).update(part.report())
         return {
             "site": self._own.site,
             "sites": sites_report(self.catalogue, self.imports),
             "refused": refusals_report(self.exports, self.imports),
             "counters": site_counts(self.catalogue.counters),
-            "parts": {part.name: part.report() for part in self._parts},
+            "parts": parts,
         }
 
     # --- changes --------------------------------------------------------------------------------------------------

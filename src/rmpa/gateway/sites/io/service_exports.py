@@ -15,6 +15,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import SiteAttachment
 from rmpa.gateway.sites.keys import UNKNOWN_TYPE, data_key
+from rmpa.gateway.sites.part import SitePart
 from rmpa.gateway.sites.services import (
     DESCRIPTION,
     NO_MD5,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.sites.part import SiteExport
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.wire.services import ServiceDescription
@@ -55,9 +57,22 @@ class _Exported:
     refused: int = 0
     problem: str = ""
 
+    def report(self) -> dict[str, object]:
+        return {
+            "module": self.source.module,
+            "node": self.source.node,
+            "name": self.source.name,
+            "to": self.to,
+            "type": self.description.type if self.description is not None else self.source.type,
+            "calls": self.calls,
+            "failed": self.failed,
+            "refused": self.refused,
+            "problem": self.problem,
+        }
 
-class SiteServiceExports:
-    """The services of this site, as queryables.
+
+class SiteServiceExports(SitePart):
+    """The services of this site, as queryables: a ``SitePart``.
 
     Args:
         site: This site's name.
@@ -67,6 +82,8 @@ class SiteServiceExports:
         why_not: ``(site, source)``: why a site may not call a service; empty if it may. The site is empty for
             programs that do not tell theirs.
     """
+
+    name = "services"
 
     def __init__(
         self,
@@ -85,24 +102,23 @@ class SiteServiceExports:
         """By module, service and the site that it is for."""
         self._bytes = 0
 
-    def export(self, source: MeshSource, to: str = "") -> None:
-        """Let other sites call a service.
-
-        Args:
-            source: The service.
-            to: The one other site that may; empty: all.
-        """
-        self.withdraw(source, to)
+    def export(self, entry: SiteExport) -> None:
+        """Let other sites call a service."""
+        self.withdraw(entry)
+        source, to = entry.source, entry.announced.to
+        if source.kind is not SourceKind.SERVICE:
+            return
         key = data_key(self._site, source.module, SourceKind.SERVICE, UNKNOWN_TYPE, source.name, to)
         queryable = self._session.queryable(key, lambda query: self._take(source, to, query), _NEEDS)
         slots = asyncio.Semaphore(limits.SITE_CALLS_AT_ONCE)
         self._exported[source.module, source.name, to] = _Exported(source, to, queryable, slots)
 
-    def withdraw(self, source: MeshSource, to: str = "") -> None:
-        """End that; calls under way end as the server lets them."""
-        entry = self._exported.pop((source.module, source.name, to), None)
-        if entry is not None:
-            entry.queryable.close()
+    def withdraw(self, entry: SiteExport) -> None:
+        """Take it back; calls under way end as the server lets them."""
+        if entry.source.kind is SourceKind.SERVICE:
+            known = self._exported.pop((entry.source.module, entry.source.name, entry.announced.to), None)
+            if known is not None:
+                known.queryable.close()
 
     async def close(self) -> None:
         """Withdraw all services; calls under way get an error."""
@@ -115,23 +131,9 @@ class SiteServiceExports:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def report(self) -> list[dict[str, object]]:
-        """What ``rmpa site info`` shows of each, as JSON values."""
-        return [
-            {
-                "module": entry.source.module,
-                "node": entry.source.node,
-                "name": entry.source.name,
-                "to": entry.to,
-                "type": entry.description.type if entry.description is not None else entry.source.type,
-                "calls": entry.calls,
-                "failed": entry.failed,
-                "refused": entry.refused,
-                "under_way": len(entry.tasks),
-                "problem": entry.problem,
-            }
-            for entry in self._exported.values()
-        ]
+    def report(self) -> dict[str, object]:
+        """What ``rmpa why`` is answered from, as JSON values."""
+        return {"out": [entry.report() for entry in self._exported.values()]}
 
     # --- inside ---------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.sites.part import SitePart
 from rmpa.gateway.sites.services import DESCRIPTION, NO_MD5, read_description, unanswered
 from rmpa.gateway.zenoh_api import ZenohPriority
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import ForeignSource
     from rmpa.gateway.sites.keys import SiteSource
+    from rmpa.gateway.sites.part import SiteImport
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.services import ServiceDescription
 
@@ -37,9 +40,22 @@ class _Imported:
     failed: int = 0
     problem: str = ""
 
+    def report(self) -> dict[str, object]:
+        return {
+            "site": self.source.module.site,
+            "module": self.source.module.name,
+            "node": self.source.node,
+            "name": self.source.name,
+            "here": self.foreign.name,
+            "type": self.description.type if self.description is not None else self.source.type,
+            "calls": self.calls,
+            "failed": self.failed,
+            "problem": (self.service.problem if self.service is not None else "") or self.problem,
+        }
 
-class SiteServiceImports:
-    """The services of other sites in the gateway's graph.
+
+class SiteServiceImports(SitePart):
+    """The services of other sites in the gateway's graph: a ``SitePart``.
 
     Args:
         site: This site's name.
@@ -48,6 +64,8 @@ class SiteServiceImports:
         timeout: Seconds that a call may take, by the service's name in the gateway's graph (``[[service]]``).
         stamp: The wall clock, nanoseconds since 1970.
     """
+
+    name = "services"
 
     def __init__(
         self,
@@ -65,60 +83,48 @@ class SiteServiceImports:
         self._numbers = itertools.count(1)
         self._imported: dict[ForeignSource, _Imported] = {}
 
-    def show(self, foreign: ForeignSource, source: SiteSource) -> None:
-        """Show a service.
+    def show(self, entry: SiteImport) -> None:
+        """Show a service."""
+        foreign = entry.source
+        self._hide(foreign)
+        if foreign.kind is SourceKind.SERVICE:
+            made = self._imported[foreign] = _Imported(entry.announced, foreign)
+            made.service = self._graph.show_service(
+                foreign, lambda request: self._call(made, request), lambda: self._describe(made)
+            )
 
-        Args:
-            foreign: The service under its name here.
-            source: What its token says.
-        """
-        self.hide(foreign)
-        entry = _Imported(source, foreign)
-        self._imported[foreign] = entry
-        entry.service = self._graph.show_service(
-            foreign, lambda request: self._call(entry, request), lambda: self._describe(entry)
-        )
-
-    def renew(self, foreign: ForeignSource, source: SiteSource) -> None:
+    def renew(self, old: SiteImport, new: SiteImport) -> None:
         """A service is of another run of its module: calls under way end with an error, and its type is unknown."""
-        entry = self._imported.get(foreign)
+        if old.source != new.source:
+            self._hide(old.source)
+        entry = self._imported.get(new.source)
         if entry is None:
-            self.show(foreign, source)
+            self.show(new)
             return
         entry.gone.set()
-        entry.source, entry.description, entry.gone = source, None, asyncio.Event()
+        entry.source, entry.description, entry.gone = new.announced, None, asyncio.Event()
 
-    def hide(self, foreign: ForeignSource) -> None:
+    def hide(self, entry: SiteImport) -> None:
         """Take a service back; calls under way end with an error at once."""
+        self._hide(entry.source)
+
+    async def close(self) -> None:
+        """Take all services back."""
+        for foreign in list(self._imported):
+            self._hide(foreign)
+
+    def report(self) -> dict[str, object]:
+        """What ``rmpa why`` is answered from, as JSON values."""
+        return {"in": [entry.report() for entry in self._imported.values()]}
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+
+    def _hide(self, foreign: ForeignSource) -> None:
         entry = self._imported.pop(foreign, None)
         if entry is not None:
             entry.gone.set()
             if entry.service is not None:
                 entry.service.close()
-
-    def close(self) -> None:
-        """Take all services back."""
-        for foreign in list(self._imported):
-            self.hide(foreign)
-
-    def report(self) -> list[dict[str, object]]:
-        """What ``rmpa site info`` shows of each, as JSON values."""
-        return [
-            {
-                "site": entry.source.module.site,
-                "module": entry.source.module.name,
-                "node": entry.source.node,
-                "name": entry.source.name,
-                "here": entry.foreign.name,
-                "type": entry.description.type if entry.description is not None else entry.source.type,
-                "calls": entry.calls,
-                "failed": entry.failed,
-                "problem": (entry.service.problem if entry.service is not None else "") or entry.problem,
-            }
-            for entry in self._imported.values()
-        ]
-
-    # --- inside ---------------------------------------------------------------------------------------------------
 
     async def _call(self, entry: _Imported, request: bytes) -> bytes:
         """Call the service.
