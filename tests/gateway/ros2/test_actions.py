@@ -228,7 +228,6 @@ def test_a_goal_of_ros1_is_sent_accepted_and_ends_with_its_result() -> None:
     assert FEEDBACK.deserialize(told).feedback.feedback == 3
     goals.answered("get_result", uuid, response(Ros2Status.SUCCEEDED))
     assert results_of(out) == [(Ros1Status.SUCCEEDED, "", b"\x08\0\0\0")]
-    assert goals.active == 0
 
 
 @pytest.mark.parametrize(
@@ -284,7 +283,7 @@ def test_a_cancellation_that_the_server_refuses_may_be_asked_for_again() -> None
         goals.answered("cancel_goal", uuid, cancel_response(1, []))
     goals.cancel(GoalId("g1").serialize())
     goals.failed("cancel_goal", uuid, "no answer")
-    assert goals.active == 1
+    assert not results_of(out), "it goes on"
 
 
 def test_another_goals_cancellation_does_not_end_a_goal() -> None:
@@ -409,7 +408,6 @@ def test_a_goal_that_vanishes_from_the_status_of_its_server_is_lost() -> None:
     assert not waiting.response
     goals.status(states_message("another", Ros1Status.ACTIVE))
     assert waiting.response == response(Ros2Status.ABORTED, 0)
-    assert goals.active == 0
     out.told.clear()
     goals.status(states_message("another", Ros1Status.ACTIVE))
     assert not out.told, "once"

@@ -15,10 +15,6 @@ class SequenceCounter:
         self._announced = 0
         self._expects_first = False
         self._gaps = 0
-        self.received = 0
-        """Messages that were new."""
-        self.old = 0
-        """Messages that were not newer than the last one."""
 
     @property
     def lost(self) -> int:
@@ -41,12 +37,10 @@ class SequenceCounter:
         elif self._expects_first:
             self._gaps += max(0, sequence - self._last - 1)
         elif sequence <= self._last:
-            self.old += 1
             return False
         else:
             self._gaps += sequence - self._last - 1
         self._last, self._expects_first = sequence, False
-        self.received += 1
         return True
 
     def announced(self, run: int, sequence: int) -> None:

@@ -40,10 +40,6 @@ class ActionGoals(Protocol):
 
     pair: ActionPair
 
-    @property
-    def active(self) -> int:
-        """Goals that have not ended."""
-
     def server_gone(self) -> None:
         """The server is gone: all goals end as aborted."""
 

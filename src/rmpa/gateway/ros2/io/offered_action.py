@@ -78,11 +78,6 @@ class GoalsToRos1:
         self._goals: dict[str, _Goal] = {}
         """By the id in ROS 1, which is the text of the UUID."""
 
-    @property
-    def active(self) -> int:
-        """Goals that have not ended."""
-        return sum(not goal.ended for goal in self._goals.values())
-
     # --- from the clients of ROS 2 --------------------------------------------------------------------------------
 
     def send_goal(self, query: ArrivedQuery) -> None:

@@ -70,11 +70,6 @@ class GoalsToRos2:
         self._goals: dict[bytes, _Goal] = {}
         self._next_status: float | None = None
 
-    @property
-    def active(self) -> int:
-        """Goals that have not ended."""
-        return sum(goal.ended is None for goal in self._goals.values())
-
     # --- from the clients of ROS 1 -------------------------------------------------------------------------------
 
     def goal(self, raw: Buffer) -> None:
