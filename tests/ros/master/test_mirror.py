@@ -87,12 +87,13 @@ def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
     assert pair.look() == []
     assert GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.mirror.take_changes()
-    state = pair.mirror.state()
+    state = pair.mirror.registrations.state()
     assert state == pair.master.registrations.state()
     assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}
-    assert (pair.mirror.publishers("/t"), pair.mirror.type_of("/t")) == ({"/p": THEIRS}, STRING)
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
+    assert pair.mirror.registrations.types()["/t"] == STRING
     pair.look()
-    assert pair.mirror.state() is state, "nothing is new"
+    assert pair.mirror.registrations.state() is state, "nothing is new"
     assert pair.changes() == set()
 
 
@@ -116,7 +117,7 @@ def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> Non
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:10", MOVED)
     pair.look()
     assert pair.changes() == {(sign, name, "/p") for sign in "+-" for name in ("/t", "/srv")}
-    assert pair.mirror.state() == pair.master.registrations.state()
+    assert pair.mirror.registrations.state() == pair.master.registrations.state()
 
 
 def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
@@ -124,7 +125,7 @@ def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     pair.look()
     pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
     pair.look()
-    assert pair.mirror.type_of("/t") == STRING
+    assert pair.mirror.registrations.types()["/t"] == STRING
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
     pair.mirror.take_changes()
@@ -144,7 +145,7 @@ def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     pair.look()
     changes = {(change.name, change.node, change.type) for change in pair.mirror.take_changes()}
     assert changes == {("/t", "/p", STRING), ("/u", "/s", STRING)}
-    assert pair.mirror.state() == pair.master.registrations.state()
+    assert pair.mirror.registrations.state() == pair.master.registrations.state()
 
 
 def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -> None:
@@ -154,7 +155,7 @@ def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
     pair.flush()
     pair.mirror.update(survey, seen)
-    assert pair.mirror.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
+    assert pair.mirror.registrations.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
     assert pair.look() == []
 
 
@@ -164,16 +165,16 @@ def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pai
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
     assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
-    assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
     assert pair.mirror.update(survey, seen) == []
-    assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/rmpa": OURS}
     pair.flush()
     assert pair.look() == []
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
     assert pair.mirror.update(survey, seen) == []
-    assert pair.mirror.publishers("/t") == {}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {}
 
 
 def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
@@ -192,7 +193,7 @@ def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
     assert sorted(pair.look()) == sorted(calls)
     pair.flush()
     assert pair.look() == []
-    assert pair.mirror.state() == pair.master.registrations.state()
+    assert pair.mirror.registrations.state() == pair.master.registrations.state()
     for method, params in pair.mirror.unregister_calls():
         pair.call(method, *params)
     pair.flush()
@@ -205,12 +206,12 @@ def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> N
     pair.look()
     pair.restart()
     pair.look()
-    assert pair.mirror.publishers("/t") == {"/dies": THEIRS, "/returns": MOVED}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/dies": THEIRS, "/returns": MOVED}
     pair.theirs("registerPublisher", "/returns", "/other", STRING, "http://127.0.0.1:4/")
     pair.mirror.mark_dead("/dies", THEIRS)
     pair.look()
-    assert pair.mirror.publishers("/t") == {}
-    assert pair.mirror.state().nodes == {"/returns": "http://127.0.0.1:4/"}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {}
+    assert pair.mirror.registrations.state().nodes == {"/returns": "http://127.0.0.1:4/"}
 
 
 def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
@@ -222,11 +223,12 @@ def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     assert pair.changes() == {("-", "/t", "/p")}
     pair.mirror.mark_alive("/p")
     pair.look()
-    assert pair.mirror.publishers("/t") == {"/p": THEIRS}
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
     pair.mirror.mark_dead("/p", THEIRS)
     pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
     pair.look()
-    assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
+    assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": MOVED}
+    assert not pair.mirror.dead
 
 
 def test_missing_registrations_are_sent_again(pair: Pair) -> None:
@@ -238,7 +240,7 @@ def test_missing_registrations_are_sent_again(pair: Pair) -> None:
     assert pair.look() == [("unregisterPublisher", ("/rmpa", "/t", OURS))]
     pair.flush()
     assert pair.look() == []
-    assert pair.mirror.state() == pair.master.registrations.state()
+    assert pair.mirror.registrations.state() == pair.master.registrations.state()
 
 
 def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
@@ -249,13 +251,13 @@ def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     pair.changes()
     assert pair.look() == []
     assert pair.changes() == {("-", "/srv", "/rmpa/b/n"), ("+", "/srv", "/local")}
-    assert pair.mirror.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
+    assert pair.mirror.registrations.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
 
 
 def test_what_the_master_does_not_take_is_none(pair: Pair) -> None:
     pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     pair.mirror.forget(("registerPublisher", ("/rmpa", "/t", STRING, OURS)))
-    assert pair.mirror.state().publishers == {}
+    assert pair.mirror.registrations.state().publishers == {}
     assert pair.look() == []
     assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t"]).code == -1
     assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t", STRING, 5]).code == -1
@@ -287,7 +289,7 @@ def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcVa
         return
     mirror = Mirror()
     mirror.update(survey, 0)
-    assert set(mirror.state().nodes) <= set(survey.uris)
+    assert set(mirror.registrations.state().nodes) <= set(survey.uris)
 
 
 def test_what_a_survey_shows_of_a_node_between_two_of_its_registrations_goes_again(pair: Pair) -> None:
@@ -303,7 +305,7 @@ def test_what_a_survey_shows_of_a_node_between_two_of_its_registrations_goes_aga
     pair.look()
     pair.flush()
     assert pair.look() == []
-    assert set(pair.mirror.state().publishers) == set(pair.master.registrations.state().publishers) == {"/a"}
+    assert set(pair.mirror.registrations.published()) == set(pair.master.registrations.published()) == {"/a"}
 
 
 NAMES: Final = st.sampled_from(["/a", "/b"])
@@ -341,7 +343,7 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     pair.look()
     pair.flush()
     assert pair.look() == []
-    mirror, master = pair.mirror.state(), pair.master.registrations.state()
+    mirror, master = pair.mirror.registrations.state(), pair.master.registrations.state()
     assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (
         master.publishers,
         master.subscribers,

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Protocol
 
+from rmpa.core.log import logged_failure
+from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.registrations import ANY_TYPE
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.core.counters import Counters
     from rmpa.ros.master.effects import GraphChange, GraphState
     from rmpa.ros.master.reachability import Unreachable
+    from rmpa.ros.master.registrations import Registrations
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+
+
+_log = logging.getLogger(__name__)
 
 
 class Core(Protocol):
     """The local graph: read at any time, changed by ``call``, observed by ``on_change``."""
 
     counters: Counters
+    registrations: Registrations
+    """The local graph's tables, or a copy of a real roscore's."""
+    listeners: list[Callable[[GraphChange], None]]
 
     @property
     def uri(self) -> str:
@@ -62,18 +74,31 @@ class Core(Protocol):
 
     def state(self) -> GraphState:
         """All known registrations; the same object until one changes."""
+        return self.registrations.state()
 
     def publishers(self, topic: str) -> Mapping[str, str]:
         """The publishers of a topic with their slave APIs; never changed afterwards."""
+        return self.registrations.at(RegistrationKind.PUBLISHER, topic)
 
     def subscribers(self, topic: str) -> Mapping[str, str]:
         """The subscribers of a topic with their slave APIs; never changed afterwards."""
+        return self.registrations.at(RegistrationKind.SUBSCRIBER, topic)
 
     def type_of(self, topic: str) -> str:
         """The type last registered for a topic; ``*`` for none."""
+        return self.registrations.types().get(topic, ANY_TYPE)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change of a registration."""
+        self.listeners.append(callback)
+
+    def report(self, changes: Iterable[GraphChange]) -> None:
+        """Log changes and call the listeners, in order; an exception of one is logged, and affects no other."""
+        for change in changes:
+            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
+            for callback in self.listeners:
+                with logged_failure(_log, "a listener failed at %s", change):
+                    callback(change)
 
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
         """Let ``callback`` answer ``lookupService`` for each caller.

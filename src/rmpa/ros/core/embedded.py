@@ -13,16 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
 from rmpa.ros.core.api import Core
-from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness
 from rmpa.ros.core.notifier import Notifier
 from rmpa.ros.core.returned_publishers import ReturnedPublishers
 from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.master.master_api import MasterApi
-from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.runtime.descriptors import Use
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 
@@ -30,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from rmpa.ros.master.effects import GraphChange, GraphState
     from rmpa.ros.master.reachability import Unreachable
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
@@ -83,7 +79,8 @@ class RosCore(Core):
         self._liveness: Liveness | None = None
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
-        self._listeners = GraphListeners()
+        self.registrations = self._api.registrations
+        self.listeners = []
         self._returned = ReturnedPublishers(self._repeat_publishers)
         self.on_change(self._returned.graph_changed)
         self.stored: CoreState | None = None
@@ -189,21 +186,6 @@ class RosCore(Core):
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
         return self.call(method, *params)
 
-    def state(self) -> GraphState:
-        return self._api.state()
-
-    def publishers(self, topic: str) -> Mapping[str, str]:
-        return self._api.registrations.at(RegistrationKind.PUBLISHER, topic)
-
-    def subscribers(self, topic: str) -> Mapping[str, str]:
-        return self._api.registrations.at(RegistrationKind.SUBSCRIBER, topic)
-
-    def type_of(self, topic: str) -> str:
-        return self._api.registrations.types().get(topic, ANY_TYPE)
-
-    def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        self._listeners.add(callback)
-
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
         self._api.service_lookup = callback
         return True
@@ -238,7 +220,7 @@ class RosCore(Core):
         if self._notifier is not None:
             for effect in effects:
                 self._notifier.add(effect)
-        self._listeners.notify(changes)
+        self.report(changes)
 
     def _repeat_publishers(self, topics: list[str]) -> None:
         for topic in yielding_to_data(topics):  # a thousand peers that return have 20,000

@@ -18,7 +18,6 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.api import Core
-from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.client import call, call_api, exchange, read_response
 from rmpa.ros.master.mirror import REGISTRATIONS, Mirror
@@ -30,7 +29,6 @@ from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.ros.master.effects import GraphChange, GraphState
     from rmpa.ros.master.reachability import Unreachable
 
 _log = logging.getLogger(__name__)
@@ -86,7 +84,8 @@ class ExternalCore(Core):
         self._node_address = node_address
         self._mirror = Mirror(yielder=yielding_to_data)
         self._liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
-        self._listeners = GraphListeners()
+        self.registrations = self._mirror.registrations
+        self.listeners = []
         self._writes: deque[_Write] = deque()
         self._written = asyncio.Event()
         self._written.set()
@@ -191,21 +190,6 @@ class ExternalCore(Core):
             return await done
         await self._written.wait()
         return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
-
-    def state(self) -> GraphState:
-        return self._mirror.state()
-
-    def publishers(self, topic: str) -> Mapping[str, str]:
-        return self._mirror.publishers(topic)
-
-    def subscribers(self, topic: str) -> Mapping[str, str]:
-        return self._mirror.subscribers(topic)
-
-    def type_of(self, topic: str) -> str:
-        return self._mirror.type_of(topic)
-
-    def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        self._listeners.add(callback)
 
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - a roscore has no such hook
         return False
@@ -403,7 +387,7 @@ class ExternalCore(Core):
     # --- changes of the graph and of the master ---------------------------------------------------------------
 
     def _report_changes(self) -> None:
-        self._listeners.notify(yielding_to_data(self._mirror.take_changes()))
+        self.report(yielding_to_data(self._mirror.take_changes()))
 
     def _found(self) -> None:
         if self._problem:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from rmpa.ros.master.effects import GraphChange, GraphState, RegistrationKind
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 
@@ -56,7 +56,7 @@ class Mirror:
 
     def __init__(self, *, yielder: Yielder = iter) -> None:
         self._yielder = yielder
-        self._known = Registrations()
+        self.registrations = Registrations()
         self._own: dict[Entry, _Own] = {}
         # Registrations changed by ``apply`` since the last survey began, with the number of that call: the survey may
         # not show the change yet.
@@ -81,22 +81,6 @@ class Mirror:
         """Nodes that were found dead, and their slave APIs."""
         return self._dead
 
-    def state(self) -> GraphState:
-        """All registrations; the same object until something changes."""
-        return self._known.state()
-
-    def publishers(self, topic: str) -> Mapping[str, str]:
-        """The nodes that publish a topic, and their slave APIs."""
-        return self._known.at(RegistrationKind.PUBLISHER, topic)
-
-    def subscribers(self, topic: str) -> Mapping[str, str]:
-        """The nodes that subscribe to a topic, and their slave APIs."""
-        return self._known.at(RegistrationKind.SUBSCRIBER, topic)
-
-    def type_of(self, topic: str) -> str:
-        """The type of a topic; ``*`` for none."""
-        return self._known.types().get(topic, ANY_TYPE)
-
     def is_ours(self, node: str) -> bool:
         """Whether the agent registered something for this node."""
         return any(entry[2] == node for entry in self._own)
@@ -104,7 +88,7 @@ class Mirror:
     def others(self) -> dict[str, str]:
         """The nodes that are not the agent's, with their slave APIs."""
         ours = {node for _, _, node in self._own}
-        return {node: api for node, api in self._known.nodes().items() if node not in ours}
+        return {node: api for node, api in self.registrations.nodes().items() if node not in ours}
 
     def unregister_calls(self) -> list[Call]:
         """The calls that unregister all that the agent registered, the latest registration first."""
@@ -112,8 +96,8 @@ class Mirror:
 
     def take_changes(self) -> list[GraphChange]:
         """Return the changes since the previous call of this method."""
-        self._known.effects.clear()  # the master notifies the nodes
-        changes, self._known.changes = self._known.changes, []
+        self.registrations.effects.clear()  # the master notifies the nodes
+        changes, self.registrations.changes = self.registrations.changes, []
         return changes
 
     # --- the agent's own registrations ------------------------------------------------------------------------
@@ -135,15 +119,15 @@ class Mirror:
         value: XmlRpcValue = 1
         match kind, words:
             case RegistrationKind.PUBLISHER, [node, key, type_name, api]:
-                self._known.register_publisher(key, type_name, node, api)
+                self.registrations.register_publisher(key, type_name, node, api)
                 undo: Call = "unregisterPublisher", (node, key, api)
-                value = self._known.apis(RegistrationKind.SUBSCRIBER, key)
+                value = self.registrations.apis(RegistrationKind.SUBSCRIBER, key)
             case RegistrationKind.SUBSCRIBER, [node, key, type_name, api]:
-                self._known.register_subscriber(key, type_name, node, api)
+                self.registrations.register_subscriber(key, type_name, node, api)
                 undo = "unregisterSubscriber", (node, key, api)
-                value = self._known.apis(RegistrationKind.PUBLISHER, key)
+                value = self.registrations.apis(RegistrationKind.PUBLISHER, key)
             case RegistrationKind.SERVICE, [node, key, uri, api]:
-                self._known.register_service(key, uri, node, api)
+                self.registrations.register_service(key, uri, node, api)
                 undo = "unregisterService", (node, key, uri)
             case _, [node, api, key]:
                 undo = "unsubscribeParam", (node, api, key)
@@ -171,9 +155,9 @@ class Mirror:
     def _forget(self, kind: RegistrationKind, key: str, node: str) -> None:
         own = self._own.pop((kind, key, node))
         if kind is RegistrationKind.SERVICE:
-            self._known.unregister_service(key, str(own.undo[1][2]), node)
+            self.registrations.unregister_service(key, str(own.undo[1][2]), node)
         elif kind is not RegistrationKind.PARAM:
-            self._known.unregister(kind, key, node, own.api)
+            self.registrations.unregister(kind, key, node, own.api)
 
     # --- the others -------------------------------------------------------------------------------------------
 
@@ -181,7 +165,7 @@ class Mirror:
         """Remove a dead node from the copy, and ignore the registrations that the master still has of it."""
         self._dead[node] = api
         self._orphans.pop(node, None)
-        self._known.purge(node, api)
+        self.registrations.purge(node, api)
 
     def mark_alive(self, node: str) -> None:
         """Undo ``mark_dead``: the next survey shows the node again."""
@@ -245,7 +229,7 @@ class Mirror:
         passed: set[str],
         survey: Survey,
     ) -> None:
-        for key, nodes in self._yielder(self._known.providers(kind)):
+        for key, nodes in self._yielder(self.registrations.providers(kind)):
             there = table.get(key, ())
             for node, api in nodes.items():
                 # A survey showed what a node of ours had before, while it had no registration by which it was known.
@@ -254,10 +238,10 @@ class Mirror:
                     continue
                 if leftover or node not in there or survey.uris.get(node) != api:
                     if kind is RegistrationKind.SERVICE:
-                        uri = self._known.service_uri(key)
-                        self._known.unregister_service(key, uri or "", node)
+                        uri = self.registrations.service_uri(key)
+                        self.registrations.unregister_service(key, uri or "", node)
                     else:
-                        self._known.unregister(kind, key, node, api)
+                        self.registrations.unregister(kind, key, node, api)
 
     def _add_new(
         self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
@@ -267,39 +251,41 @@ class Mirror:
                 api = survey.uris.get(node)
                 if node in passed or api is None:
                     continue
-                known = self._known.at(kind, key).get(node) == api
+                known = self.registrations.at(kind, key).get(node) == api
                 match kind:
                     case RegistrationKind.PUBLISHER if not known:
-                        self._known.register_publisher(key, survey.types.get(key, ANY_TYPE), node, api)
+                        self.registrations.register_publisher(key, survey.types.get(key, ANY_TYPE), node, api)
                     case RegistrationKind.SUBSCRIBER if not known:
-                        self._known.register_subscriber(key, survey.types.get(key, ANY_TYPE), node, api)
+                        self.registrations.register_subscriber(key, survey.types.get(key, ANY_TYPE), node, api)
                     case RegistrationKind.SERVICE if key in survey.services:
                         self._take_service(key, survey.services[key], node, api, seen)
 
     def _take_service(self, service: str, uri: str, node: str, api: str, seen: int) -> None:
-        if self._known.service_uri(service) == uri and node in self._known.at(RegistrationKind.SERVICE, service):
+        if self.registrations.service_uri(service) == uri and node in self.registrations.at(
+            RegistrationKind.SERVICE, service
+        ):
             return
-        for ours in tuple(self._known.at(RegistrationKind.SERVICE, service)):
+        for ours in tuple(self.registrations.at(RegistrationKind.SERVICE, service)):
             entry = RegistrationKind.SERVICE, service, ours
             if entry in self._own:
                 if self._touched.get(entry, 0) > seen:
                     return
                 # The last provider of a service counts: the agent's was replaced, and is not registered again.
                 self._forget(*entry)
-        self._known.register_service(service, uri, node, api)
+        self.registrations.register_service(service, uri, node, api)
 
     def _update_types(self, survey: Survey, passed: set[str]) -> None:
         """Update the types of topics: the master has the type that was registered last."""
-        types = self._known.types()
+        types = self.registrations.types()
         for topic, type_name in self._yielder(survey.types.items()):
             if types.get(topic) == type_name or type_name == ANY_TYPE:
                 continue
-            for node, api in self._known.at(RegistrationKind.PUBLISHER, topic).items():
+            for node, api in self.registrations.at(RegistrationKind.PUBLISHER, topic).items():
                 if node not in passed:
-                    self._known.register_publisher(topic, type_name, node, api)
-            if topic not in types and (nodes := self._known.at(RegistrationKind.SUBSCRIBER, topic)):
+                    self.registrations.register_publisher(topic, type_name, node, api)
+            if topic not in types and (nodes := self.registrations.at(RegistrationKind.SUBSCRIBER, topic)):
                 node, api = next(iter(nodes.items()))
-                self._known.register_subscriber(topic, type_name, node, api)
+                self.registrations.register_subscriber(topic, type_name, node, api)
 
     def _missing(self, survey: Survey, seen: int) -> list[Call]:
         again = []
