@@ -16,7 +16,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Warn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator, Mapping
+    from collections.abc import Callable, Hashable, Iterator
 
 KeyT = TypeVar("KeyT")
 LocalT = TypeVar("LocalT")
@@ -106,7 +106,8 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         self._offer = offer
         self._wire = wire
         self._renewed = renewed
-        self._offered: dict[KeyT, LocalT] = {}
+        self.offered: dict[KeyT, LocalT] = {}
+        """The entries within the limit, by key; which of them a peer is sent is decided by ``offer``."""
         self._beyond: OrderedDict[KeyT, LocalT] = OrderedDict()
         self._peers: dict[int, CataloguePeer[KeyT, LocalT, OfferT, WireT]] = {}
         self.changes = 0
@@ -115,11 +116,6 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         """The peers that have, or had when last looked at, entries to examine."""
 
     # --- entries -----------------------------------------------------------------------------------------------
-
-    @property
-    def offered(self) -> Mapping[KeyT, LocalT]:
-        """The entries within the limit, by key; which of them a peer is sent is decided by ``offer``."""
-        return self._offered
 
     @property
     def beyond(self) -> int:
@@ -135,11 +131,11 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
         Without room the entry waits until ``next_beyond`` returns it. Peers are not notified: call ``note``.
         """
-        if key not in self._offered and len(self._offered) >= self.limit:
+        if key not in self.offered and len(self.offered) >= self.limit:
             self._beyond[key] = local
             return False
         self._beyond.pop(key, None)
-        self._offered[key] = local
+        self.offered[key] = local
         return True
 
     def warning(self, what: str) -> Warn:
@@ -157,7 +153,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
     def remove(self, key: KeyT) -> bool:
         """Offer an entry no more; return whether it was within the limit."""
         self._beyond.pop(key, None)
-        return self._offered.pop(key, None) is not None
+        return self.offered.pop(key, None) is not None
 
     def next_beyond(self) -> tuple[KeyT, LocalT] | None:
         """Take the entry beyond the limit that has waited longest; it waits no longer.
@@ -165,7 +161,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         Returns:
             Its key and value; ``None`` if none waits, or there is no room.
         """
-        return self._beyond.popitem(last=False) if self._beyond and len(self._offered) < self.limit else None
+        return self._beyond.popitem(last=False) if self._beyond and len(self.offered) < self.limit else None
 
     # --- peers -------------------------------------------------------------------------------------------------
 
@@ -178,7 +174,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
             instance: The peer's run, as 32 hexadecimal digits.
             judged: Whether each entry is judged or renamed for this peer.
         """
-        self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self._offered))
+        self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self.offered))
         self._with_news[peer] = None
         return self._portion(self._peers[peer])
 
@@ -209,7 +205,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
     def note_all(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> None:
         """Have all entries examined for one peer: its rules have changed."""
-        known.news.update(dict.fromkeys(self._offered))
+        known.news.update(dict.fromkeys(self.offered))
         self._with_news = dict.fromkeys(self._peers)
 
     @property
@@ -253,7 +249,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         portion: Portion[KeyT, OfferT, WireT] = Portion()
         for key in tuple(islice(known.news, limits.ADVERTISED_AT_ONCE)):
             del known.news[key]
-            local = self._offered.get(key)
+            local = self.offered.get(key)
             offer = self._offer(known, key, local) if local is not None else None
             before = known.told.get(key)
             if before is not None and (offer is None or self._wire(offer) != self._wire(before[0])):

@@ -6,7 +6,7 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
 _Thing = TypeVar("_Thing")
 
@@ -21,18 +21,14 @@ class NodePlaces(Generic[_Thing]):
         limit: How many places there are.
     """
 
-    __slots__ = ("_refused", "_shown", "limit")
+    __slots__ = ("_shown", "limit", "refused")
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._shown: Counter[str] = Counter()
         # Ordered: taking the first item of a plain dict passes over all that were taken before it.
-        self._refused: OrderedDict[str, dict[_Thing, None]] = OrderedDict()
-
-    @property
-    def refused(self) -> Mapping[str, Mapping[_Thing, None]]:
+        self.refused: OrderedDict[str, dict[_Thing, None]] = OrderedDict()
         """The nodes without a place, and the things of each."""
-        return self._refused
 
     def free(self, node: str) -> bool:
         """Whether a node may show a thing: it has a place, or a place is free."""
@@ -40,15 +36,15 @@ class NodePlaces(Generic[_Thing]):
 
     def refuse(self, node: str, thing: _Thing) -> None:
         """Note that a thing is hidden because its node has no place."""
-        self._refused.setdefault(node, {})[thing] = None
+        self.refused.setdefault(node, {})[thing] = None
 
     def leave(self, node: str, thing: _Thing) -> None:
         """Note that a thing is shown, hidden for another reason, or gone."""
-        things = self._refused.get(node)
+        things = self.refused.get(node)
         if things is not None:
             things.pop(thing, None)
             if not things:
-                del self._refused[node]
+                del self.refused[node]
 
     def show(self, node: str) -> None:
         """Count one more thing of a node that is shown."""
@@ -65,12 +61,12 @@ class NodePlaces(Generic[_Thing]):
 
         The caller shows the things before it asks for the next node, or the place still counts as free.
         """
-        while self._refused and self.free(next(iter(self._refused))):
-            yield tuple(self._refused.popitem(last=False)[1])
+        while self.refused and self.free(next(iter(self.refused))):
+            yield tuple(self.refused.popitem(last=False)[1])
 
     def give_up(self) -> None:
         """Forget what is refused: the peer is away."""
-        self._refused.clear()
+        self.refused.clear()
 
 
 def warning(peer: str, kind: str, limit: int) -> str:

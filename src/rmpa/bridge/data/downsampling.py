@@ -10,26 +10,22 @@ class Downsampler:
         rate: Messages a second.
     """
 
-    __slots__ = ("_due", "_period", "skipped")
+    __slots__ = ("_period", "due", "skipped")
 
     def __init__(self, rate: float) -> None:
         self._period = 1 / rate
-        self._due = 0.0
+        self.due = 0.0
+        """When the next message may be sent, monotonic seconds."""
         self.skipped = 0
         """Messages left out for newer ones; the sender counts them here."""
-
-    @property
-    def due(self) -> float:
-        """When the next message may be sent, monotonic seconds."""
-        return self._due
 
     def admit(self, now: float) -> bool:
         """Whether a message may be sent now; if so, the next one is due a period later."""
         # A tenth of the period early is on time: two clocks at the same rate must not lose every other message.
-        if now < self._due - self._period / 10:
+        if now < self.due - self._period / 10:
             return False
         # Keep the phase while messages come faster than the rate; restart it after a pause.
-        self._due = max(self._due + self._period, now)
-        if self._due < now + self._period / 2:
-            self._due = now + self._period
+        self.due = max(self.due + self._period, now)
+        if self.due < now + self._period / 2:
+            self.due = now + self._period
         return True

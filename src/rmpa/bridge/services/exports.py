@@ -105,14 +105,10 @@ class ServiceExports:
             # Another server under the same name: what peers know of it may no longer be true.
             renewed=lambda before, now: before != now,
         )
-        self._seen: dict[str, LocalService] = {}
+        self.seen: dict[str, LocalService] = {}
+        """The server of every service of the local graph, whether the service crosses or not."""
         self._about: dict[str, ServiceAbout] = {}
         self._peers: dict[int, _Callers] = {}
-
-    @property
-    def seen(self) -> Mapping[str, LocalService]:
-        """The server of every service of the local graph, whether the service crosses or not."""
-        return self._seen
 
     @property
     def offered(self) -> Mapping[str, LocalService]:
@@ -164,12 +160,12 @@ class ServiceExports:
             service: The service's local name.
             server: Its server; ``None`` where there is none, or only a proxy that is not relayed.
         """
-        if self._seen.get(service) == server:
+        if self.seen.get(service) == server:
             return []
         if server is None:
-            del self._seen[service]
+            del self.seen[service]
         else:
-            self._seen[service] = server
+            self.seen[service] = server
         return self._judge(service)
 
     def apply_rules(
@@ -188,7 +184,7 @@ class ServiceExports:
 
     def _rejudge(self) -> Iterator[list[ExportAction]]:
         yield self._end_denied()
-        for service in tuple(self._seen):
+        for service in tuple(self.seen):
             yield self._judge(service)
 
     def _end_denied(self) -> list[ExportAction]:
@@ -204,7 +200,7 @@ class ServiceExports:
         return actions
 
     def _judge(self, service: str) -> list[ExportAction]:
-        server, before = self._seen.get(service), self.offered.get(service)
+        server, before = self.seen.get(service), self.offered.get(service)
         reason = "its server has gone"
         if server is not None and not self._crosses(service, server):
             server, reason = None, "a rule keeps it home now"

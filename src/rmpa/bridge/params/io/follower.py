@@ -53,7 +53,8 @@ class ParamFollower:
         self._refusals = RefusalLog(_log, counters)
         self._working: asyncio.Task[None] | None = None
         self._asking: dict[int, asyncio.Task[None]] = {}
-        self._subscribed: set[str] = set()
+        self.subscribed: set[str] = set()
+        """The keys of which the local core notifies the agent's node."""
         self._time_before: list[str | None] = []
         """What ``/use_sim_time`` was here before it was followed; empty if it was not followed."""
         self._left: set[str] = set()
@@ -114,12 +115,12 @@ class ParamFollower:
         """
         for key in [key for key in self._left if all(key != entry.rule.to for entry in self.following)]:
             await self._core.leave(key)
-            self._subscribed.discard(key)
+            self.subscribed.discard(key)
             if key == SIM_TIME and self._time_before:
                 await self._reset_time(self._time_before.pop())
         self._left.clear()
         if restarted:
-            self._subscribed.clear()
+            self.subscribed.clear()
         for entry in self.following:
             if restarted:
                 entry.due = entry.known and (entry.text is not None or entry.had)
@@ -145,11 +146,6 @@ class ParamFollower:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-    @property
-    def subscribed(self) -> set[str]:
-        """The keys of which the local core notifies the agent's node."""
-        return self._subscribed
 
     # --- the owners ----------------------------------------------------------------------------------------------
 
@@ -253,9 +249,9 @@ class ParamFollower:
             raise RemoteProtocolError(f"more than {limits.FOLLOWED_BYTES_MAX >> 20} MiB of parameters are followed")
         try:
             value = await read_text(text) if text is not None else None
-            if key not in self._subscribed:
+            if key not in self.subscribed:
                 await self._core.follow(key)
-                self._subscribed.add(key)
+                self.subscribed.add(key)
             await self._bring(entry, value)
         except RemoteProtocolError:
             entry.text, entry.known = None, False

@@ -72,18 +72,14 @@ class LocalSubscriptions:
         self._on_described = on_described
         self._on_lost = on_lost
         self._connections: dict[Source, PublisherConnection | InProcessConnection] = {}
-        self._flows: dict[Source, ExportFlow] = {}
+        self.flows: dict[Source, ExportFlow] = {}
+        """The flow of each connected source, for snapshots."""
         self._senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
         self._on_given_up = on_given_up
         self._on_missed = on_missed
-
-    @property
-    def flows(self) -> Mapping[Source, ExportFlow]:
-        """The flow of each connected source, for snapshots."""
-        return self._flows
 
     @property
     def connections(self) -> Iterable[PublisherConnection | InProcessConnection]:
@@ -93,8 +89,8 @@ class LocalSubscriptions:
     def connect(self, action: Connect) -> None:
         """Subscribe to one publisher; ``on_described`` or ``on_lost`` reports the outcome."""
         source = action.source
-        flow = self._flows[source] = ExportFlow()
-        if sum(s.topic == source.topic for s in self._flows) == 1:
+        flow = self.flows[source] = ExportFlow()
+        if sum(s.topic == source.topic for s in self.flows) == 1:
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
         _log.debug("> subscribe to %s at %s", source, action.uri)
         connection = self._connections[source] = self._connection(source, action.uri, flow)
@@ -144,7 +140,7 @@ class LocalSubscriptions:
         Raises:
             RemoteProtocolError: The peer resumes after a message that was never sent.
         """
-        flow = self._flows[action.source]
+        flow = self.flows[action.source]
         route_sender = flow.by_peer.get(action.peer)
         self._claim(action.peer, action.source)
         if (
@@ -166,7 +162,7 @@ class LocalSubscriptions:
 
     def suspend_route(self, action: SuspendRoute) -> None:
         """Keep a reliable source's messages for a peer whose link is gone; does nothing for best effort."""
-        flow = self._flows.get(action.source)
+        flow = self.flows.get(action.source)
         if flow is not None:
             route_sender = flow.by_peer.get(action.peer)
             self._forget(route_sender, action.peer)
@@ -184,12 +180,12 @@ class LocalSubscriptions:
     def back(self, peer: int) -> None:
         """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
         until = asyncio.get_running_loop().time() + mesh_limits.RESUME_CLAIM
-        self._parked.limit([(peer, source) for source in self._flows], until)
+        self._parked.limit([(peer, source) for source in self.flows], until)
         self._timer.arm()
 
     def gone(self, peer: int) -> None:
         """Give up the messages that are kept for a peer that will not come back."""
-        keys = [(peer, source) for source in self._flows]
+        keys = [(peer, source) for source in self.flows]
         self._give_up([key for key in keys if self._parked.claim(key) is not None])
 
     def remove_route(self, action: RemoveRoute) -> None:
@@ -199,13 +195,13 @@ class LocalSubscriptions:
 
     def numbering(self, source: Source, peer: int) -> ReliableSender | None:
         """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
-        flow = self._flows.get(source)
+        flow = self.flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
         return route_sender.sender if isinstance(route_sender, ReliableRouteSender) else None
 
     def _end(self, source: Source, peer: int) -> None:
         """Removes a source's sender to a peer, if there is one."""
-        flow = self._flows.get(source)
+        flow = self.flows.get(source)
         route_sender = flow.by_peer.get(peer) if flow is not None else None
         if flow is not None and route_sender is not None:
             self._forget(route_sender, peer)
@@ -220,7 +216,7 @@ class LocalSubscriptions:
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
-                route_sender = self._flows[source].by_peer.get(peer)
+                route_sender = self.flows[source].by_peer.get(peer)
                 if isinstance(route_sender, ReliableRouteSender):
                     counts[source] = route_sender.missed() + route_sender.sender.pending
             self._on_given_up(peer, counts)
@@ -253,7 +249,7 @@ class LocalSubscriptions:
             self._gone(source, self._connections[source], description.problem)
             return
         if description.latching:
-            self._flows[source].latch()
+            self.flows[source].latch()
         self._on_described(source, description)
 
     def _left_out(self, source: Source, flow: ExportFlow, size: int) -> None:
@@ -268,7 +264,7 @@ class LocalSubscriptions:
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
             self._on_malformed(source, reason)
-        numberings = {peer: self.numbering(source, peer) for peer in self._flows[source].by_peer}
+        numberings = {peer: self.numbering(source, peer) for peer in self.flows[source].by_peer}
         self._drop(source)  # first: what follows may connect the source anew
         lasts = {peer: numbering.last for peer, numbering in numberings.items() if numbering is not None}
         self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
@@ -276,11 +272,11 @@ class LocalSubscriptions:
             self._core.suspect(source.node)
 
     def _drop(self, source: Source) -> None:
-        flow = self._flows.pop(source, None)
+        flow = self.flows.pop(source, None)
         if flow is not None:
             for peer in list(flow.by_peer):
                 self._claim(peer, source)
                 self._forget(flow.by_peer[peer], peer)
             flow.close()
-        if flow is not None and not any(s.topic == source.topic for s in self._flows):
+        if flow is not None and not any(s.topic == source.topic for s in self.flows):
             self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
