@@ -73,7 +73,7 @@ class WebProcess:
         self._task = asyncio.create_task(self._supervise(), name="rmpa web")
 
     def reload(self) -> None:
-        """Have the child read its tokens and rules again; one that is not there reads them when it starts."""
+        """Have the child read its settings again; one that is not there reads them when it starts."""
         if self.pid is not None:
             with contextlib.suppress(OSError):
                 os.kill(self.pid, signal.SIGHUP)

@@ -373,13 +373,14 @@ def test_a_flood_closes_the_connection() -> None:
     assert page.others[-1].refusal == "message_rate"
 
 
-def test_the_log_is_left_out_for_a_slow_page() -> None:
+def test_new_lines_of_the_log_are_left_out_for_a_slow_page_and_kept_ones_are_not() -> None:
     page = Page()
     page.send("log", on=True)
     assert page.others == [FollowLog(True)]
     assert page.take(page.session.log([{"text": "a"}]))[0]["lines"] == [{"text": "a"}]
     page.unsent = 5
     assert page.take(page.session.log([{"text": "b"}])) == []
+    assert page.take(page.session.log([{"text": "c"}], kept=True))[0]["lines"] == [{"text": "c"}]
 
 
 def test_the_first_message_says_what_the_page_may_do() -> None:

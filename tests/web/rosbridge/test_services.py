@@ -30,6 +30,7 @@ from rmpa.web.hub.requests import (
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.encodings import decode_png
 from rmpa.web.rosbridge.rosapi import Rosapi
+from rmpa.web.values.codec import codec_for
 from tests.web.rosbridge.hub import NOW_NS, Client, Types
 
 ADD = "rospy_tutorials/AddTwoInts"
@@ -254,7 +255,7 @@ def _ask(client: Client, service: str, /, **args: Any) -> Any:
     values = answer["values"]
     # What JSON clients get is also a valid ROS response.
     rosapi = Rosapi(cast("Any", client.graph), cast("Any", Types()), lambda: NOW_NS)
-    rosapi.response_codec(f"/rosapi/{service}").write(values, 0)
+    codec_for(ServiceType(rosapi.services[f"/rosapi/{service}"]).response).write(values, 0)
     return values
 
 

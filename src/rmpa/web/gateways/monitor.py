@@ -141,9 +141,7 @@ class MonitorConnection(ClientConnection):
                 case Speed():
                     self._drive(output)
                 case FollowLog(on=True):
-                    self._monitor.log.follow(self, lambda lines: self._act(self._session.log(lines)))
-                    if (refused := self._monitor.log.refused) is not None:
-                        self._act(self._session.failed(str(refused)))
+                    self._follow_log()
                 case FollowLog():
                     self._monitor.log.unfollow(self)
                 case MonitorClose():
@@ -151,6 +149,13 @@ class MonitorConnection(ClientConnection):
                 case _:
                     self.ask(output)
         self.arm()
+
+    def _follow_log(self) -> None:
+        log = self._monitor.log
+        if kept := log.follow(self, lambda lines: self._act(self._session.log(lines))):
+            self._act(self._session.log(kept, kept=True))
+        if log.refused is not None:
+            self._act(self._session.failed(str(log.refused)))
 
     def _ask(self, question: Question) -> None:
         async def answer() -> None:

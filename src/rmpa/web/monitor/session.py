@@ -138,7 +138,6 @@ class MonitorSession:
         self._questions: set[int] = set()
         self._joystick = Joystick()
         self._opened = now
-        self.skipped = 0
 
     # --- the client ---
 
@@ -282,12 +281,10 @@ class MonitorSession:
         """What the page ordered cannot be done, and is neither a watch nor a question: driving."""
         yield self._failed(0, error, remedy)
 
-    def log(self, lines: list[dict[str, Any]]) -> Iterator[Output]:
-        """Lines of the log, oldest first; left out while the client does not take what was sent."""
-        if self._unsent() == 0:
+    def log(self, lines: list[dict[str, Any]], *, kept: bool = False) -> Iterator[Output]:
+        """Lines of the log, oldest first; new ones are left out while the client does not take what was sent."""
+        if kept or self._unsent() == 0:
             yield _text({"op": "log", "lines": lines[-limits.LOG_LINES :]})
-        else:
-            self.skipped += len(lines)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None`` for not before something else happens."""

@@ -17,7 +17,7 @@ from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 from rmpa.web.rosbridge.typedefs import typedefs_of
-from rmpa.web.values.codec import MessageCodec, codec_for
+from rmpa.web.values.codec import codec_for
 
 if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
@@ -167,10 +167,6 @@ class Rosapi:
         # Once to bytes and back: each field is there, and of its type.
         request = codec.json_values(memoryview(codec.write_arguments(arguments, 0).payload))
         return answer(request)
-
-    def response_codec(self, service: str) -> MessageCodec:
-        """Converts a service's responses."""
-        return codec_for(ServiceType(self.services[service]).response)
 
     @staticmethod
     def finish(todo: Todo, found: str = "") -> Values:

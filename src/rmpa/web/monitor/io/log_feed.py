@@ -55,12 +55,10 @@ class LogFeed:
             self._timer.cancel()
         self._hub.topics.unsubscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC)
 
-    def follow(self, page: object, show: Callable[[list[dict[str, Any]]], None]) -> None:
-        """Give a page the lines that are kept, and each further one; ``show`` takes them, oldest first."""
-        if page not in self._followers:
-            self._followers[page] = show
-            if self._lines:
-                show(list(self._lines))
+    def follow(self, page: object, show: Callable[[list[dict[str, Any]]], None]) -> list[dict[str, Any]]:
+        """Give a page each further line, by ``show``; returns those that are kept, oldest first."""
+        known, self._followers[page] = page in self._followers, show
+        return [] if known else list(self._lines)
 
     def unfollow(self, page: object) -> None:
         """End a ``follow``."""

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import GraphService, ParamValue
+    from rmpa.web.hub.requests import ParamValue
     from rmpa.web.hub.rights import NodeRules
     from rmpa.web.monitor.io.resource_watch import ResourceWatch
     from rmpa.web.monitor.session import Question
@@ -264,12 +264,6 @@ class Answers:
     async def _type_of(self, service: str) -> ServiceType:
         found = await self._hub.calls.find(service)
         return await self._hub.types.find_service(found.type)
-
-
-def _service_key(service: GraphService) -> str:
-    """The service's key in the state (``view.service_key``)."""
-    peer = proxied_peer(service.providers[0]) if service.providers else None
-    return f"{peer}:{service.name}" if peer else service.name
 
 
 async def _in_time(done: Awaitable[Any]) -> None:
