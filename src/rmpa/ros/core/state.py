@@ -84,14 +84,12 @@ def serialize(state: StoredState) -> bytes:
 
 
 def _packable(value: Any) -> Any:
-    """The value with each date as an extension; the same object where there is none."""
+    """A copy of the value, with each date as an extension."""
     match value:
         case dict():
-            parts = {name: _packable(part) for name, part in value.items()}
-            return parts if any(parts[name] is not part for name, part in value.items()) else value
+            return {name: _packable(part) for name, part in value.items()}
         case list() | tuple():
-            packed = [_packable(part) for part in value]
-            return packed if any(new is not old for new, old in zip(packed, value, strict=True)) else value
+            return [_packable(part) for part in value]
         case datetime():
             return msgspec.msgpack.Ext(_DATE, value.isoformat().encode())
     return value

@@ -74,7 +74,7 @@ class HttpConnection(asyncio.Protocol):
         self.gone: asyncio.Future[None] = self._loop.create_future()
         self.client = "?"
 
-    # --- http.eviction.Client ---------------------------------------------------------------------------------
+    # --- what http.eviction asks ------------------------------------------------------------------------------
 
     @property
     def idle(self) -> bool:

@@ -7,45 +7,20 @@ then. The slowest is closed, so that ``rostopic list`` is answered beside any nu
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from rmpa.ros.http.connection import HttpConnection
+
 _MOMENT: Final = 1e-3
 """Seconds; the least duration in the pace of a call."""
 
 
-class Client(Protocol):
-    """One connection."""
-
-    @property
-    def idle(self) -> bool:
-        """Whether no call is being received or answered, and no answer is unread."""
-
-    @property
-    def answering(self) -> bool:
-        """Whether a call is being answered: then the client is not the slow side."""
-
-    @property
-    def reserved(self) -> int:
-        """Bytes reserved for the connection's call."""
-
-    @property
-    def received(self) -> int:
-        """Received bytes of an unfinished call."""
-
-    @property
-    def begun(self) -> float:
-        """When the call began that is unfinished, or whose answer is not read yet, in monotonic seconds."""
-
-
-_C = TypeVar("_C", bound=Client)
-
-
-def for_newcomer(connections: Iterable[_C], now: float) -> _C | None:
+def for_newcomer(connections: Iterable[HttpConnection], now: float) -> HttpConnection | None:
     """Choose the connection to close for a new one; ``None`` if all are being answered.
 
     It is the slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
@@ -67,16 +42,16 @@ def for_newcomer(connections: Iterable[_C], now: float) -> _C | None:
     return min(slow or stalled, key=lambda one: _pace(one, now), default=None)
 
 
-def for_call(connections: Iterable[_C], now: float) -> _C | None:
+def for_call(connections: Iterable[HttpConnection], now: float) -> HttpConnection | None:
     """Choose the connection to close for the bytes of another call; ``None`` if none is slow."""
     slow = [one for one in connections if one.reserved and not one.answering and _is_slow(one, now)]
     return min(slow, key=lambda one: _pace(one, now), default=None)
 
 
-def _is_slow(one: Client, now: float) -> bool:
+def _is_slow(one: HttpConnection, now: float) -> bool:
     return now - one.begun > limits.HTTP_SLOW_AFTER and _pace(one, now) < limits.HTTP_PACE_MIN
 
 
-def _pace(one: Client, now: float) -> float:
+def _pace(one: HttpConnection, now: float) -> float:
     """Bytes a second; 0 for a client that does not read its answer."""
     return one.received / max(now - one.begun, _MOMENT)
