@@ -184,7 +184,7 @@ def test_a_token_that_cannot_be_used(machine: Callable[[str], Machine]) -> None:
     assert arm.status()["on"] is False  # nothing is left behind
     gripper.trust("join", token)
     err = arm.refused("join", "--name", "gripper", token)
-    assert "the token cannot be used by gripper: used" in err
+    assert "gripper cannot join: the token was used (used)" in err
     assert "each token lets one module join; ask for a new one: rmpa trust invite" in err
     assert "No such option: --yes; leave it out: nothing is asked" in arm.refused("join", "--yes", token, code=2)
     token = base.trust("invite", "--no-wait").strip()
@@ -277,4 +277,4 @@ def test_ctrl_c_withdraws_the_token(machine: Callable[[str], Machine]) -> None:
     inviting.send_signal(signal.SIGINT)
     _, err = inviting.communicate(timeout=DEADLINE)
     assert (inviting.returncode, "the token is withdrawn" in err) == (130, True), err
-    assert "the token cannot be used by arm: token" in arm.refused("join", token)
+    assert "arm cannot join: the token is unknown here (token)" in arm.refused("join", token)

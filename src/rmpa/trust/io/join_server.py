@@ -24,6 +24,7 @@ from rmpa.trust.join import (
     proof_of,
 )
 from rmpa.trust.status import JoinStep
+from rmpa.trust.tokens import TokenProblem
 
 if TYPE_CHECKING:
     import socket
@@ -38,6 +39,12 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _READ = 16 * 1024
+_PROBLEMS = {
+    TokenProblem.TOKEN: "is unknown here",
+    TokenProblem.USED: "was used",
+    TokenProblem.LATE: "has ended",
+    TokenProblem.NAME: "is for another module",
+}
 
 
 class JoinServer:
@@ -136,7 +143,7 @@ class JoinServer:
         # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
         proof = proof_of(invitation.key if invitation is not None else b"", asked.request, self._server())
         if problem is not None:
-            refused = JoinRefused(problem.value, f"the token cannot be used by {name}: {problem.value}")
+            refused = JoinRefused(problem.value, f"{name} cannot join: the token {_PROBLEMS[problem]}")
         elif not hmac.compare_digest(proof, asked.proof):
             refused = JoinRefused("token", "the request is not signed with the token's key")
         elif self._is_linked(name) or authority.has_issued(name, invitation.name if invitation is not None else ""):
