@@ -373,7 +373,7 @@ class ExternalCore(Core):
             self._other_agent, self._other_until = other, self._loop.time() + limits.MASTER_OTHER_AGENT
         again = self._mirror.update(survey, seen)
         self._report_changes()
-        if again:
+        if again and self._loop.time() >= self._other_until:
             _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
         for method, params in again:
             self._queue(_Write(method, params))
