@@ -69,7 +69,7 @@ _options = setting_options(
 @config_option
 @click.pass_context
 def gateway(context: click.Context, /, **options: object) -> int:
-    """Join this network's modules with other sites, ROS 2 and zenoh-bridge-ros1, over Zenoh.
+    """Join this network's modules with other sites and with ROS 2, over Zenoh.
 
     Topics, services, actions and parameters cross once a node at the other side asks for them.
     """
