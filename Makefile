@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-services soak-web soak-swim swim bench experiment wheel ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-services soak-web bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -80,12 +80,6 @@ soak-services: $(STAMP)  ## callers of a peer's services come and go at random; 
 
 soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web come and go for an hour; nothing may leak: make soak-web [SECONDS=3600] [SEED=N]
 	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))
-
-swim: $(STAMP)  ## figures of the failure detector at 1,000 simulated members: deaths, loss, pauses, cuts: make swim [ARGS="--members 200"]
-	$(BIN)/python -m tests.simulation.swim_figures $(ARGS)
-
-soak-swim: $(STAMP)  ## 24 simulated hours at 1 % packet loss, in which no module may be lost: make soak-swim [PEERS=32] [HOURS=24] [SEED=1]
-	$(BIN)/python -m tests.simulation --kind long --loss 0.01 --hours $(or $(HOURS),24) --peers $(or $(PEERS),32) --seed $(or $(SEED),1)
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
 	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers,web-peers]'  # a peer that cannot be installed is left out

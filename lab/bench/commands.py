@@ -16,11 +16,10 @@ from lab.bed.bench import why_no_hosts, why_no_ros
 from lab.bench import (
     crosstraffic,
     fleet,
-    fleet_graph,
     gateway,
     idle,
     load,
-    parked,
+    one_of_many,
     period,
     radio,
     roscore,
@@ -29,7 +28,6 @@ from lab.bench import (
     services,
     startup,
     storm,
-    thousand,
     throughput,
     web,
 )
@@ -100,10 +98,10 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
     ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
-    "fleet_graph": Measurement("what the topics of 999 peers cost one agent", fleet_graph.measure, needs=()),
+    "one_of_many": Measurement(
+        "one whole agent among 255 peers that are played", one_of_many.measure, (why_no_hosts, why_no_ros)
+    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
-    "parked": Measurement("how much later the first message of a parked peer arrives", parked.measure, needs=()),
-    "thousand": Measurement("a mesh of up to a thousand modules, simulated", thousand.measure, needs=()),
     "gateway": Measurement(
         "sites joined by gateways, beside a bare pair of Zenoh programs",
         gateway.measure,

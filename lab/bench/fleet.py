@@ -50,7 +50,6 @@ _WATCHERS: Final = 8
 _TOPIC: Final = "/stream"
 _SIZE: Final = 64
 _RATE: Final = 100.0
-_PRESENT: Final = frozenset({"linked", "parked"})
 _CPU_LIMIT: Final = 15.0
 _CPU_AT: Final = 32
 _RATIO_LIMIT: Final = 1.2
@@ -299,7 +298,7 @@ def _when_all(agents: Sequence[Agent], knows: Callable[[Snapshot], bool]) -> flo
 
 
 def _present(found: Snapshot) -> dict[str, PeerInfo]:
-    return {peer.name: peer for peer in found.peers if peer.state in _PRESENT}
+    return {peer.name: peer for peer in found.peers if peer.state == "linked"}
 
 
 def knows(found: Snapshot, peers: int, topics: int) -> bool:

@@ -212,10 +212,10 @@ def test_nodes_of_peers(rmpa: Rmpa, talker: str, peer: list[dict[str, Any]]) -> 
 
 
 def test_many_modules_that_do_not_tell_their_nodes_take_one_line() -> None:
-    parked = [PeerNodes(peer=f"arm{number}", nodes=(), problem="parked") for number in range(1000)]
-    told = [*parked, PeerNodes(peer="base", nodes=()), PeerNodes(peer="leg", nodes=(), problem="it is older")]
+    silent = [PeerNodes(peer=f"arm{number}", nodes=(), problem="it is stopped") for number in range(1000)]
+    told = [*silent, PeerNodes(peer="base", nodes=()), PeerNodes(peer="leg", nodes=(), problem="it is older")]
     assert list(_untold(told)) == [
-        "1,000 modules (arm0, arm1, arm2, ...) do not tell their nodes, only those that stand here: parked",
+        "1,000 modules (arm0, arm1, arm2, ...) do not tell their nodes, only those that stand here: it is stopped",
         "leg does not tell its nodes, only those that stand here: it is older",
     ]
-    assert next(_untold(parked[:2])).startswith("arm0, arm1 do not tell")
+    assert next(_untold(silent[:2])).startswith("arm0, arm1 do not tell")

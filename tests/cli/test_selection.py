@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 def peers(count: int) -> tuple[PeerInfo, ...]:
-    """So many parked peers, one of them refused."""
+    """So many relayed peers, one of them refused."""
     made = [
         PeerInfo(
             name=f"arm{n}",
             guid=f"10.0.{n // 250}.{n % 250 + 1}:40000#1",
             instance="22" * 16,
-            state="parked",
+            state="relayed",
             since_ago=9.0,
         )
         for n in range(count)
@@ -41,7 +41,7 @@ def test_a_list_of_a_thousand_begins_with_a_summary_and_the_problems(
     code, out, err = place.run("peer", "list", "--limit", "5")
     assert code == 0
     lines = out.splitlines()
-    assert lines[0] == "1,000 peers: 999 parked, 1 refused"
+    assert lines[0] == "1,000 peers: 999 relayed, 1 refused"
     assert lines[3].split()[:2] == ["arm777", "refused"]
     assert len(lines) == 1 + 1 + 1 + 5 + 1
     assert lines[-1] == "... 995 more peers; fewer: rmpa peer list 'arm*', --state linked; all: --all"
@@ -77,4 +77,4 @@ def test_a_terminal_shows_the_first_of_many_unless_all_is_said(monkeypatch: pyte
 
 
 def test_the_summary_names_the_most_frequent_first() -> None:
-    assert summary(3, "peers", ["parked", "linked", "parked"]) == "3 peers: 2 parked, 1 linked"
+    assert summary(3, "peers", ["relayed", "linked", "relayed"]) == "3 peers: 2 relayed, 1 linked"

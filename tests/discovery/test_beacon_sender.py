@@ -11,7 +11,6 @@ from rmpa.discovery.beacon_sender import BeaconSender
 from rmpa.discovery.endpoint import Endpoint, PeerInstance
 from rmpa.discovery.endpoint_table import EndpointTable
 from rmpa.discovery.events import HeardBy, SendMulticast, SendUnicast
-from rmpa.discovery.pacing import BeaconPace
 
 OWN = Identity(Guid.of("10.0.0.1", 40_001, 7), bytes(16), "own")
 
@@ -22,7 +21,7 @@ class Bench:
     def __init__(self, *, multicast: bool = True) -> None:
         self.endpoints = EndpointTable()
         self.counters = Counters()
-        self.sender = BeaconSender(OWN, self.endpoints, BeaconPace(3.0), self.counters, multicast=multicast)
+        self.sender = BeaconSender(OWN, self.endpoints, 3.0, self.counters, multicast=multicast)
 
     def peer(self, number: int, address: str = "10.0.0.2") -> PeerInstance:
         """A peer that was heard by multicast at 0."""
@@ -76,8 +75,8 @@ def test_loopback_peers_are_not_told_to_other_hosts() -> None:
 def test_peers_whose_multicasts_are_not_heard_get_unicasts() -> None:
     heard = Bench()
     peer = heard.peer(2)
-    assert heard.sender.unheard_by_multicast(peer.silence) == []
-    assert heard.sender.unheard_by_multicast(peer.silence + 0.1) == [peer]
+    assert heard.sender.unheard_by_multicast(limits.MULTICAST_SILENCE) == []
+    assert heard.sender.unheard_by_multicast(limits.MULTICAST_SILENCE + 0.1) == [peer]
     without = Bench(multicast=False)
     other = without.peer(2)
     assert without.sender.unheard_by_multicast(0.0) == [other]

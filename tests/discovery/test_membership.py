@@ -231,7 +231,7 @@ def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
     assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
 
 
-def parked(one: Harness) -> Speaker:
+def was_linked(one: Harness) -> Speaker:
     """Peer 2, which had a link."""
     speaker = Speaker(who(2))
     one.hear(speaker())
@@ -256,7 +256,7 @@ def test_a_forged_goodbye_is_refuted_by_the_next_heartbeat(one: Harness, ahead: 
 
 
 def test_a_peer_that_was_linked_is_asked_whether_it_said_goodbye(one: Harness) -> None:
-    speaker = parked(one)
+    speaker = was_linked(one)
     forger = ("10.0.0.66", 6666)
     one.hear(Speaker(who(2), 1000)(BeaconKind.GOODBYE), source=forger, multicast=False)
     assert one.present() == []
@@ -265,15 +265,6 @@ def test_a_peer_that_was_linked_is_asked_whether_it_said_goodbye(one: Harness) -
     one.hear(speaker(BeaconKind.ANSWER), multicast=False)
     assert one.present() == ["peer2"]
     assert unicasts(one.run(10.0), BeaconKind.ANNOUNCE) == [], "one announcement is enough"
-
-
-def test_news_that_a_peer_has_left_is_checked(one: Harness) -> None:
-    speaker = parked(one)
-    one.membership.peer_failed(who(2).guid, who(2).instance, one.now, LossReason.GOODBYE)
-    assert one.present() == []
-    assert unicasts(one.run(limits.GOODBYE_CHECK), BeaconKind.ANNOUNCE) == [who(2).guid.endpoint]
-    one.hear(speaker(BeaconKind.ANSWER), multicast=False)
-    assert one.present() == ["peer2"]
 
 
 def test_peers_that_were_never_linked_are_not_asked(one: Harness) -> None:
@@ -480,7 +471,7 @@ def test_a_restarted_peer_is_no_rival_of_its_dead_run_however_late_its_link_fall
     one.membership.link_up(who(2, run=2), one.now)
     assert [type(e) for e in one.membership.events()] == [PeerRestarted]
     one.run(1)
-    one.membership.link_down(who(2).guid, one.now, who(2, run=2).instance)  # parked
+    one.membership.link_down(who(2).guid, one.now, who(2, run=2).instance)
     one.run(1)
     assert one.membership.events() == []
     assert one.present() == ["peer2"]

@@ -1,4 +1,4 @@
-"""Links with the release before pace, parked, probe and lane frames, which has none of these features.
+"""Links with the release before pace and lane frames, which has none of these features.
 
 The bytes were recorded from that release, and must not be made by the present code.
 """
@@ -82,11 +82,11 @@ def let_pass(made: Side, time: Time, seconds: float) -> list[int]:
 def test_the_earlier_release_gets_only_frames_that_it_knows(role: ConnectionRole) -> None:
     time = Time()
     made, sent = linked(role, time)
-    for needed, parks in ((True, False), (False, False), (False, True), (True, True), (False, True)):
-        made.link.need(time.now, needed=needed, parks=parks)
-        sent += let_pass(made, time, limits.REST_AFTER + 2 * limits.PARK_AFTER)
+    for needed in (True, False, True, False):
+        made.link.need(time.now, needed=needed)
+        sent += let_pass(made, time, 5 * limits.REST_AFTER)
         assert not made.link.rests
-    assert made.link.state is ConnectionState.UP, "a link that nothing needs is neither parked nor lost"
+    assert made.link.state is ConnectionState.UP, "a link that nothing needs is not lost"
     assert set(sent) <= KINDS
     deliver(BYE, made.link, time.now)
     assert isinstance(made.last(), ConnectionClosed)
@@ -96,7 +96,7 @@ def test_the_earlier_release_gets_only_frames_that_it_knows(role: ConnectionRole
 def test_the_silence_of_the_earlier_release_is_noticed_within_a_second(role: ConnectionRole) -> None:
     time = Time()
     made, _ = linked(role, time)
-    made.link.need(time.now, needed=False, parks=True)
+    made.link.need(time.now, needed=False)
     let_pass(made, time, 60.0)
     heard = time.now
     while (due := made.link.next_timer()) is not None and made.link.state is ConnectionState.UP:

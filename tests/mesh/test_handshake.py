@@ -95,16 +95,17 @@ def test_refused(hello: Hello, links: list[KnownLink], code: Refusal, advice: st
 def test_bulk_lane_is_accepted_beside_its_express_lane(dialled: bool, alive: bool) -> None:
     there = KnownLink(LOW.guid, LOW.instance, dialled=dialled, alive=alive)
     assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there]) is None
-    assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there], busy=True) is None
+    assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there], full=True) is None
     mirrored = KnownLink(HIGH.guid, HIGH.instance, dialled=dialled, alive=alive)
     assert judge(replace(hello_of(HIGH), lane=Lane.BULK), LOW, [mirrored]) is None
 
 
-def test_busy_only_for_strangers() -> None:
-    verdict = judge(hello_of(LOW), HIGH, [], busy=True)
+def test_a_full_mesh_refuses_strangers_alone() -> None:
+    verdict = judge(hello_of(LOW), HIGH, [], full=True)
     assert verdict is not None
-    assert verdict.code == Refusal.BUSY
-    assert judge(hello_of(LOW), HIGH, [KnownLink(LOW.guid, LOW.instance, False, True)], busy=True) is None
+    assert verdict.code == Refusal.FULL
+    assert "docs/sites.md" in verdict.text
+    assert judge(hello_of(LOW), HIGH, [KnownLink(LOW.guid, LOW.instance, False, True)], full=True) is None
 
 
 def test_welcome_cases() -> None:

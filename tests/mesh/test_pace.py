@@ -284,20 +284,6 @@ def test_the_hello_of_the_last_release_is_taken_as_one_that_cannot_rest() -> Non
     assert not Hello.parse(golden).features & Feature.PACE
 
 
-def test_willingness_to_park_is_told_and_ends_with_the_next_need() -> None:
-    time = Time()
-    dialler, acceptor = pair(time)
-    rest(dialler, acceptor, time)
-    dialler.link.need(time.now, needed=False, parks=True)
-    exchange(dialler, acceptor, time)
-    assert [dialler.link.remote_parks, acceptor.link.remote_parks] == [False, True]
-    assert resting(dialler, acceptor) == [True, True]
-    dialler.link.need(time.now, needed=True, parks=True)
-    exchange(dialler, acceptor, time)
-    assert not acceptor.link.remote_parks
-    assert resting(dialler, acceptor) == [False, False]
-
-
 @pytest.mark.parametrize("needed", [False, True])
 def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> None:
     time = Time()
@@ -306,7 +292,6 @@ def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> 
     frame = Frame(FrameKind.PACE, route=0xFFFFFFFC | needed, sequence=16_000).serialize()
     deliver(frame, dialler.link, time.now)
     assert dialler.link.rests is not needed
-    assert not dialler.link.remote_parks
 
 
 @pytest.mark.parametrize("claimed", [0, 1, 10**9])

@@ -12,7 +12,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Hello, Refusal, Refuse
+from rmpa.mesh.handshake import FULL, Hello, Refusal, Refuse
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import (
     CloseLink,
@@ -485,10 +485,10 @@ def test_forged_peers_do_not_starve_a_waiting_one() -> None:
 
 
 def test_many_real_peers_at_once_are_not_held_up() -> None:
-    crowd = [stranger(number) for number in range(300)]
+    crowd = [stranger(number) for number in range(255)]
     network = Network(*crowd)
     network.find(*crowd)
-    assert (len(network.linked()), network.now) == (300, 0.0)
+    assert (len(network.linked()), network.now) == (255, 0.0)
 
 
 def test_a_stranger_that_leaves_the_line_is_not_dialled() -> None:
@@ -502,3 +502,48 @@ def test_a_stranger_that_leaves_the_line_is_not_dialled() -> None:
     peering.handle_timer(1.0)
     assert dials(peering.take()) == [kept.guid.endpoint]
     assert peering.next_timer() is None
+
+
+def full_mesh(monkeypatch: pytest.MonkeyPatch) -> Peering:
+    """A module of a mesh of four that is full."""
+    monkeypatch.setattr(limits, "MODULES_MAX", 4)
+    peering = of(LOW)
+    for number in range(1, 4):
+        peering.peer_found(stranger(number), 0.0)
+        peering.link_up(number, stranger(number), 0.0, dialled=True, endpoint=stranger(number).guid.endpoint)
+    peering.take()
+    return peering
+
+
+def hello_of(identity: Identity) -> Hello:
+    return Hello.of(identity, lease=1.0, expected=LOW.guid)
+
+
+def test_a_full_mesh_neither_dials_nor_accepts_one_more_until_discovery_has_given_up_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    peering = full_mesh(monkeypatch)
+    peering.peer_found(stranger(4), 1.0)
+    assert dials(peering.take()) == []
+    assert peering.judge(hello_of(stranger(4)), 1.0) is FULL
+    (status,) = [each for each in peering.peers() if each.identity == stranger(4)]
+    assert (status.state, status.last_error) == ("refused", str(FULL))
+    peering.link_down(2, "silent", 2.0, silent=True)
+    assert peering.judge(hello_of(stranger(4)), 3.0) is FULL, "the place is kept for the one that is away"
+    assert peering.judge(hello_of(stranger(2)), 3.0) is None
+    peering.peer_gone(stranger(2).guid, 4.0)
+    assert peering.judge(hello_of(stranger(4)), 4.0) is None
+    assert until_dial(peering, 4.0)[0] < 4.0 + limits.REFUSED_RETRY
+
+
+def test_a_module_for_which_there_is_no_place_says_so_once() -> None:
+    peering = of(LOW)
+    for number in (1, 2):
+        peering.peer_found(stranger(number), 0.0)
+        peering.dial_refused(stranger(number).guid, FULL, 0.1, stranger(number).guid.endpoint)
+    assert [output for output in peering.take() if isinstance(output, LinkRefused)] == [
+        LinkRefused(stranger(1), FULL)
+    ]
+    assert peering.left_out
+    peering.link_up(1, stranger(1), 1.0, dialled=True, endpoint=stranger(1).guid.endpoint)
+    assert not peering.left_out

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo, ProbesInfo
+from rmpa.observe.peer_info import BoundInfo, LinkInfo, PeerInfo
 from rmpa.observe.snapshot import (
     AgentInfo,
-    DetectorInfo,
     EventInfo,
     FilesInfo,
     LatencyInfo,
@@ -31,7 +30,6 @@ SNAPSHOT = Snapshot(
         rss=41_000_000,
         addresses=("10.0.0.1",),
         interfaces=("wlan0",),
-        links="full mesh (3 modules, mesh.full_mesh_up_to = 64)",
         config_file="/etc/rmpa/rmpa.toml",
         realtime=("SCHED_FIFO 50: granted",),
         core_memory="kept in /s/core-11311.state; 2 of 2 nodes of the run before are taken up",
@@ -39,7 +37,6 @@ SNAPSHOT = Snapshot(
         proxies=17,
         proxy_sockets=2,
         proxy_listening="two for all, ports 40011 and 40012, and an address 127.a.b.c for each",
-        detector=DetectorInfo(members=99, suspects=1, health=2, refuted=1, news=3),
     ),
     taken=1_700_003_725.0,
     peers=(
@@ -70,7 +67,6 @@ SNAPSHOT = Snapshot(
             topics_out=1,
             direct_in=1,
             direct_out=2,
-            probes=ProbesInfo(state="suspect", heard_ago=2.5, rtt=0.0008, refuted=1, version=12),
         ),
         PeerInfo(
             name="pc",

@@ -212,11 +212,6 @@ def test_sources_of_one_topic_have_unique_names() -> None:
         ({}, DiagnosticLevel.OK, "linked, round trip 0.43 ms"),
         ({"state": "linking", "link": None}, DiagnosticLevel.WARN, "linking"),
         (
-            {"state": "parked", "link": None},
-            DiagnosticLevel.OK,
-            "parked: nothing needs it now; it is linked again when something does",
-        ),
-        (
             {"state": "relayed", "link": None, "via": "gate"},
             DiagnosticLevel.OK,
             "relayed: gate passes on what it publishes",

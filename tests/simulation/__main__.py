@@ -11,12 +11,10 @@ from pathlib import Path
 from tests.simulation.direct_scenario import DirectScenario
 from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.large_scenario import PARTS, USUAL_PARTS, Figures, LargeScenario
-from tests.simulation.long_scenario import LongFigures, LongScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import Scenario
-from tests.simulation.swim_scenario import SwimScenario
 
 
 def main() -> int:
@@ -24,26 +22,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "swim", "rests", "thousand", "long"]
+    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "rests", "large"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
-    parser.add_argument("--loss", type=float, default=0.01, help="thousand, long: share of datagrams that are lost")
+    parser.add_argument("--loss", type=float, default=0.01, help="large: share of datagrams that are lost")
     parser.add_argument(
         "--parts",
         default=",".join(USUAL_PARTS),
-        help=f"thousand: of {','.join(PARTS)}; %(default)s",
+        help=f"large: of {','.join(PARTS)}; %(default)s",
     )
-    parser.add_argument("--hours", type=float, default=24.0, help="long: simulated hours")
-    parser.add_argument("--json", type=Path, help="thousand, long: write the figures there")
+    parser.add_argument("--json", type=Path, help="large: write the figures there")
     arguments = parser.parse_args()
-    if arguments.kind == "thousand":
+    if arguments.kind == "large":
         return _play_large(arguments)
-    if arguments.kind == "long":
-        return _play_long(arguments)
-    scenario: Scenario | ReliableScenario | DirectScenario | SwimScenario
+    scenario: Scenario | ReliableScenario | DirectScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
-    elif arguments.kind == "swim":
-        scenario = SwimScenario(arguments.seed, arguments.peers, keep=True)
     elif arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:
@@ -73,15 +66,7 @@ def _play_large(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _play_long(arguments: argparse.Namespace) -> int:
-    """Play a mesh for hours; 1 if a living module was held to have failed, or a killed one was not noticed."""
-    scenario = LongScenario(arguments.seed, arguments.peers, loss=arguments.loss, hours=arguments.hours, say=_say)
-    figures = scenario.play()
-    _write(figures, arguments.json)
-    return 1 if figures.lost_falsely or figures.missed else 0
-
-
-def _write(figures: Figures | LongFigures, file: Path | None) -> None:
+def _write(figures: Figures, file: Path | None) -> None:
     text = json.dumps(asdict(figures), indent=1)
     print(text)
     if file is not None:

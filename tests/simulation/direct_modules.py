@@ -165,14 +165,12 @@ class Proxies:
 def session(peer: int, name: str, address: str) -> Any:
     """The double of one run of a peer."""
     link = SimpleNamespace(name=name, silent=True, crashed=False)
-    return SimpleNamespace(
-        peer=peer, link=link, linked=True, reachable=True, same_machine=False, address=address, proxies=Proxies()
-    )
+    return SimpleNamespace(peer=peer, link=link, linked=True, same_machine=False, address=address, proxies=Proxies())
 
 
 def sessions(of: dict[int, Any]) -> Any:
     """The double of ``PeerSessions``."""
-    return SimpleNamespace(get=of.get, reachable=lambda: [one for one in of.values() if one.reachable])
+    return SimpleNamespace(get=of.get, linked=lambda: [one for one in of.values() if one.linked])
 
 
 class PublisherModule:
@@ -393,7 +391,7 @@ class SubscriberModule:
         self.rpc.routes[number] = (channel, there.rpc, theirs)
         there.rpc.routes[there_number] = (channel, self.rpc, mine)
         for one in (mine, theirs):
-            one.linked = one.reachable = True
+            one.linked = True
         self.importer.link_up(mine)
         there.exporter.link_up(theirs)
 
@@ -403,7 +401,7 @@ class SubscriberModule:
         assert self.channel is not None
         self.channel.up, self.channel = False, None
         for one in (mine, theirs):
-            one.linked = one.reachable = False
+            one.linked = False
             one.link.crashed = crashed
         self.importer.link_down(mine, crashed=crashed)
         self.there.exporter.link_down(theirs, crashed=crashed)

@@ -12,25 +12,18 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.clock import earliest
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.core.links import Links
-from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
-from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.swim.events import MemberOffers, MemberSuspected, SwimEvent
-from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Hello
 from rmpa.mesh.keepalive import RestPace
-from rmpa.mesh.mode import MeshMode
 from rmpa.mesh.peering import Peering
 from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkUp
 from tests.simulation.large_network import TCP_BYTES, Link
 
 if TYPE_CHECKING:
-    from rmpa.discovery.beacon import Address
+    from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.events import Event, LossReason, Output
-    from rmpa.discovery.swim.packets import SwimPacket
     from rmpa.mesh.peering_events import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 
@@ -38,22 +31,16 @@ TOPICS: Final = 20
 """Topics that each module offers."""
 CATALOGUE_BYTES: Final = 2 * 24 + 80 * TOPICS + 2 * 52
 """Bytes of the catalogue over a link: two frames, some 80 bytes a topic, and their packets' headers."""
-UNCHANGED_BYTES: Final = 2 * 24 + 169 + 28 + 2 * 52
-"""Bytes of the word that the catalogue is the one that the hello named, and of its name in the hello."""
 HANDSHAKE_BYTES: Final = 2 * (24 + 60 + 52)
 _NEVER: Final = float("inf")
-OFFERS_SPREAD_MAX: Final = 5.0
-"""Longest random delay before a parked peer is dialled for its newer offers."""
 
 
 @dataclass(slots=True)
 class Tally:
-    """What all modules together saw; counted where it happens, because a thousand of them know a million peers."""
+    """What all modules together saw; counted where it happens, because 256 of them know 65,280 peers."""
 
     members: int = 0
     """Pairs (module, member that it knows)."""
-    suspected: int = 0
-    suspected_falsely: int = 0
     lost_falsely: int = 0
     """Living and reachable members that a module lost."""
     links: int = 0
@@ -67,12 +54,10 @@ class Module:
         network: Where it lives.
         number: From 1; gives its address and name.
         tally: Shared by all modules.
-        demand: Whether links stand on demand whatever the number of modules.
     """
 
-    def __init__(self, network: LargeNetwork, number: int, tally: Tally, *, demand: bool = False) -> None:
+    def __init__(self, network: LargeNetwork, number: int, tally: Tally) -> None:
         self.network = network
-        self._links = Links.DEMAND if demand else Links.AUTO
         self.tally = tally
         self.name = f"module{number}"
         self.address: Address = (str(IPv4Address(0x0A000000 + number)), 40000)
@@ -86,7 +71,7 @@ class Module:
         self.known: dict[int, tuple[bytes, int]] = {}
         """The run and the version of the offers that are known, by the peer's place."""
         self.lost_at: dict[int, float] = {}
-        """When each peer was lost, by its place; only if ``watch`` is set."""
+        """When the link to each peer was lost, by its place; only if ``watch`` is set."""
         self.watch = False
         self.metered = False
         self.cpu = 0.0
@@ -110,17 +95,11 @@ class Module:
         rng = random.Random(self.network.world.rng.getrandbits(64))
         now = self.network.now
         self.identity = Identity(Guid.of(*self.address, self.run), rng.randbytes(16), self.name)
-        self.detector = FailureDetector(self.identity, rng=rng.random)
-        self.detector.set_version(self.offers, now)
-        self.membership = MembershipProtocol(self.identity, rng=rng.random, vouches=self.detector.vouches)
-        self.member_watch = MemberWatch(self.detector, self.membership)
+        self.membership = MembershipProtocol(self.identity, rng=rng.random)
         self.peering = Peering(self.identity, rng=rng.random, alive=self._is_alive)
-        self.mode = MeshMode(self._links)
-        self.rng = rng
         self._armed = _NEVER
         self.network.join(self)
         self.membership.start(now)
-        self._take_mode()
         self.flush()
 
     def _is_alive(self, number: int) -> bool:
@@ -163,7 +142,7 @@ class Module:
         if self._reaches(link.other(self)) or not link.up:
             return
         lease = self._lease(link)
-        self.network.world.after(lease, lambda: self._end(link, "silent", parked=False, silent=True))
+        self.network.world.after(lease, lambda: self._end(link, "silent", silent=True))
 
     def _present(self) -> set[int]:
         return {view.identity.guid.place for view in self.membership.peers() if view.present}
@@ -171,10 +150,8 @@ class Module:
     def change_offers(self) -> None:
         """A node of this module advertises something new."""
         self.offers += 1
-        self.detector.set_version(self.offers, self.network.now)
         for link in list(self.links.values()):
-            link.other(self).learn(self)
-        self.flush()
+            self.network.later(functools.partial(link.other(self).learn, self))
 
     # --- packets ----------------------------------------------------------------------------------------------
 
@@ -199,17 +176,6 @@ class Module:
         else:
             self._arm(membership.next_timer())
 
-    def hear_unicast(self, packet: Beacon | SwimPacket, source: Address) -> None:
-        """A datagram came to this module's own port."""
-        if isinstance(packet, Beacon):
-            self.hear_beacon(packet, source, multicast=False)
-        elif self.alive:
-            began = time.process_time() if self.metered else 0.0
-            self.detector.receive(packet, source, self.network.now)
-            self.flush()
-            if self.metered:
-                self.cpu += time.process_time() - began
-
     # --- outputs, events, time --------------------------------------------------------------------------------
 
     def flush(self) -> None:
@@ -228,22 +194,17 @@ class Module:
                 if isinstance(output, SendMulticast):
                     self.network.multicast(self, output.beacon, size)
                 else:
-                    self.network.unicast(self, output.address, output.beacon, size, "beacon")
-            for send in self.detector.outputs():
-                self.network.unicast(self, send.address, send.packet, len(send.packet.serialize()), "swim")
+                    self.network.unicast(self, output.address, output.beacon, size)
             for event in events:
                 busy = True
                 self._on_event(event)
-            for heard in self.member_watch.events(self.network.now):
-                busy = True
-                self._on_swim(heard)
             for order in self.peering.take():
                 busy = True
                 self._on_order(order)
             outputs, events = self.membership.outputs(), self.membership.events()
             busy = busy or bool(outputs or events)
         self._flushing = False
-        self._arm(earliest(self.membership.next_timer(), self.detector.next_timer(), self.peering.next_timer()))
+        self._arm(earliest(self.membership.next_timer(), self.peering.next_timer()))
 
     def _arm(self, when: float | None) -> None:
         """Plan a wake-up, unless an earlier one is planned. One that turns out to be too early does no harm."""
@@ -261,7 +222,6 @@ class Module:
         began = time.process_time() if self.metered else 0.0
         now = self.network.now
         self.membership.handle_timer(now)
-        self.detector.handle_timer(now)
         self.peering.handle_timer(now)
         self.flush()
         if self.metered:
@@ -269,12 +229,10 @@ class Module:
 
     def _on_event(self, event: Event) -> None:
         now = self.network.now
-        self.member_watch.membership_changed(event, now)
         match event:
             case PeerFound(identity=identity, source=source):
                 self.tally.members += 1
                 self.peering.peer_found(identity, now, source[0] if source else None)
-                self._count_modules()
             case PeerChanged(identity=identity):
                 self.peering.peer_found(identity, now)
             case PeerRestarted(identity=identity, previous=previous, source=source):
@@ -286,7 +244,6 @@ class Module:
                 self._judge_loss(identity, reason)
                 self.peering.peer_gone(identity.guid, now)
                 self._forget(identity)
-                self._count_modules()
             case RunDoubted(identity=identity):
                 self._check_link(identity.guid.place)
             case _:
@@ -300,8 +257,6 @@ class Module:
                 self.network.world.after(mesh_limits.WAKE_TIMEOUT, ended)
 
     def _judge_loss(self, identity: Identity, reason: LossReason) -> None:
-        if self.watch:
-            self.lost_at[identity.guid.place] = self.network.now
         module = self.network.modules.get(identity.guid.endpoint)
         if module is not None and module.identity.instance == identity.instance and self._reaches(module):
             self.tally.lost_falsely += 1
@@ -316,37 +271,6 @@ class Module:
         if known is not None and known[0] == identity.instance:
             del self.known[place]
 
-    def _count_modules(self) -> None:
-        if self.mode.count(self.membership.members + 1):
-            self._take_mode()
-
-    def _take_mode(self) -> None:
-        self.membership.set_demand(self.network.now, on=self.mode.demand)
-        self.detector.set_active(self.network.now, active=self.mode.demand)
-
-    def _on_swim(self, event: SwimEvent) -> None:
-        match event:
-            case MemberSuspected(guid=guid, instance=instance):
-                self.tally.suspected += 1
-                module = self.network.modules.get(guid.endpoint)
-                alive = module is not None and module.identity.instance == instance and self._reaches(module)
-                self.tally.suspected_falsely += alive
-                self._check_link(guid.place)
-            case MemberOffers(guid=guid, instance=instance, version=version):
-                known = self.known.get(guid.place)
-                if known is not None and known[0] == instance and known[1] < version:
-                    spread = min(OFFERS_SPREAD_MAX, self.mode.modules / 100) * self.rng.random()
-                    run = self.run
-                    self.network.world.after(spread, lambda: self._fetch(guid, version, run))
-            case _:
-                pass
-
-    def _fetch(self, guid: Guid, version: int, run: int) -> None:
-        known = self.known.get(guid.place)
-        if self.alive and run == self.run and known is not None and known[1] < version:
-            self.peering.want(guid, self.network.now)
-            self.flush()
-
     # --- links ------------------------------------------------------------------------------------------------
 
     def _on_order(self, order: PeeringOutput) -> None:
@@ -357,10 +281,11 @@ class Module:
             case LinkUp(link_id=link_id, identity=identity):
                 self._linked(self.links[link_id], identity)
             case LinkDown(identity=identity):
-                self.member_watch.link_down(identity.guid, identity.instance)
+                if self.watch:
+                    self.lost_at[identity.guid.place] = self.network.now
                 self.membership.link_down(identity.guid, self.network.now, identity.instance)
             case CloseLink(link_id=link_id, reason=reason) if link_id in self.links:
-                self._end(self.links[link_id], reason, parked=False)
+                self._end(self.links[link_id], reason)
             case _:
                 pass
 
@@ -404,41 +329,26 @@ class Module:
     def _linked(self, link: Link, identity: Identity) -> None:
         now = self.network.now
         self.membership.link_up(identity, now, identity.guid.endpoint)
-        self.member_watch.link_up(identity, now, answers_probes=True)
         other = link.other(self)
         self.network.later(lambda: self.learn(other))
         link.used = link.used or other.identity.guid.place in self.wants
-        if link.ends[0] is self:
-            self.network.world.after(mesh_limits.PARK_AFTER, lambda: self._rest(link))
 
     def learn(self, other: Module) -> None:
         """A peer's catalogue came over the link."""
         if not (self.alive and other.alive):
             return
         offers = (other.identity.instance, other.offers)
-        held = self.known.get(other.identity.guid.place) == offers
-        self.network.count("catalogue", UNCHANGED_BYTES if held else CATALOGUE_BYTES, 1)
+        self.network.count("catalogue", CATALOGUE_BYTES, 1)
         self.known[other.identity.guid.place] = offers
-        self.detector.learn_version(other.identity.guid, other.identity.instance, other.offers, self.network.now)
-        self.flush()
 
-    def _rest(self, link: Link) -> None:
-        """Nothing depended on the link for long: it is parked if both sides link on demand, and can agree on it."""
-        if not self._reaches(link.other(self)):
-            return  # its lease ends it
-        if link.up and not link.used and all(end.mode.demand for end in link.ends):
-            self._end(link, "parked", parked=True)
-        elif link.up and not link.used:
-            self.network.world.after(mesh_limits.PARK_AFTER, lambda: self._rest(link))
-
-    def _end(self, link: Link, reason: str, *, parked: bool, silent: bool = False) -> None:
+    def _end(self, link: Link, reason: str, *, silent: bool = False) -> None:
         self.tally.links -= link.up
         link.up = False
         for end, number, run in zip(link.ends, link.ids, link.runs, strict=True):
-            end.link_ended(number, reason, run, silent=silent, parked=parked)
+            end.link_ended(number, reason, run, silent=silent)
 
-    def link_ended(self, number: int, reason: str, run: int, *, silent: bool = False, parked: bool = False) -> None:
+    def link_ended(self, number: int, reason: str, run: int, *, silent: bool = False) -> None:
         """A link is over."""
         if self.alive and run == self.run and self.links.pop(number, None) is not None:
-            self.peering.link_down(number, reason, self.network.now, silent=silent, parked=parked)
+            self.peering.link_down(number, reason, self.network.now, silent=silent)
             self.flush()

@@ -1,7 +1,7 @@
-"""The network of a large mesh: datagrams and links of up to some thousand modules, counted; no sockets.
+"""The network of a large mesh: datagrams and links of hundreds of modules, counted; no sockets.
 
-A multicast is one action for all its receivers, so that a thousand modules that each send one are a thousand actions
-and not a million. A link is a pair of machines' views of one connection: its handshake is judged by the real code,
+A multicast is one action for all its receivers, so that 256 modules that each send one are 256 actions and
+not 65,000. A link is a pair of machines' views of one connection: its handshake is judged by the real code,
 and what crosses it is counted by its size.
 """
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.swim.packets import SwimPacket
     from tests.simulation.large_module import Module
 
 UDP_HEADERS: Final = 28
@@ -120,17 +119,17 @@ class LargeNetwork:
         chance, loss, host = self.world.rng.random, self.loss, source.address[0]
         return [m for m in self._hosts if chance() >= loss and (not self.sides or self.reaches(host, m.address[0]))]
 
-    def unicast(self, source: Module, to: Address, packet: Beacon | SwimPacket, size: int, kind: str) -> None:
+    def unicast(self, source: Module, to: Address, beacon: Beacon, size: int) -> None:
         """Send one datagram."""
         if self.world.rng.random() < self.loss:
-            self.count(kind, size + UDP_HEADERS, 0)
+            self.count("beacon", size + UDP_HEADERS, 0)
             return
 
         def arrive() -> None:
             module = self.modules.get(to)
             there = module is not None and self.reaches(source.address[0], to[0])
-            self.count(kind, size + UDP_HEADERS, int(there))
+            self.count("beacon", size + UDP_HEADERS, int(there))
             if module is not None and there:
-                module.hear_unicast(packet, source.address)
+                module.hear_beacon(beacon, source.address, multicast=False)
 
         self.later(arrive)

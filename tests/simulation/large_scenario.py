@@ -1,6 +1,6 @@
-"""A mesh of up to some thousand modules: a flash start, rest, changed offers, a third killed at once, a partition.
+"""A large mesh: a flash start, rest, changed offers, a third killed at once, a partition, one module too many.
 
-``python -m tests.simulation --kind thousand --seed N --peers M`` plays one and prints its figures.
+``python -m tests.simulation --kind large --seed N --peers M`` plays one and prints its figures.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 START_SPREAD: Final = 1.0
 """Seconds within which all modules start."""
-REST_AFTER: Final = 75.0
-"""Seconds after which all links that nothing uses are parked, and all intervals have their length."""
+REST_AFTER: Final = 30.0
+"""Seconds after which all links are at rest."""
 REST: Final = 20.0
 LOOK: Final = 0.1
 SINGLE_KILLS: Final = 3
-PARTS: Final = ("rest", "offers", "kills", "third", "churn", "partition")
+PARTS: Final = ("rest", "offers", "kills", "third", "churn", "partition", "surplus")
 USUAL_PARTS: Final = PARTS[:4]
 CHANGED: Final = 10
 """Modules that change their offers at one time."""
@@ -50,7 +50,6 @@ class Figures:
     rest_by_kind: dict[str, float] = field(default_factory=dict)
     rest_cpu_percent: float = 0.0
     start_cpu: float = 0.0
-    suspected_at_rest: int = 0
     lost_falsely: int = 0
     changed_after: float | None = None
     killed: int = 0
@@ -61,6 +60,12 @@ class Figures:
     parted_lost: float | None = None
     healed_after: float | None = None
     churn_after: float | None = None
+    surplus_links: int = 0
+    """Links of the module that came to a full mesh."""
+    surplus_others: int = 0
+    """Links of the others, while it was there."""
+    surplus_joined: float | None = None
+    """Seconds until it had all links, after another one had been killed."""
     seconds: float = 0.0
     cpu: float = 0.0
     rss_mb: float = 0.0
@@ -117,6 +122,7 @@ class LargeScenario:
             "third": self._kill_a_third,
             "churn": self._churn,
             "partition": self._part,
+            "surplus": self._one_too_many,
         }
         self.world.run(max(self.world.now, 1000.0 + self._settle))
         for part in PARTS:
@@ -153,7 +159,6 @@ class LargeScenario:
         """Nothing happens; what does that cost?"""
         metered = self.modules[len(self.modules) // 2]
         before, cpu = {kind: _copy(row) for kind, row in self.network.traffic.items()}, metered.cpu
-        suspected = self.tally.suspected_falsely
         self.world.run(self.world.now + REST)
         per = len(self.modules) * REST
         kinds = self.network.traffic
@@ -164,7 +169,6 @@ class LargeScenario:
             self.figures.rest_bytes += size / per
             self.figures.rest_messages += (row.sent + row.received - old.sent - old.received) / per
         self.figures.rest_cpu_percent = 100 * (metered.cpu - cpu) / REST
-        self.figures.suspected_at_rest = self.tally.suspected_falsely - suspected
         self.figures.links_at_rest = self.tally.links
         self._say(
             f"at rest {self.figures.rest_bytes / 1000:.2f} KB/s and {self.figures.rest_messages:.0f} messages/s"
@@ -238,8 +242,12 @@ class LargeScenario:
         for module in self.modules[:half]:
             for link in list(module.links.values()):
                 module.part(link)
-        inside = half * (half - 1) + (len(self.modules) - half) * (len(self.modules) - half - 1)
-        self.figures.parted_lost = self._until(lambda: self.tally.members <= inside, began, 90.0)
+        for module in self.modules:
+            module.watch = True
+            module.lost_at.clear()
+        self.figures.parted_lost = self._until(
+            lambda: all(len(module.lost_at) >= half for module in self.modules), began, 90.0
+        )
         self.world.run(max(self.world.now, began + 60.0))
         self.network.sides = {}
         began = self.world.now
@@ -248,6 +256,18 @@ class LargeScenario:
         self._say(
             f"partition: halves lose each other after {_s(self.figures.parted_lost)}, agree again after {_s(agreed)}"
         )
+
+    def _one_too_many(self) -> None:
+        """A module comes to a mesh that is full, and joins when a place has become free."""
+        extra = Module(self.network, len(self.modules) + 1, self.tally)
+        extra.start()
+        self.world.run(self.world.now + 30.0)
+        self.figures.surplus_links = len(extra.links)
+        self.figures.surplus_others = self.tally.links - len(extra.links)
+        began, count = self.world.now, len(self.modules)
+        self.modules[0].kill()
+        self.figures.surplus_joined = self._until(lambda: len(extra.links) == count - 1, began, 90.0)
+        self._say(f"one too many: {self.figures.surplus_links} links; joins after {_s(self.figures.surplus_joined)}")
 
     # --- inside -----------------------------------------------------------------------------------------------
 

@@ -133,14 +133,11 @@ def test_the_number_of_time_series_is_bounded_and_what_is_left_out_is_counted(
 
 def test_what_is_used_comes_before_what_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "METRIC_ROUTES", 1)
-    monkeypatch.setattr(limits, "METRIC_PEERS", 1)
     idle = RouteInfo(peer="a", node="/n", direction="in", state="idle", type="std_msgs/String")
     used = msgspec.structs.replace(idle, state="open")
     topics = (TopicInfo(name="/a", routes=(idle,)), TopicInfo(name="/b", routes=(used,)))
-    peers = (peer("a", state="parked", link=None), peer("b"))
-    found = samples(Snapshot(agent=AGENT, taken=1.0, peers=peers, topics=topics, topics_left=9, services_left=4))
+    found = samples(Snapshot(agent=AGENT, taken=1.0, topics=topics, topics_left=9, services_left=4))
     assert [dict(labels)["topic"] for name, labels in found if name == "rmpa_route_open"] == ["/b"]
-    assert [dict(labels)["peer"] for name, labels in found if name == "rmpa_peer_linked"] == ["b"]
     assert found["rmpa_metrics_omitted", frozenset({("kind", "route")})] == 10
     assert found["rmpa_topics", frozenset()] == 11
     assert found["rmpa_services", frozenset()] == 4

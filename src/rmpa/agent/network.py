@@ -16,17 +16,12 @@ from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
-from rmpa.discovery.swim.events import MemberOffers, MemberSuspected
-from rmpa.discovery.swim.packets import MemberState
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.handshake import Feature
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.mode import MeshMode
 from rmpa.mesh.peering_events import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
@@ -40,7 +35,6 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
-    from rmpa.discovery.swim.events import SwimEvent
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
@@ -72,7 +66,6 @@ class NetworkEndpoint:
         trust: AgentTrust | None = None,
     ) -> None:
         self._clock = clock = SystemClock()
-        self._checking_dials = TokenBucket(mesh_limits.CHECKING_DIALS_PER_SECOND, mesh_limits.CHECKING_DIALS_BURST)
         self._settings = settings
         self._bridge = bridge
         sessions, receiver = bridge.sessions, bridge.receiver
@@ -91,11 +84,7 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
-        self.mode = MeshMode(settings.links, settings.full_mesh_up_to)
-        """Whether all peers stay linked, or those that something depends on."""
         self._members: set[Guid] = set()
-        sessions.may_park, sessions.on_want = self._may_park, self._want
-        sessions.offers.on_version = self._offers
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -113,20 +102,15 @@ class NetworkEndpoint:
             settings,
             udp,
             on_event=self._event,
-            on_member=self._member,
             on_interfaces=self._interfaces,
             clock=clock,
             trust=trust.membership.packets if trust is not None else None,
         )
         self._udp = udp
-        self._on_denied = trust.membership.on_denied if trust is not None else []
-        self._on_denied.append(self._denied)
 
     async def start(self) -> None:
         """Accept links, then send beacons."""
         await self.mesh.start()
-        self.discovery.set_demand(on=self.mode.demand)
-        self.discovery.set_version(self._bridge.sessions.offers.version)
         await self.discovery.start()
         _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
 
@@ -134,41 +118,12 @@ class NetworkEndpoint:
         """Send the goodbye, and close the links in order."""
         await self.discovery.close()
         self._udp.close()
-        self._on_denied.remove(self._denied)
-        self._bridge.sessions.leave()
         await self.mesh.close()
 
     def _count(self, guid: Guid, *, present: bool) -> None:
-        """Take in that a peer has become a member, or is none any more; the number decides on the mode."""
+        """Take in that a peer has become a member, or is none any more."""
         (self._members.add if present else self._members.discard)(guid)
         self.mesh.count_peers(len(self._members))
-        if self.mode.count(1 + len(self._members)):
-            _log.info("= %s", self.mode)
-            self.discovery.set_demand(on=self.mode.demand)
-            if not self.mode.demand:
-                self.mesh.unpark(len(self._members) / mesh_limits.UNPARK_RATE)
-
-    def _may_park(self, link: PeerLink) -> bool:
-        """Whether this agent would do without a link that nothing needs; a relay must hear of changes at once."""
-        relays = self._settings.relay or self._settings.gateway.site != ""
-        member = self.discovery.member(link.guid, link.identity.instance)
-        answers = member is not None and member.state is MemberState.ALIVE  # else the link is the only sign of life
-        return self.mode.demand and not relays and answers
-
-    def _denied(self) -> None:
-        """End the sessions of parked peers that are revoked; the mesh ends the links of the others."""
-        for session in list(self._bridge.sessions.reachable()):
-            last = session.link.connection
-            if session.linked or last.remote is None:
-                continue
-            if self.mesh.connection_prove(last, last.remote) is not None:
-                self._bridge.sessions.lost(session.link.identity)
-
-    def _want(self, guid: Guid) -> None:
-        self.mesh.want(guid)
-
-    def _offers(self, version: int) -> None:
-        self.discovery.set_version(version)
 
     def _event(self, event: Event) -> None:
         match event:
@@ -182,32 +137,16 @@ class NetworkEndpoint:
                 _log.info("+ %s restarted, it was %s", identity, previous.guid)
                 self._count(previous.guid, present=False)
                 self._count(identity.guid, present=True)
-                self._bridge.sessions.lost(previous)
                 self.mesh.peer_gone(previous.guid)
                 self.mesh.peer_found(identity, source[0] if source else None)
             case PeerLost(identity=identity, reason=reason):
                 _log.info("- %s %s", identity, reason.value)
                 self._count(identity.guid, present=False)
                 self.mesh.peer_gone(identity.guid)
-                self._bridge.sessions.lost(identity)
             case RunDoubted(identity=identity):
                 self._check_link(identity.guid)
             case PeerConflict():
                 pass  # discovery has logged the error, at a bounded rate
-
-    def _member(self, event: SwimEvent) -> None:
-        """Take in what the failure detector has found; discovery itself acts on failures."""
-        match event:
-            case MemberSuspected(guid=guid):
-                if self.mesh.link(guid) is not None:
-                    self._check_link(guid)
-                elif self._checking_dials.take(self._clock.now()):
-                    # Probes use UDP alone, which a firewall may block: a parked peer that TCP reaches has not failed.
-                    self.mesh.want(guid)
-            case MemberOffers(guid=guid, instance=instance, version=version):
-                self._bridge.sessions.offers.heard(guid, instance, version, 1 + len(self._members))
-            case _:
-                pass
 
     def _check_link(self, guid: Guid) -> None:
         """Wake the link of a peer that may be gone: a link at rest would notice that after many seconds."""
@@ -216,13 +155,7 @@ class NetworkEndpoint:
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
-        remote = link.connection.remote
-        features = remote.features if remote is not None else 0
-        self.discovery.link_up(
-            link.identity,
-            (link.remote_endpoint[0], link.identity.guid.port),
-            answers_probes=bool(features & Feature.SWIM),
-        )
+        self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:

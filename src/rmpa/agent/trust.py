@@ -6,7 +6,6 @@ import asyncio
 import base64
 import logging
 import os
-import random
 import time
 from typing import TYPE_CHECKING, Any, Final
 
@@ -152,7 +151,7 @@ class AgentTrust(Part):
         """The state, as ``rmpa trust status`` and the snapshot show it."""
         from rmpa.trust.io.status import status_of  # noqa: PLC0415
 
-        linked = {session.link.name for session in self._bridge.sessions.reachable()}
+        linked = {session.link.name for session in self._bridge.sessions.linked()}
         return status_of(
             self.membership, self.authority, agent="secured", linked=linked, authority_name=self.authority_name()
         )
@@ -168,7 +167,7 @@ class AgentTrust(Part):
     def link_down(self, session: PeerSession) -> None:
         """Forget what the peer has."""
         self._spreading.link_down(session.peer)
-        if self._authority_peer is session and not session.reachable:
+        if self._authority_peer is session and not session.linked:
             self._authority_peer = None
 
     def gone(self, session: PeerSession) -> None:
@@ -206,10 +205,7 @@ class AgentTrust(Part):
         self._refusals.refuse(self._clock.now(), counter, name, text)
 
     def spread(self) -> None:
-        """Send newer documents to all that lack them; some of the parked peers are linked, which do the same."""
-        parked = [session for session in self._bridge.sessions.reachable() if not session.linked]
-        for session in random.sample(parked, min(len(parked), limits.SPREAD_PARKED)):
-            self._bridge.sessions.want(session)
+        """Send newer documents to all that lack them."""
         sessions = {session.peer: session for session in self._bridge.sessions.linked()}
         for peer, kinds in self._spreading.changed():
             if peer in sessions:
@@ -276,7 +272,7 @@ class AgentTrust(Part):
         """
         hosts = self._hosts()
         missing = set(hosts) - self.membership.certificate.hosts
-        linked = self._authority_peer is not None and self._authority_peer.reachable
+        linked = self._authority_peer is not None and self._authority_peer.linked
         return bool(missing) and hosts != self._hosts_asked and (self.authority is not None or linked)
 
     async def renew(self) -> None:
@@ -288,7 +284,7 @@ class AgentTrust(Part):
         if self.authority is not None:
             self._hosts_asked = self._hosts()
             self.authority.renew_own(self._hosts_asked)
-        elif self._authority_peer is not None and self._authority_peer.reachable:
+        elif self._authority_peer is not None and self._authority_peer.linked:
             await self._renew_by_link(self._authority_peer)
         else:
             await self._renew_by_dial()
@@ -341,7 +337,7 @@ class AgentTrust(Part):
 
     def is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
-        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.reachable()))
+        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
         return name.casefold() in {each.casefold() for each in names}
 
 

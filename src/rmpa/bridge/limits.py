@@ -199,11 +199,3 @@ DIRECT_LOOK: Final = 0.02
 REFUSALS_LOGGED: Final = 128
 """Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
 invented, are only counted until the rules change."""
-
-# --- parked peers ---------------------------------------------------------------------------------------------
-UNSENT_MAX: Final = 64
-"""Notifications that wait for the link to a parked peer; it stands within a round trip, or the peer is away."""
-REFRESH_RATE: Final = 100.0
-"""Links a second that all modules together make to a parked peer that offers something new."""
-REFRESH_MAX: Final = 5.0
-"""The longest delay of such a link, whatever the number of modules."""

@@ -92,7 +92,7 @@ def ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T
 
 
 def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
-    """Which modules do not tell their nodes, one line for all with the same reason: many modules may be parked."""
+    """Which modules do not tell their nodes, one line for all with the same reason."""
     reasons: dict[str, list[str]] = {}
     for one in told:
         if one.problem:

@@ -23,19 +23,18 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.peer_info import LaneInfo, LinkInfo, PeerInfo, ProbesInfo
+    from rmpa.observe.peer_info import LaneInfo, LinkInfo, PeerInfo
     from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
 _COLOURS: Final = {
     "linked": "green",
     "relayed": "green",
-    "parked": "green",
     "linking": "yellow",
     "refused": "red",
     "conflict": "red",
     "foreign": "yellow",
 }
-_USUAL: Final = frozenset({"linked", "relayed", "parked"})
+_USUAL: Final = frozenset({"linked", "relayed"})
 """States that are no problem."""
 _COLUMNS: Final = tuple(
     Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
@@ -47,8 +46,6 @@ _ROUTES: Final = (
     *map(Column, ("  TOPIC", "TYPE", "NODE", "ROUTE")),
     *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
 )
-
-_PARKED = "none: nothing needs it; it is made on demand, and probes notice within seconds if the peer is gone"
 
 
 def connect(agent: str | None) -> ControlClient:
@@ -114,8 +111,6 @@ def list_(
         colours = [_COLOURS.get(p.state, "") for p in shown]
         print_table(_COLUMNS[:width], [_row(p)[:width] for p in shown], colours=colours)
         selection.print_rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
-    if snapshot.agent.links.startswith("links on demand"):
-        click.echo(f"{snapshot.agent.name} keeps {snapshot.agent.links}")
     troubles = _troubles(snapshot, peers)
     told = selection.shown(troubles)
     for trouble in told:
@@ -159,7 +154,7 @@ def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
     for info in peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
         found += [bound.text for bound in info.beyond]
-        if info.last_error and info.state not in {"linked", "relayed", "parked"}:
+        if info.last_error and info.state not in _USUAL:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
     return found
@@ -230,8 +225,6 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         ("Found", f"{duration(info.found_ago)} ago by {info.source or ('a beacon' if strange else 'a link')}"),
         ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
     ]
-    if info.probes is not None:
-        facts.append(("Probes", _probes_text(info.probes)))
     link = info.link
     if link is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
@@ -248,22 +241,12 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
         if info.direct_in or info.direct_out:
             ours = f"{info.direct_in} of the subscribers here to its nodes"
             facts.append(("Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"))
-    if info.state == "parked":
-        facts.append(("Link", _PARKED))
     if info.last_error:
         facts.append(("Last error", info.last_error))
     if info.next_attempt is not None:
         facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
     facts += [("Limit", bound.text) for bound in info.beyond]
     return facts + [("Conflict", conflict) for conflict in info.conflicts]
-
-
-def _probes_text(probes: ProbesInfo) -> str:
-    """``alive, heard 0.4 s ago, round trip 0.8 ms, refuted 0 suspicions, version 3 of its offers``."""
-    heard = f"heard {duration(probes.heard_ago)} ago" if probes.heard_ago is not None else "not heard yet"
-    trip = f", round trip {duration(probes.rtt)}" if probes.rtt is not None else ""
-    offers = f", version {probes.version} of its offers" if probes.version is not None else ""
-    return f"{probes.state}, {heard}{trip}, refuted {probes.refuted} suspicions{offers}"
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")

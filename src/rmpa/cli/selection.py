@@ -87,7 +87,7 @@ class Selection:
 
 
 def summary(total: int, what: str, counts: Iterable[str]) -> str:
-    """``1,000 peers: 900 parked, 98 linked, 2 refused``, the most frequent first."""
+    """``200 peers: 198 linked, 2 refused``, the most frequent first."""
     parts = [f"{count:,} {word}" for word, count in Counter(counts).most_common()]
     return f"{total:,} {what}: {', '.join(parts)}"
 

@@ -26,9 +26,6 @@ CONTRACT_RATE_MIN: Final = 0.001
 """Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
 CONTRACT_RATE_MAX: Final = 1_000_000.0
 """Highest ``max_rate`` in messages a second: more than any topic reaches."""
-FULL_MESH_MODULES: Final = 64
-"""Default of ``mesh.full_mesh_up_to``: up to this size each module keeps a link to each other one (63 links at rest
-take some 13 keepalives a second); a larger mesh keeps the links that something depends on."""
 FOLLOWED_MAX: Final = 256
 """Default of ``limits.params``: parameters that one module follows, and that one peer may follow here; a namespace
 counts as one."""

@@ -213,6 +213,10 @@ REMOVED: Final = {
         "let a gateway with a site name join those robots, or run zenoh-bridge-ros1 beside rmpa",
     ),
     **dict.fromkeys(
+        ("mesh.links", "mesh.full_mesh_up_to", "RMPA_LINKS", "RMPA_FULL_MESH_UP_TO"),
+        "leave it out: up to 256 modules keep a link to each other; make more of them sites (docs/sites.md)",
+    ),
+    **dict.fromkeys(
         ("gateway.store", "RMPA_GATEWAY_STORE", "gateway.rule.keep"),
         "no gateway keeps values: record the topic with rosbag, or keep its key by a storage of Zenoh",
     ),

@@ -37,7 +37,6 @@ from rmpa.config.values import (
     HOST,
     HOST_PORT,
     INTERFACE,
-    LINKS,
     LOG_LEVEL,
     MASTER_URI,
     MULTICAST,
@@ -57,7 +56,6 @@ from rmpa.config.values import (
     list_of,
 )
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
-from rmpa.core.links import Links
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -414,21 +412,6 @@ class Settings:
     )
     port: int = setting(
         0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any.", key="mesh.port", env="RMPA_PORT", option="--port"
-    )
-    links: Links = setting(
-        Links.AUTO,
-        LINKS,
-        "Which peers stay linked. full: all; demand: those of which something is used; auto: all up to "
-        "mesh.full_mesh_up_to modules.",
-        key="mesh.links",
-        env="RMPA_LINKS",
-    )
-    full_mesh_up_to: int = setting(
-        limits.FULL_MESH_MODULES,
-        BOUND,
-        "Up to so many modules, this one included, each keeps a link to each; above it links stand on demand.",
-        key="mesh.full_mesh_up_to",
-        env="RMPA_FULL_MESH_UP_TO",
     )
     interfaces: tuple[str, ...] = setting(
         (),

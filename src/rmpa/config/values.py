@@ -16,7 +16,6 @@ from rmpa.config import limits
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Transport
 from rmpa.core.identity import peer_name_from, peer_name_problem
-from rmpa.core.links import Links
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -181,7 +180,6 @@ def member_of(kind: type[_Word], what: str) -> ValueType[_Word]:
 
 
 TRANSPORT: Final = member_of(Transport, "a transport")
-LINKS: Final = member_of(Links, "a way to keep links")
 
 # --- switches and numbers -------------------------------------------------------------------------------------------
 

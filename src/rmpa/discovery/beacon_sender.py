@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.serial_number import serial_add
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import SendMulticast, SendUnicast
 from rmpa.discovery.gossip import GossipSelector
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from rmpa.discovery.endpoint import PeerInstance
     from rmpa.discovery.endpoint_table import EndpointTable
     from rmpa.discovery.events import Output
-    from rmpa.discovery.pacing import BeaconPace
 
 _NEVER: Final = float("-inf")
 
@@ -30,13 +30,13 @@ class BeaconSender:
     Args:
         identity: This agent's own.
         endpoints: The peers.
-        pace: Has the lease that beacons announce.
+        lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where answers that were held back are counted.
         multicast: Whether to send to the group at all.
     """
 
     def __init__(
-        self, identity: Identity, endpoints: EndpointTable, pace: BeaconPace, counters: Counters, *, multicast: bool
+        self, identity: Identity, endpoints: EndpointTable, lease: float, counters: Counters, *, multicast: bool
     ) -> None:
         self.identity = identity
         """This agent's own, as the next beacon will carry it."""
@@ -45,7 +45,7 @@ class BeaconSender:
         self.closed = False
         """Whether nothing is sent any more: a goodbye was the last beacon."""
         self._endpoints = endpoints
-        self._pace = pace
+        self._lease_ms = round(lease * 1000)
         self._counters = counters
         self._sequence = 0
         self._gossip_selector = GossipSelector()
@@ -97,9 +97,10 @@ class BeaconSender:
         if not self.multicast:
             return list(members)
         many = is_many(len(members))  # then a peer that a link brought has some time to be heard
-        return [v for v in members if now - max(v.multicast_at, v.since if many else _NEVER) > v.silence]
+        since = now - limits.MULTICAST_SILENCE
+        return [v for v in members if max(v.multicast_at, v.since if many else _NEVER) < since]
 
     def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
         self._sequence = serial_add(self._sequence, 1)
-        lease = round(self._pace.lease * 1000)
-        return Beacon(kind, self.identity, lease, self._sequence, gossip, self._endpoints.observed_addresses(gossip))
+        observed = self._endpoints.observed_addresses(gossip)
+        return Beacon(kind, self.identity, self._lease_ms, self._sequence, gossip, observed)

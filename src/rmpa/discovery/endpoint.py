@@ -60,7 +60,7 @@ class PeerInstance:
         leaving: Whether it said goodbye. The goodbye may be forged: its number does not count for what comes after.
         before_goodbye: The number of its last beacon before the goodbye.
         superseded_at: When another run took its endpoint.
-        vouched_until: Until when the failure detector's word keeps it.
+        doubted: Whether the silence of its beacons, while it is linked, was reported.
     """
 
     identity: Identity
@@ -77,21 +77,12 @@ class PeerInstance:
     leaving: bool = False
     before_goodbye: int | None = None
     superseded_at: float = _NEVER
-    vouched_until: float = _NEVER
+    doubted: bool = False
 
     @property
     def deadline(self) -> float:
         """When its lease is over, if it stays silent."""
-        return max(self.heard + self.lease, self.vouched_until)
-
-    @property
-    def silence(self) -> float:
-        """Seconds without a beacon that show two missed ones.
-
-        Members of a large mesh send theirs more rarely and promise a longer lease, which counts if one is verified.
-        """
-        longer = self.lease / core_limits.PEER_LEASE if self.verified else 1.0
-        return limits.MULTICAST_SILENCE * max(1.0, longer)
+        return self.heard + self.lease
 
     @property
     def addresses(self) -> tuple[Address, ...]:
@@ -121,6 +112,7 @@ class PeerInstance:
         self.sequence = beacon.sequence
         self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
         self.heard = now
+        self.doubted = False
         self.source = source
         self.heard_by = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
 
@@ -174,7 +166,7 @@ class Endpoint:
         # A handshake carries no further addresses; those of the beacons stay.
         peer.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
         peer.linked = peer.verified = True
-        peer.leaving = False
+        peer.leaving = peer.doubted = False
         peer.heard = now
         if peer is self.current:
             return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
@@ -219,8 +211,9 @@ class Endpoint:
             del self.others[instance]
 
     def next_timer(self) -> float | None:
-        """When the first lease is over; that of a linked run never is."""
-        first = self.current.deadline if self.current is not None and not self.current.linked else None
+        """When the first lease is over; that of a linked run is only once, which is reported."""
+        current = self.current
+        first = None if current is None or self.own or (current.linked and current.doubted) else current.deadline
         return earliest(first, *(v.deadline for v in self.others.values())) if self.others else first
 
     def _find(self, instance: bytes) -> PeerInstance | None:

@@ -55,13 +55,6 @@ class EndpointTable:
         """The endpoint at a place, or ``None``."""
         return self._all.get(place)
 
-    def current(self, guid: Guid, run: bytes) -> PeerInstance | None:
-        """The run at a GUID's place, if it is a member and its instance id begins so; not this agent itself."""
-        endpoint = self._all.get(guid.place)
-        if endpoint is None or endpoint.current is None or not endpoint.present:
-            return None
-        return endpoint.current if endpoint.current.identity.instance.startswith(run) else None
-
     def add(self, place: int, endpoint: Endpoint) -> Endpoint:
         """Add an endpoint at a place that has none; return it."""
         self._all[place] = endpoint

@@ -29,7 +29,6 @@ class LossReason(Enum):
     GOODBYE = "said goodbye"
     MOVED = "started anew at another port"
     CONFLICT = "another live peer has its GUID address"
-    FAILED = "did not answer the probes of several members"
 
 
 class ConflictKind(Enum):

@@ -43,7 +43,7 @@ class GossipSelector:
         guids: list[Guid] = []
         for number in range(start, start + count):
             peer = peers[number % count]
-            if peer is to or not (peer.linked or now - peer.heard <= peer.silence):
+            if peer is to or not (peer.linked or now - peer.heard <= limits.MULTICAST_SILENCE):
                 continue
             guid = peer.identity.guid
             if loopback or not guid.is_loopback:

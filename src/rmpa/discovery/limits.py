@@ -23,16 +23,6 @@ HEARTBEAT_INTERVAL: Final = 5.0
 MANY_MEMBERS: Final = 64
 """Members above which answers and early heartbeats are delayed or gathered, lest a start of many agents be a storm of
 packets. Up to here each announcement is answered at once, as in the paper."""
-HEARTBEATS_PER_SECOND: Final = 32.0
-"""Heartbeats a second, of all members together, that each agent of a large mesh hears: its own interval is the number
-of members divided by this. They take 0.2 % of a core and 3 KB/s. The failure detector notices a dead peer long before
-its lease."""
-HEARTBEAT_INTERVAL_MAX: Final = 39.0
-"""The longest interval of heartbeats: three of them and a second fit into ``LEASE_MAX``. It is reached
-with 1,250 members."""
-HEARTBEAT_GROWTH: Final = 1.25
-"""Factor by which the interval of heartbeats grows at most from one to the next: peers that missed the beacon with
-the longer lease still count by the shorter one."""
 CONFLICT_AFTER: Final = 2.0
 """A packet of a replaced instance after this long is not a late one: two live peers share one GUID."""
 ADDRESS_SHARED_AFTER: Final = 5.0
@@ -47,8 +37,8 @@ GOODBYE_CHECK: Final = 0.25
 """Seconds from a goodbye to the announcement that asks whether it was forged: the answer comes after
 ``GOODBYE_LATE``."""
 GOODBYE_CHECKS: Final = 16
-"""Members that ask so, on average: in larger meshes each decides by chance, and the failure detector spreads the
-refutation. A goodbye then costs the network no more than this many packets."""
+"""Members that ask so, on average: in larger meshes each decides by chance. A goodbye then costs the
+network no more than this many packets."""
 GOODBYE_CHECKS_PER_SECOND: Final = 25.0
 """Goodbyes a second that one agent checks; those beyond it are refuted by the next heartbeat."""
 GOODBYE_CHECKS_BURST: Final = 64
@@ -149,85 +139,3 @@ SEED_RETRY_FIRST: Final = 1.0
 """Delay before a failed look-up of a seed's name is repeated; it doubles each time (no name server yet)."""
 SEED_RETRY_MAX: Final = 30.0
 """The longest delay between two look-ups after failures."""
-
-# --- failure detection (SWIM) -----------------------------------------------------------------------------------
-SWIM_PACKET_MAX: Final = 1168
-"""Bytes of one packet of the failure detector: with a secured mesh's trailer it is as long as a beacon may be."""
-PROBE_INTERVAL: Final = 1.0
-"""Time between two probes of one agent (SWIM, section 3; memberlist has the same), whatever the number of members."""
-PROBE_TIMEOUT_MIN: Final = 0.2
-"""The shortest time for an answer to a probe: Wi-Fi with power saving delays packets by 100 ms and more."""
-PROBE_TIMEOUT_MAX: Final = 1.0
-"""The longest such time, however slow the answers are."""
-PROBE_RTT_FIRST: Final = 0.05
-"""Round trip that is assumed before the first answer."""
-INDIRECT_PROBES: Final = 3
-"""Members that are asked to probe one that did not answer (memberlist has the same)."""
-INDIRECT_TIMEOUT_FACTOR: Final = 2.0
-"""Time for their answers, in time-outs of a probe: a probe by way of another member takes two round trips."""
-RELAYS_MAX: Final = 128
-"""Probes for others that are under way at one time; further requests are not answered."""
-RELAYS_PER_SECOND: Final = 100.0
-"""Probes for others a second."""
-EXTRA_PROBES_PER_SECOND: Final = 40.0
-"""Probes a second beside the regular ones: of members that others suspect, or hold to have failed."""
-CONFIRMING_PROBES: Final = 8.0
-"""Members, in the mean, that at once probe one that is suspected: they confirm it, or let it be refuted."""
-CONFIRMATIONS_MAX: Final = 3
-"""Further members that suspect the same one, after which a suspicion is as short as it may be (Lifeguard)."""
-SUSPICION_TIME: Final = 0.5
-"""Shortest suspicion for each power of ten of the number of members: news takes O(log N) to reach all."""
-SUSPICION_FACTOR: Final = 3.0
-"""How much longer a suspicion is that nothing confirms."""
-SUSPICION_LINKED: Final = 1.0
-"""A suspected member that still has a link is judged again after this long: its link decides."""
-HEALTH_MAX: Final = 8
-"""The worst score of an agent's own health (Lifeguard): its intervals and time-outs are nine times as long then."""
-SWIM_LATE: Final = 0.15
-"""A timer that fires later than this means that this process was stopped, or had no CPU."""
-SWIM_LATE_GRACE: Final = 0.25
-"""All time-outs are prolonged by this beyond such a pause: packets that came meanwhile are read first."""
-SWIM_DEAF: Final = 5.0
-"""An agent that has heard no member for this long does not renew the leases of any: it may itself be cut off."""
-SWIM_LINGER: Final = 10.0
-"""Seconds after the last failure in which an agent still probes, though so many members failed that it keeps a link
-to each of the others from now on. Members that died together are found within this."""
-GOSSIP_INTERVAL: Final = 0.2
-"""Time between two rounds of news while there is any (memberlist has the same)."""
-GOSSIP_FANOUT: Final = 3
-"""Members that get the news in one round."""
-NEWS_SENT_FACTOR: Final = 4
-"""How often news is sent, for each power of ten of the number of members (memberlist has the same): with 16 times at
-1,000 members one in ten million misses it."""
-NEWS_QUEUE_MAX: Final = 4096
-"""News that is spread at one time, one for each member; what was sent most often is dropped first."""
-MEMBERS_HEARSAY_MAX: Final = 1024
-"""Members that are known from the news alone; the oldest is forgotten first."""
-MEMBERS_GONE_MAX: Final = 4096
-"""Members that failed or left and are remembered, so that old news does not bring them back."""
-MEMBERS_GONE_KEPT: Final = 120.0
-"""How long they are remembered."""
-INCARNATION_LEAP: Final = 4096
-"""By how much news may raise a member's incarnation number at once: a forged one must not use all numbers up."""
-LEAVE_FANOUT: Final = 8
-"""Members that an agent tells that it leaves; they tell the others."""
-SYNC_BUCKETS: Final = 64
-"""Parts of the table of members whose hashes are compared when two tables differ."""
-SYNC_QUIET: Final = 3.0
-"""Tables are compared when the own one did not change for this long: before, news is still under way."""
-SYNC_INTERVAL: Final = 5.0
-"""Time between two comparisons that one agent asks for."""
-SYNC_OVERDUE: Final = 30.0
-"""A table that never rests is compared all the same after this long."""
-SYNC_PACKETS_MAX: Final = 32
-"""Packets of one answer to a comparison, 44 members each; the rest is compared the next time."""
-SYNCS_PER_SECOND: Final = 2.0
-"""Comparisons a second that an agent answers: each may be 35 KB."""
-SWIM_PER_SECOND: Final = 600.0
-"""Packets of the failure detector a second that are accepted in all. A full one takes 0.5 ms, so they take 30 % of a
-core at most; a member of a thousand gets 30 to 100. In an open mesh anyone can send them in the names of members."""
-SWIM_BURST: Final = 1200
-SWIM_UNLINKED_PER_SECOND: Final = 400.0
-"""Packets of the failure detector a second that are accepted from agents without a link, over all addresses: 3 % of a
-core."""
-SWIM_UNLINKED_BURST: Final = 1000

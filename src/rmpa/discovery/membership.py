@@ -3,7 +3,7 @@
 Inputs are ``start``, ``receive``, ``link_up``, ``link_down``, ``interfaces_changed``, ``set_seeds`` and
 ``handle_timer``; after each of them take ``outputs()`` (beacons to send) and ``events()`` (what happened).
 
-As in SWIM, members are learnt by gossip and kept by heartbeats with a lease; unlike there a peer only becomes a
+Members are kept by heartbeats with a lease, or by their links. Gossip tells of further peers; a peer only becomes a
 member by a beacon of its own or a link, never because another peer says so.
 """
 
@@ -36,7 +36,7 @@ from rmpa.discovery.events import (
 )
 from rmpa.discovery.goodbye_checks import GoodbyeChecks
 from rmpa.discovery.gossip import GossipCandidates
-from rmpa.discovery.pacing import BeaconPace, LateAnswers, is_many
+from rmpa.discovery.pacing import LateAnswers, dissemination_interval, is_many
 from rmpa.discovery.unicast import UnicastHeartbeats
 
 if TYPE_CHECKING:
@@ -58,8 +58,6 @@ class MembershipProtocol:
         multicast: Whether to send to the group at all.
         lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where refusals are counted.
-        vouches: ``(guid, instance, now)``: whether the failure detector holds a run to be alive, which renews its
-            lease.
     """
 
     def __init__(
@@ -70,14 +68,11 @@ class MembershipProtocol:
         multicast: bool = True,
         lease: float = core_limits.PEER_LEASE,
         counters: Counters | None = None,
-        vouches: Callable[[Guid, bytes, float], bool] = lambda *_: False,
     ) -> None:
-        self._vouches = vouches
         self.counters = counters if counters is not None else Counters()
         self._rng = rng
-        self._pace = BeaconPace(lease)
         self._endpoints = EndpointTable()
-        self._sender = BeaconSender(identity, self._endpoints, self._pace, self.counters, multicast=multicast)
+        self._sender = BeaconSender(identity, self._endpoints, lease, self.counters, multicast=multicast)
         self._eviction = Eviction(self._endpoints)
         self._reported_names: set[frozenset[bytes]] = set()
         self._late_answers = LateAnswers(rng)
@@ -216,19 +211,6 @@ class MembershipProtocol:
             self._sender.send_answer(endpoint.current, now)
         self._remove_if_empty(key)
 
-    def peer_failed(self, guid: Guid, instance: bytes, now: float, reason: LossReason = LossReason.FAILED) -> None:
-        """Remove a run that the failure detector has given up, unless it has a link; a beacon brings it back."""
-        endpoint, peer = self._endpoints.get(guid.place), self._endpoints.current(guid, instance)
-        if endpoint is None or peer is None or peer.linked:
-            return
-        self._peer_lost(endpoint, reason)
-        endpoint.remove_current()
-        if reason is LossReason.GOODBYE:
-            self._check_goodbye(peer, now)
-        self._clear_conflict(endpoint, now)
-        self._endpoints.changed(guid.place)
-        self._remove_if_empty(guid.place)
-
     def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
         """Announce this agent again after a change of interfaces, with its present addresses if they are given."""
         if self._sender.closed:
@@ -238,12 +220,6 @@ class MembershipProtocol:
             self._sender.identity = Identity(own.guid, own.instance, own.name, own.domain, addresses)
         self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
         self.handle_timer(now)
-
-    def set_demand(self, now: float, *, on: bool) -> None:
-        """Take in whether this agent links on demand: its heartbeats then become rarer as the mesh grows."""
-        if self._pace.demand != on and self._heartbeat_at is not None:
-            self._heartbeat_at = min(self._heartbeat_at, now + limits.HEARTBEAT_INTERVAL)
-        self._pace.demand = on
 
     def set_seeds(self, seeds: Iterable[Address]) -> None:
         """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
@@ -286,7 +262,6 @@ class MembershipProtocol:
             for address in self._seeds:
                 self._sender.send(BeaconKind.ANNOUNCE, address)
         if self._heartbeat_at <= now:
-            self._pace.advance(len(self._endpoints.present()))
             self._heartbeat_at = self._next_heartbeat(now)
             self._send_multicast(BeaconKind.HEARTBEAT, now)
             self._plan_unicast_heartbeats(now)
@@ -334,10 +309,6 @@ class MembershipProtocol:
         endpoint = self._endpoints.get(guid.place)
         peer = endpoint.current if endpoint is not None else None
         return peer is not None and peer.verified and peer.identity.instance == instance
-
-    def member(self, guid: Guid, run: bytes) -> PeerInstance | None:
-        """This run of a peer, if it is a member; ``run`` may be only the beginning of its instance id."""
-        return self._endpoints.current(guid, run)
 
     @property
     def identity(self) -> Identity:
@@ -474,11 +445,10 @@ class MembershipProtocol:
             if endpoint is None:
                 continue
             peer = endpoint.current
-            if peer is not None and not peer.linked and peer.deadline <= now:
-                if self._vouches(peer.identity.guid, peer.identity.instance, now):
-                    peer.vouched_until = now + peer.lease
-                    self._endpoints.heard(key)
-                    continue
+            if peer is not None and peer.linked and peer.deadline <= now and not endpoint.own:
+                peer.doubted = True  # a link at rest would notice much later that its peer is gone
+                self._events.append(RunDoubted(peer.identity))
+            elif peer is not None and not peer.linked and peer.deadline <= now:
                 self._peer_lost(endpoint, LossReason.SILENCE)
                 endpoint.remove_current()
                 if peer.multicast_at + limits.MULTICAST_SILENCE < now:
@@ -525,7 +495,7 @@ class MembershipProtocol:
         """Schedule gossip about a found peer for the peers that multicast does not reach."""
         members = len(self._endpoints.present())
         if self._disseminate_at is None and self._heartbeat_at is not None and members > 1:
-            self._disseminate_at = max(now, self._disseminated_at + self._pace.dissemination_interval(members))
+            self._disseminate_at = max(now, self._disseminated_at + dissemination_interval(members))
 
     def _answer_if_unknown(
         self, endpoint: Endpoint, change: EndpointChange, beacon: Beacon, now: float, *, multicast: bool
@@ -537,7 +507,7 @@ class MembershipProtocol:
         unknown = change in {EndpointChange.NEW, EndpointChange.RESTARTED}
         # A unicast heartbeat means that its sender receives none of this agent's multicasts. If this agent receives
         # none of the sender's either, its own heartbeats go there by unicast anyway.
-        deaf = not multicast and now - peer.multicast_at <= peer.silence
+        deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
         if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
         if not (multicast and self._sender.multicast and is_many(self.members)):
@@ -569,18 +539,14 @@ class MembershipProtocol:
         if was_candidate:
             peer.found_by = HeardBy.GOSSIP
         elif beacon.kind is BeaconKind.ANSWER and self._sender.multicast and source not in self._seeds:
-            peer.multicast_at = now - self._pace.interval
+            peer.multicast_at = now - limits.HEARTBEAT_INTERVAL
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender."""
         for address in self._endpoints.unknown_addresses(beacon.observed, self._sender.identity):
             if not self._candidates.add(address, now):
                 self.counters.add("gossip.full")
-        self.hear_of(beacon.gossip, now)
-
-    def hear_of(self, guids: tuple[Guid, ...], now: float) -> None:
-        """Announce this agent to unknown ones of these peers; only their own beacon makes them members."""
-        for guid in guids:
+        for guid in beacon.gossip:
             if guid.place in self._endpoints or (guid.is_loopback and not self._sender.identity.guid.is_loopback):
                 continue
             if not self._candidates.add(guid.endpoint, now):
@@ -594,4 +560,4 @@ class MembershipProtocol:
         return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
 
     def _next_heartbeat(self, now: float) -> float:
-        return now + self._pace.interval * (1.0 - limits.HEARTBEAT_JITTER * self._rng())
+        return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())

@@ -33,15 +33,12 @@ from rmpa.mesh.connection_events import (
     HandshakeDone,
     HelloReceived,
     MarkReceived,
-    Parted,
-    PartingEnded,
     PongReceived,
     Refused,
 )
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive, RestPace
-from rmpa.mesh.parting import Parting, PartingStep
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.reasons import TrustReason
@@ -189,7 +186,6 @@ class ConnectionProtocol:
         self._state = ConnectionState.HANDSHAKING
         phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
         self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR, phase=phase, rest=rest)
-        self._parting = Parting(self._keepalive, dialler=role is ConnectionRole.DIALLER)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._output = bytearray()
@@ -337,24 +333,20 @@ class ConnectionProtocol:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
-    def need(self, now: float, *, needed: bool, parks: bool = False) -> None:
+    def need(self, now: float, *, needed: bool) -> None:
         """Say whether something depends on this connection; if neither side needs it, it rests.
 
-        Without effect on a connection that is not up, or whose remote side cannot rest. ``parks`` says that this side
-        would end a link that nothing needs (``Feature.PARK``).
+        Without effect on a connection that is not up, or whose remote side cannot rest.
         """
         keepalive = self._keepalive
         if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
             return
-        parks = parks and not needed and bool(self.remote.features & Feature.PARK)
-        if keepalive.needed is needed and keepalive.parks is parks:
+        if keepalive.needed is needed:
             return
-        keepalive.needed, keepalive.parks = needed, parks
-        self._parting.changed(now)
-        if (self._parting.holding or keepalive.agree()) and needed:
+        keepalive.needed = needed
+        if keepalive.agree() and needed:
             keepalive.wake(now, max(limits.WAKE_TIMEOUT, 3 * (self.clock.rtt or 0.0)))
-        if not self._parting.holding:
-            self._send_pace(now)
+        self._send_pace(now)
 
     @property
     def rests(self) -> bool:
@@ -365,19 +357,6 @@ class ConnectionProtocol:
     def remote_lease(self) -> float:
         """Seconds after which the silence of the remote side ends the connection."""
         return self._keepalive.remote_lease
-
-    @property
-    def remote_parks(self) -> bool:
-        """Whether the remote side would end the link for now, because nothing there needs it."""
-        return self._keepalive.remote_parks
-
-    @property
-    def holding(self) -> bool:
-        """Whether this side has agreed to part, and sends nothing until ``Parted`` or ``PartingEnded``.
-
-        It stays true if the connection ends before either.
-        """
-        return self._parting.holding
 
     @property
     def quiet_after(self) -> float:
@@ -408,7 +387,7 @@ class ConnectionProtocol:
             excused = keepalive.excused
             ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
             self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
-        elif self._parting.ask(now) or (not self._parting.holding and keepalive.renew()):
+        elif keepalive.renew():
             self._send_pace(now)
         else:
             self._ping(now)
@@ -469,8 +448,6 @@ class ConnectionProtocol:
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED, FrameKind.LANE}:
             self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
-            if route == frames.BYE_PARKED and self._parting.holding:
-                self.on_event(Parted())
             self._end(f"{self._name} left: {frames.parse_text(payload)}")
         elif kind is FrameKind.REFUSE:
             refuse = Refuse.parse(payload)
@@ -549,21 +526,13 @@ class ConnectionProtocol:
 
     def _paced(self, lease: float, flags: int, now: float) -> None:
         self._keepalive.remote_pace(lease, now, flags)
-        step = self._parting.paced(flags, now)
-        if step is PartingStep.PART:
-            self._send(frames.bye(f"{self._ours.name} parked the link", parked=True))
-            self._close(_Step.LEAVING, f"parked: nothing needs the link with {self._name}", now)
-            self.on_event(Parted())
-            return
-        if self._keepalive.agree() or step is not PartingStep.NOTHING:
+        if self._keepalive.agree():
             self._send_pace(now)
-        if step is PartingStep.GO_ON:
-            self.on_event(PartingEnded())
 
     def _send_pace(self, now: float) -> None:
         """Promise the lease that holds from now on; the ping measures the path, and is the first sign of life."""
         keepalive = self._keepalive
-        self._send(Frame(FrameKind.PACE, route=int(self._parting.flags), sequence=round(keepalive.lease * 1000)))
+        self._send(Frame(FrameKind.PACE, route=int(keepalive.flags), sequence=round(keepalive.lease * 1000)))
         self._ping(now)
 
     def _send(self, frame: Frame) -> None:

@@ -62,16 +62,6 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Parted:
-    """Both sides agreed to part for now: the link may be made again at any time. ``ConnectionClosed`` follows."""
-
-
-@dataclass(frozen=True, slots=True)
-class PartingEnded:
-    """The remote side needs the connection after all; what was held back while it decided may be sent."""
-
-
-@dataclass(frozen=True, slots=True)
 class ConnectionClosed:
     """The connection is over: the driver sends the remaining output and closes the socket.
 
@@ -98,13 +88,5 @@ class MarkReceived:
 
 
 ConnectionEvent = (
-    HelloReceived
-    | HandshakeDone
-    | ControlReceived
-    | PongReceived
-    | MarkReceived
-    | Refused
-    | Parted
-    | PartingEnded
-    | ConnectionClosed
+    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
 )

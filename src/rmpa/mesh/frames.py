@@ -54,19 +54,11 @@ class FrameKind(IntEnum):
     LANE = 13
 
 
-BYE_PARKED: Final = 1
-"""The route field of a bye by which both sides part for now (``mesh.parting``); else it is 0."""
-
-
 class PaceFlag(IntFlag):
     """What the route field of a pace frame says; bits that are not known are ignored."""
 
     NEEDED = 1
     """Something at the sender depends on the connection, so that neither side may rest."""
-    PARKS = 2
-    """The sender would end the link for now; see ``Feature.PARK``."""
-    PARTING = 4
-    """The dialler asks to end the link for now; the acceptor agrees, and holds back what it would send."""
 
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
@@ -213,9 +205,9 @@ def parse_pong(payload: Buffer) -> tuple[int, int]:
     return t1, t2
 
 
-def bye(reason: str, *, parked: bool = False, stamp_ns: int = 0) -> Frame:
-    """The last frame of a connection; ``parked``: by agreement, and it may be made again at any time."""
-    return Frame(FrameKind.BYE, text_payload(reason), route=BYE_PARKED if parked else 0, stamp_ns=stamp_ns)
+def bye(reason: str, *, stamp_ns: int = 0) -> Frame:
+    """The last frame of a connection."""
+    return Frame(FrameKind.BYE, text_payload(reason), stamp_ns=stamp_ns)
 
 
 def text_payload(text: str) -> bytes:

@@ -45,13 +45,9 @@ class Feature(IntFlag):
 
     PACE = 1
     """It takes pace frames: the link may rest."""
-    PARK = 2
-    """It takes a bye that says "parked": the link may be ended for now, by agreement."""
-    SWIM = 4
-    """It answers the probes of failure detectors."""
 
 
-FEATURES: Final = Feature.PACE | Feature.PARK | Feature.SWIM
+FEATURES: Final = Feature.PACE
 """The features of this version."""
 
 
@@ -68,6 +64,7 @@ class Refusal(IntEnum):
     BUSY = 8
     LANE = 9
     NO_EXPRESS = 10
+    FULL = 21
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,14 +246,22 @@ class KnownLink:
     alive: bool
 
 
-def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: bool = False) -> Refuse | None:
+FULL: Final = Refuse(
+    Refusal.FULL,
+    f"this mesh has {limits.MODULES_MAX} modules and no place for one more: make further ones a site of their own "
+    "(`rmpa gateway`, docs/sites.md)",
+)
+"""The answer to a module for which a mesh has no place; it may join when one becomes free."""
+
+
+def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, full: bool = False) -> Refuse | None:
     """Decide on a hello: ``None`` accepts the connection.
 
     Args:
         hello: The dialler's hello.
         ours: The identity of this agent.
         links: The links that are up, or at least those with a peer of the hello's address and port.
-        busy: Whether there is no room for one more peer.
+        full: Whether there is no place for one more peer.
     """
     if refuse := _judge_identity(hello, ours):
         return refuse
@@ -276,8 +281,8 @@ def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: boo
                 return _duplicate(hello.guid)
         elif link.dialled and ours.guid < hello.guid:
             return Refuse(Refusal.ALREADY_LINKED, "we are linked already; the link that the lower GUID dialled stays")
-    if busy and not there:
-        return Refuse(Refusal.BUSY, f"{ours.name} has as many links as it can hold ({limits.LINKS_MAX})")
+    if full and not there:
+        return FULL
     return None
 
 

@@ -71,9 +71,7 @@ class Keepalive:
         "heard",
         "lease",
         "needed",
-        "parks",
         "remote_needs",
-        "remote_parks",
         "sent",
     )
 
@@ -86,8 +84,6 @@ class Keepalive:
         self.promise(lease)
         self.needed = self.remote_needs = True
         """Whether this side, and the remote one, needs the short lease."""
-        self.parks = self.remote_parks = False
-        """Whether this side, and the remote one, would end the link for now; never while it is needed."""
         self.heard = now
         """When bytes were last received."""
         self.sent = now
@@ -138,14 +134,13 @@ class Keepalive:
         """The remote side promises ``lease`` seconds from now on; ``flags`` are bits of ``PaceFlag``."""
         self._remote_lease = lease
         self.remote_needs = bool(flags & PaceFlag.NEEDED)
-        self.remote_parks = bool(flags & PaceFlag.PARKS)
         self.heard = now
         self._woken = None
 
     @property
     def flags(self) -> PaceFlag:
         """What this side says in a pace frame."""
-        return PaceFlag.NEEDED if self.needed else PaceFlag.PARKS if self.parks else PaceFlag(0)
+        return PaceFlag.NEEDED if self.needed else PaceFlag(0)
 
     @property
     def rests(self) -> bool:

@@ -11,6 +11,9 @@ from rmpa.core.limits import PEER_LEASE
 from rmpa.core.sizes import KIB, MIB
 
 # --- mesh -------------------------------------------------------------------------------------------------------
+MODULES_MAX: Final = 256
+"""Modules of one mesh, each with a link to each other one: 255 links and up to 510 sockets. One more is refused; more
+modules are sites, joined by gateways (docs/sites.md)."""
 EXPRESS_LEASE: Final = 1.0
 """A link on which no byte arrived for this long is dead (TCP alone would take two hours to notice)."""
 PAUSE_NOTICED: Final = 0.1
@@ -42,22 +45,6 @@ WAKE_PING_INTERVAL: Final = 0.02
 """Interval of these pings."""
 REST_AFTER: Final = 5.0
 """A link rests when nothing has depended on it for this long, so that a short pause of use changes nothing."""
-PARK_AFTER: Final = 10.0
-"""Where links stand on demand, a link that has been at rest for this long is closed by agreement. Making it again
-takes one round trip and the exchange of both catalogues, so a function that is used now and then keeps its link."""
-WANT_GRACE: Final = 5.0
-"""How long a parked peer may be dialled in vain, once something needs it, before it counts as lost: more than two
-rounds over all of its addresses (DIAL_TIMEOUT)."""
-CHECKING_DIALS_PER_SECOND: Final = 4.0
-"""Parked peers that are dialled a second because their probes are not answered: a firewall may block UDP alone."""
-CHECKING_DIALS_BURST: Final = 8
-"""Such dials at once. Where more peers fall silent they have probably failed, and dials to them would be in vain."""
-UNPARK_RATE: Final = 100.0
-"""Parked peers that are dialled a second where the mesh has become small enough for all links, and where many peers
-have changed what they offer: each takes a millisecond at both sides."""
-FULL_MESH_AGAIN: Final = 0.75
-"""The share of ``mesh.full_mesh_up_to`` below which all links are made again: a quarter of the modules may come and
-go without a change of the mode."""
 ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
 """The acceptor's keepalive interval, as a multiple of the dialler's: on an idle link only the dialler pings, and each
 ping and pong is a sign of life."""
@@ -152,8 +139,6 @@ LINK_LEASE_MAX: Final = 60.0
 """The longest lease; a longer one that a peer claims is lowered to it."""
 GHOST_QUIET: Final = 0.5
 """A link that was silent for this long (two keepalive intervals) does not prevent a link to a new run of its peer."""
-LINKS_MAX: Final = 4096
-"""Peers that may be linked at one time; as many as the membership holds."""
 CONNECTIONS_PER_NAME: Final = 16
 """Connections that one certified name may have here. A module has two, one for each lane; twice that while its agent
 starts anew or dials cross, and twice that after a cut. Each takes some 130 KB."""

@@ -21,7 +21,7 @@ from rmpa.core.clock import earliest
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Hello, KnownLink, Lane, Refusal, Refuse, judge
+from rmpa.mesh.handshake import FULL, Hello, KnownLink, Lane, Refusal, Refuse, judge
 from rmpa.mesh.peering_events import (
     OTHER_PEER,
     SELDOM_MENDED,
@@ -64,7 +64,6 @@ class _Peer:
     verified: bool = False  # the peer was linked before
     token_taken: bool = False  # the present dial counts against the rate of unverified peers
     gone: bool = False  # the peer is forgotten when its link or dial ends
-    parked: bool = False  # the last link was ended by agreement, and nothing needs the peer
     source: str | None = None
     good: SocketAddress | None = None  # the endpoint where the peer was reached last
     link: _LinkInfo | None = None
@@ -80,6 +79,11 @@ class _Peer:
     last_endpoint: SocketAddress | None = None
     refused: Refuse | None = None
     reported: set[int] = field(default_factory=set)  # refusals that were reported
+
+    @property
+    def has_place(self) -> bool:
+        """Whether it is one of the modules of this mesh."""
+        return self.link is not None or (self.verified and self.announced)
 
     def endpoints(self) -> list[SocketAddress]:
         """The endpoints to dial, best first: the last one that worked, the beacon's source, the announced ones."""
@@ -112,6 +116,8 @@ class Peering:
         self._never_dialled: dict[int, None] = {}
         """The peers of the queue that were never dialled."""
         self._newest_next = True
+        self._reported_full: set[int] = set()
+        """``Refusal.FULL`` once one of all peers has said so, until a link comes up."""
         self._pursued: set[int] = set()
         """Peers whose links were in use and fell silent within ``limits.PURSUIT``."""
         self._queue_at: float | None = None
@@ -144,7 +150,6 @@ class Peering:
             peer.lower = self._ours.guid < identity.guid
             self._restart(peer, now)
         if fresh and peer.link is None and not peer.dialling:
-            peer.parked = False
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
         self._dial_due(peer, now)
 
@@ -155,25 +160,6 @@ class Peering:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
-
-    def want(self, guid: Guid, now: float) -> None:
-        """Dial a parked peer at once, or one that waits for its next dial, because something needs it."""
-        peer = self._peers.get(guid.place)
-        if peer is None or peer.link is not None or peer.dialling or peer.gone:
-            return
-        if peer.parked:
-            peer.parked, peer.fell = False, now
-        if peer.next_attempt is None or (peer.verified and not peer.refused):
-            peer.backoff.reset()
-            self._dial_at(peer, now)
-            self._dial_due(peer, now)
-
-    def unpark(self, now: float, spread: float) -> None:
-        """Dial all parked peers, in ``spread`` seconds, because every peer is to be linked again."""
-        for peer in self._peers.values():
-            if peer.parked:
-                peer.parked, peer.fell = False, now
-                self._dial_at(peer, now + spread * self._rng() + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     # --- events of the driver -------------------------------------------------------------------------------
 
@@ -187,7 +173,19 @@ class Peering:
         if peer is not None and peer.link is not None:
             link = peer.link
             known.append(KnownLink(link.identity.guid, link.identity.instance, link.dialled, self._alive(link.id)))
-        return judge(hello, self._ours, known, busy=len(self._by_link) >= limits.LINKS_MAX)
+        refuse = judge(hello, self._ours, known, full=self._full(peer))
+        if refuse is FULL:
+            self.link_refused(hello.guid, refuse)
+        return refuse
+
+    def _full(self, peer: _Peer | None = None) -> bool:
+        """Whether the mesh has no place for this peer, or for a new one.
+
+        A place is taken by a link, and kept while its peer is away for a moment: until discovery has given it up.
+        """
+        if len(self._peers) < limits.MODULES_MAX or (peer is not None and peer.has_place):
+            return False
+        return sum(each.has_place for each in self._peers.values()) >= limits.MODULES_MAX - 1
 
     def dial_opened(self, guid: Guid, now: float) -> bool:
         """Take in that a ``Dial`` has a connection, on which the hello is sent next.
@@ -236,13 +234,13 @@ class Peering:
         peer.link = new
         self._end_pursuit(peer)
         peer.forget_at = peer.refused = None
-        peer.parked = False
         self._dial_at(peer, None)
         self._verify(peer, now)
         peer.attempts = 0
         peer.gone = False
         peer.tried.clear()
         peer.reported.clear()
+        self._reported_full.clear()
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
@@ -253,7 +251,6 @@ class Peering:
         now: float,
         *,
         silent: bool = False,
-        parked: bool = False,
         needed: bool = False,
     ) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
@@ -263,20 +260,14 @@ class Peering:
             reason: Why, for people.
             now: Monotonic seconds.
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
-            parked: Whether both sides ended it for now: an announced peer is not dialled until ``want``.
             needed: Whether something at either side depended on it, so that the peer is worth many attempts.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
             return
         link = peer.link
-        parked = parked and peer.announced and not peer.gone
-        self._drop(peer, link, LinkDownCause.PARKED if parked else LinkDownCause.ENDED, reason)
+        self._drop(peer, link, LinkDownCause.ENDED, reason)
         peer.fell = now
-        if parked:
-            peer.parked, peer.last_error = True, ""
-            peer.backoff.reset()
-            return
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
@@ -330,8 +321,9 @@ class Peering:
             peer.refused = refuse
             pause = max(limits.REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
-        if refuse.code not in OTHER_PEER and refuse.code not in peer.reported:
-            peer.reported.add(refuse.code)
+        reported = self._reported_full if refuse.code == Refusal.FULL else peer.reported
+        if refuse.code not in OTHER_PEER and refuse.code not in reported:
+            reported.add(refuse.code)
             self._outputs.append(LinkRefused(peer.identity, refuse))
 
     def link_refused(self, guid: Guid, refuse: Refuse) -> None:
@@ -345,6 +337,11 @@ class Peering:
         there = [p for p in self._peers.values() if p.link is None and any(e[0] == host for e in p.endpoints())]
         if len(there) == 1:
             self.link_refused(there[0].identity.guid, refuse)
+
+    @property
+    def left_out(self) -> bool:
+        """Whether a mesh that is full has refused this module, and no link has come up since."""
+        return bool(self._reported_full)
 
     # --- time and outputs -----------------------------------------------------------------------------------
 
@@ -407,7 +404,6 @@ class Peering:
 
     def _restart(self, peer: _Peer, now: float) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
-        peer.parked = False
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
@@ -542,6 +538,9 @@ class Peering:
         It takes in turn the newest peer that was never dialled, so that a real peer does not wait for many forged
         ones, and the peer that has waited longest, so that no peer waits forever.
         """
+        if self._dial_queue and self._full():
+            self._queue_at = now + limits.REFUSED_RETRY
+            return
         while self._dial_queue and self._dial_rate.take(now):
             newest = self._newest_next and self._never_dialled
             place = next(reversed(self._never_dialled) if newest else iter(self._dial_queue))
@@ -564,13 +563,11 @@ class Peering:
 
 
 def _status(peer: _Peer) -> PeerStatus:
-    state: Literal["linked", "dialling", "waiting", "refused", "parked"]
+    state: Literal["linked", "dialling", "waiting", "refused"]
     if peer.link is not None:
         state = "linked"
     elif peer.dialling:
         state = "dialling"
-    elif peer.parked:
-        state = "parked"
     else:
         state = "waiting" if peer.refused is None else "refused"
     link = peer.link

@@ -22,6 +22,7 @@ SELDOM_MENDED: Final = frozenset(
         Refusal.DUPLICATE,
         Refusal.MALFORMED,
         Refusal.LANE,
+        Refusal.FULL,
         TrustReason.PLAIN,
         TrustReason.FOREIGN,
         TrustReason.EXPIRED,
@@ -75,8 +76,6 @@ class LinkDownCause(Enum):
     """The same run of the peer has another link from the same moment on."""
     RESTARTED = "the peer restarted"
     """Another run of the peer has taken its place."""
-    PARKED = "parked: nothing needed it"
-    """Both sides ended it for now; it is made again when something needs the peer."""
     ENDED = "the connection ended"
     """The connection of its express lane ended; ``LinkDown.reason`` says how."""
 
@@ -115,12 +114,10 @@ class PeerStatus:
 
     Args:
         identity: The peer.
-        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself. ``parked``: the link
-            was ended by agreement, and is made again when something needs the peer.
+        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
         link_id: Its link, if linked.
         lower: Whether this agent has the lower GUID of the two, and dials first.
-        since: When the link came up, or the last link fell, or a parked peer was wanted again, monotonic seconds;
-            ``None`` before the first link.
+        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
         attempts: Dials since the last link.
         last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
         next_attempt: When it is dialled next, monotonic seconds.
@@ -129,7 +126,7 @@ class PeerStatus:
     """
 
     identity: Identity
-    state: Literal["linked", "dialling", "waiting", "refused", "parked"]
+    state: Literal["linked", "dialling", "waiting", "refused"]
     link_id: int | None
     lower: bool
     since: float | None

@@ -74,7 +74,7 @@ class Health:
         peers = _by_name(snapshot.peers)
         yield _agent(snapshot)
         for name, info in peers.items():
-            if info.state in (_LINKED, "parked"):
+            if info.state == _LINKED:
                 self._linked[name] = now
                 self._topics[name] = set()
             counts[name] = Counter(dropped=info.link.dropped if info.link else 0)
@@ -212,9 +212,7 @@ def _agent(snapshot: Snapshot) -> Check:
     if files is not None and files.near and not files.problem:
         notes.append(f"{files.open} of {files.limit} file descriptors are open; {remedy(snapshot.agent.pid)}")
     level = FAIL if files is not None and files.problem else WARN if notes else OK
-    parked = sum(info.state == "parked" for info in snapshot.peers)
-    known = f"{linked} of {len(snapshot.peers)} known peers linked" + (f", {parked} parked" if parked else "")
-    text = "; ".join(notes) or known
+    text = "; ".join(notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
     return Check(HERE, level, text, evidence=agent_values(snapshot, linked))
 
 
@@ -233,8 +231,6 @@ def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[Chec
         if troubles:
             return WARN, "; ".join(troubles)
         return OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
-    if info.state == "parked":
-        return OK, "parked: nothing needs it now; it is linked again when something does"
     if info.state == "relayed":
         return OK, f"relayed: {info.via or 'another peer'} passes on what it publishes"
     if info.state in ("conflict", "refused"):

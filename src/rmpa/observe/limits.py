@@ -89,5 +89,3 @@ DOCTOR_NODES_TIMEOUT: Final = 2.0
 """Seconds in which a core tells the addresses of its nodes; each takes a millisecond."""
 DOCTOR_NODES_MAX: Final = 500
 """Nodes of one core whose ports are looked at, so that the check ends in time."""
-PARKED_ASKED_MAX: Final = 32
-"""Parked peers that a list of the nodes of all modules has linked; of more, only the nodes with proxies are shown."""

@@ -88,24 +88,6 @@ class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
     text: str
 
 
-class ProbesInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What the failure detector holds of a peer.
-
-    Attributes:
-        state: ``alive``, or ``suspect``: it did not answer probes, and may refute that it has failed.
-        heard_ago: Seconds since its last packet; ``None`` if none came.
-        rtt: The last round trip of a probe in seconds; ``None`` before the first.
-        refuted: How often it was suspected and refuted that.
-        version: The version of what it offers; ``None`` while none was heard of.
-    """
-
-    state: str
-    heard_ago: float | None = None
-    rtt: float | None = None
-    refuted: int = 0
-    version: int | None = None
-
-
 class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     """One peer of the roster.
 
@@ -116,8 +98,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
             ``conflict`` (shares a GUID or an address with another, so it cannot be linked); ``relayed`` (has no link;
-            another peer relays its topics); ``parked`` (both sides ended the link, as nothing needed it; it is made
-            again on demand); ``foreign`` (is not of this mesh).
+            another peer relays its topics); ``foreign`` (is not of this mesh).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.
@@ -133,7 +114,6 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         beyond: What this module hides of it by its limits.
         direct_in: Subscribers here that are connected to its nodes directly.
         direct_out: Its subscribers that may connect to nodes here directly.
-        probes: What the failure detector holds of it, while it probes.
     """
 
     name: str
@@ -155,4 +135,3 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     beyond: tuple[BoundInfo, ...] = ()
     direct_in: int = 0
     direct_out: int = 0
-    probes: ProbesInfo | None = None

@@ -39,24 +39,6 @@ class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
-class DetectorInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """The failure detector, which probes the members while links stand on demand.
-
-    Attributes:
-        members: The members that it watches.
-        suspects: Those of them that are suspected now.
-        health: Its own health: 0 is well; above it this process or its network was slow, and it judges more slowly.
-        refuted: How often others suspected this agent and it refuted that.
-        news: News of members that is being spread.
-    """
-
-    members: int
-    suspects: int = 0
-    health: int = 0
-    refuted: int = 0
-    news: int = 0
-
-
 class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The agent itself.
 
@@ -74,7 +56,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         rss: Resident memory, bytes.
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
-        links: Whether all peers stay linked or those in use, and why, ready to read: ``full mesh (3 modules, …)``.
         config_file: Where its settings were read, or empty.
         realtime: The outcome of each request of ``--realtime``, ready to read; empty without it.
         files: Its file descriptors.
@@ -83,7 +64,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         proxy_listening: How these are used, ready to read: the ports that all share, or why each has its own.
         core_memory: Where the core stores registrations and parameters, and what it took over from its last run,
             ready to read; empty for a core that stores nothing.
-        detector: The failure detector, while it probes.
     """
 
     name: str
@@ -99,7 +79,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     rss: int | None = None
     addresses: tuple[str, ...] = ()
     interfaces: tuple[str, ...] = ()
-    links: str = ""
     config_file: str = ""
     realtime: tuple[str, ...] = ()
     files: FilesInfo | None = None
@@ -107,7 +86,6 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     proxy_sockets: int = 0
     proxy_listening: str = ""
     core_memory: str = ""
-    detector: DetectorInfo | None = None
 
 
 class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):

@@ -28,7 +28,6 @@ class KeyPurpose(StrEnum):
     """What a key signs. Each has a key of its own, so that no bytes of one can stand for another."""
 
     BEACON = "rmpa beacon 1"
-    SWIM = "rmpa swim 1"
 
 
 @dataclass(frozen=True, slots=True)

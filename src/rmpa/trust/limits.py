@@ -109,6 +109,3 @@ DENY_MAX: Final = 1024
 """Names on a deny list, two for each member of a full roster."""
 DOCUMENT_MAX: Final = 256 * KIB
 """Bytes of a signed document: a full deny list has some 100 KB."""
-SPREAD_PARKED: Final = 16
-"""Parked peers that are linked for a newer document; each of them does the same. A module that is left out, which is
-rare, learns of the document with its next link."""

@@ -155,7 +155,7 @@ malformed message disconnects it: it does not speak the protocol."""
 
 # --- /metrics -----------------------------------------------------------------------------------------------------
 METRIC_PEERS: Final = 1024
-"""Peers in /metrics, a linked one with some fifteen time series, a parked one with three; linked ones go first."""
+"""Peers in /metrics, each with some fifteen time series."""
 METRIC_ROUTES: Final = 2000
 """Routes in /metrics, each with some twenty time series; a module of 300 topics and three peers has some 1,000."""
 METRIC_SERVICES: Final = 1000

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
     from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot
 
-PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed", "parked")
+PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")
 """The values of ``PeerInfo.state``."""
-_IN_ORDER: Final = frozenset({"linked", "relayed", "parked"})
+_IN_ORDER: Final = frozenset({"linked", "relayed"})
 """States of a peer that has its link, or needs none."""
 EVENT_KINDS: Final = (
     "deadline_missed",
@@ -119,10 +119,7 @@ def metrics(snapshot: Snapshot | None) -> Iterator[Metric]:
     omitted = _Family(
         "rmpa_metrics_omitted", "Peers, routes, services and reasons left out for their number.", "gauge", ("kind",)
     )
-    known = sorted(
-        snapshot.peers, key=lambda peer: peer.state == "parked"
-    )  # those in use are never left out for them
-    peers = _bounded(omitted, "peer", known, limits.METRIC_PEERS)
+    peers = _bounded(omitted, "peer", snapshot.peers, limits.METRIC_PEERS)
     all_routes = [(t.name, route) for t in snapshot.topics for route in t.routes]
     all_routes.sort(key=lambda each: each[1].state == "idle")
     routes = _bounded(omitted, "route", all_routes, limits.METRIC_ROUTES, snapshot.topics_left)
@@ -204,7 +201,7 @@ def _peers(snapshot: Snapshot, peers: Iterable[PeerInfo]) -> Iterator[Metric]:
     linked = _Family("rmpa_peer_linked", "Whether the peer has a link.", "gauge", ("peer",))
     missing = _Family(
         "rmpa_peer_link_missing",
-        "Whether the peer has no link and should have one: it is neither linked nor parked nor relayed.",
+        "Whether the peer has no link and should have one: it is neither linked nor relayed.",
         "gauge",
         ("peer",),
     )

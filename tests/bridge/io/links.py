@@ -99,8 +99,7 @@ class LinkEnd:
         self.guid = other.identity.guid
         self.name = other.name
         self.silent = False
-        self.crashed = self.parked = False
-        self.held: list[bytes] = []
+        self.crashed = False
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
         self.gone = self.abandoned = False

@@ -63,8 +63,7 @@ class Link:
         self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)
         self.guid = self.identity.guid
         self.silent = silent
-        self.parked = self.crashed = False
-        self.held: list[bytes] = []
+        self.crashed = False
 
 
 class Scene:
@@ -226,29 +225,3 @@ def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
         assert made.sessions.get(1) is None
 
     assert play(scene, 9.0) == ["up 1", "down", "grace over", "gone", "up 2"]
-
-
-def test_a_parked_peer_whose_name_another_module_has_too_is_dialled_and_both_stay() -> None:
-    """A copied disk gives two modules one name; a restart at another port looks the same until the old one fails."""
-
-    async def scene(made: Scene) -> None:
-        wanted: list[Guid] = []
-        made.sessions.on_want = wanted.append
-
-        def park(link: PeerLink) -> None:
-            link.parked = True
-            made.sessions.link_down(link)
-
-        first = made.link(1)
-        park(first)
-        second = made.link(2, host="10.0.0.2")
-        assert wanted == [first.guid]
-        assert made.states() == [PeerState.LINKED]
-        first = made.link(1)
-        park(first)
-        park(second)
-        made.link(2, host="10.0.0.2")
-        assert made.states() == [PeerState.LINKED, PeerState.PARKED]
-        assert wanted == [first.guid]
-
-    play(scene)

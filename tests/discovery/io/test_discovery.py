@@ -22,7 +22,6 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
-from rmpa.discovery.swim.events import MemberOffers
 from rmpa.trust.keyring import GroupKey, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.discovery.events import PeerView
-    from rmpa.discovery.swim.events import SwimEvent
 
 DEADLINE = 15.0
 
@@ -424,50 +422,3 @@ async def test_a_secured_mesh_hears_its_members_alone(agents: list[Agent], setti
         await until(partial(lambda each: each.discovery.counters["beacon.forged"], agent))
     assert base.names() == {"pc"}
     assert foreign.names() == set()
-
-
-@pytest.mark.parametrize("secured", [False, True])
-async def test_a_member_without_a_link_that_dies_is_lost_by_its_silence_to_probes(
-    agents: list[Agent], settings: Settings, secured: bool
-) -> None:
-    found: list[SwimEvent] = []
-    mesh = [
-        Agent(f"m{n}", settings, on_member=found.append, trust=_trust(b"k") if secured else None) for n in range(5)
-    ]
-    await start(agents, *mesh)
-    for agent in mesh:
-        agent.discovery.set_demand(on=True)
-        for other in mesh:
-            if other is not agent:
-                agent.discovery.link_up(other.identity, answers_probes=True)
-                agent.discovery.link_down(other.identity.guid, other.identity.instance)
-    mesh[3].discovery.set_version(7)
-    await until(lambda: sum(isinstance(event, MemberOffers) and event.version == 7 for event in found) == 4)
-    dead = mesh[4]
-    agents.remove(dead)
-    dead.discovery._membership._sender.closed = dead.discovery._detector._closed = True  # killed: no goodbye
-    await dead.end()
-    lost = PeerLost(dead.identity, LossReason.FAILED)
-    for agent in mesh[:4]:
-        await until(partial(lambda each: lost in each.events, agent))
-        assert len(agent.names()) == 3
-        assert agent.discovery.detector.members == 3
-        assert agent.discovery.member(dead.identity.guid, dead.identity.instance) is None
-
-
-async def test_an_agent_in_full_mesh_sends_no_probes_and_answers_them(
-    agents: list[Agent], settings: Settings
-) -> None:
-    base, pc = Agent("base", settings), Agent("pc", settings)
-    await start(agents, base, pc)
-    for one, other in ((base, pc), (pc, base)):
-        one.discovery.link_up(other.identity, answers_probes=True)
-    pc.discovery.set_demand(on=True)
-
-    def heard() -> float | None:
-        view = pc.discovery.member(base.identity.guid, base.identity.instance)
-        return view.rtt if view is not None else None
-
-    await until(lambda: heard() is not None)
-    assert not base.discovery.detector.active
-    assert base.discovery.counters["swim.out"] <= pc.discovery.counters["swim.out"]

@@ -11,7 +11,6 @@ from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
-from rmpa.discovery.swim.packets import SwimKind, SwimPacket
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
 from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
@@ -90,37 +89,6 @@ def test_flooding_address_is_ignored_for_the_rest_of_the_second() -> None:
     assert door.intake.parse(packet(FRIEND, 501), ("10.0.0.2", 4000), 11.0, multicast=True, interface=1) is not None
 
 
-def probe(identity: Identity, sequence: int) -> bytes:
-    subject = (Guid.of("10.0.0.1", 4000), bytes(8))
-    return SwimPacket(SwimKind.PROBE, identity.guid, identity.instance, 0, sequence, subject=subject).serialize()
-
-
-def test_a_flood_of_probes_leaves_room_for_beacons() -> None:
-    door = Door()
-    heard = 0
-    for n in range(3000):
-        guid = Guid.of(f"10.1.{n // 250}.{1 + n % 250}", 4000)
-        data = probe(Identity(guid, os.urandom(16), "forged"), 1)
-        heard += door.intake.parse(data, source(n), 10.0, multicast=False, interface=1) is not None
-    assert heard == limits.SWIM_UNLINKED_BURST == door.counters["swim.in"]
-    assert door.counters["swim.unlinked_limited"] == 3000 - heard
-    assert door.flood(100, 10.0) == 100
-    known = door.intake.parse(probe(FRIEND, 9), ("10.0.0.2", 4000), 10.0, multicast=False, interface=1)
-    assert isinstance(known, SwimPacket)
-    assert door.intake.parse(probe(FRIEND, 9)[:50], ("10.0.0.2", 4000), 10.0, multicast=False, interface=1) is None
-    assert door.counters["swim.malformed"] == 1
-
-
-def test_a_flood_in_the_name_of_a_member_is_limited_over_all_addresses() -> None:
-    """In an open mesh a beacon shows all that a packet in its sender's name needs; source addresses can be forged."""
-    door = Door()
-    taken = [door.intake.parse(probe(FRIEND, n), source(n), 10.0, multicast=False, interface=1) for n in range(3000)]
-    assert sum(packet is not None for packet in taken) == limits.SWIM_BURST == door.counters["swim.in"]
-    assert door.counters["swim.limited"] == 3000 - limits.SWIM_BURST
-    assert door.intake.parse(packet(FRIEND, 7), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is not None
-    assert door.intake.parse(probe(FRIEND, 1), ("10.0.0.2", 4000), 10.5, multicast=False, interface=1) is not None
-
-
 WALL = 1_790_000_000.0
 RING = KeyRing([GroupKey(1, b"k" * 32)], 0.0)
 
@@ -189,25 +157,6 @@ def test_a_module_with_an_older_group_key_is_recognised_and_counts_for_no_limit(
     assert isinstance(found(member, 7, 11.0), Beacon)
     assert counters["beacon.in"] == 1
     assert counters["beacon.flood"] == counters["beacon.unlinked_limited"] == 0
-
-
-def test_packets_of_the_failure_detector_have_a_key_of_their_own() -> None:
-    ring = KeyRing([GroupKey(1, b"k" * 32), GroupKey(2, b"n" * 32)], 0.0)
-    counters = Counters()
-    door = PacketFilter(0, counters, trust=PacketTrust(PacketSigner(ring), PacketVerifier(ring), lambda: WALL))
-    signer = PacketSigner(ring)
-    old = PacketSigner(KeyRing([GroupKey(1, b"k" * 32)], 0.0))
-
-    def hears(data: bytes) -> bool:
-        return door.parse(data, ("10.0.0.2", 4000), 10.0, multicast=False, interface=1) is not None
-
-    body = probe(FRIEND, 1)
-    assert hears(signer.sign(body, KeyPurpose.SWIM, 10.0, WALL))
-    assert not hears(body)
-    assert not hears(signer.sign(body, KeyPurpose.BEACON, 10.0, WALL))
-    assert not hears(old.sign(body, KeyPurpose.SWIM, 10.0, WALL)), "a module without the present key says nothing"
-    assert counters["swim.in"] == 1
-    assert (counters["beacon.untagged"], counters["beacon.forged"], counters["swim.old_key"]) == (1, 1, 1)
 
 
 def test_a_flood_under_the_address_of_a_member_does_not_silence_it() -> None:

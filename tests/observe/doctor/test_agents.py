@@ -59,7 +59,6 @@ def test_a_peer_that_needs_no_link_is_not_a_problem() -> None:
     assert linked.link is not None
     states = (
         msgspec.structs.replace(linked, name="idle", link=msgspec.structs.replace(linked.link, rests=True)),
-        msgspec.structs.replace(linked, name="far", state="parked", link=None),
         msgspec.structs.replace(linked, name="beyond", state="relayed", link=None, via="idle"),
     )
     shown = msgspec.structs.replace(SNAPSHOT, peers=states)
@@ -67,15 +66,14 @@ def test_a_peer_that_needs_no_link_is_not_a_problem() -> None:
         f.where: f for f in judge_agents({"base": shown}, "0.1.0") if f.name == "peer" and f.level is CheckLevel.OK
     }
     assert found["base-idle"].text == "linked by 10.0.0.2:40002, at rest, found by multicast"
-    assert found["base-far"].text.startswith("parked: nothing needs its link")
     assert found["base-beyond"].text == "relayed: another peer passes on its topics"
     assert exit_code(judge_agents({"base": shown}, "0.1.0")) == 0
 
 
 def test_of_many_peers_those_with_a_problem_are_listed() -> None:
     joystick, pc = SNAPSHOT.peers
-    parked = [msgspec.structs.replace(joystick, name=f"m{n}", state="parked", link=None) for n in range(999)]
-    shown = msgspec.structs.replace(SNAPSHOT, peers=(*parked, joystick, pc))
+    others = [msgspec.structs.replace(joystick, name=f"m{n}", state="relayed", link=None) for n in range(999)]
+    shown = msgspec.structs.replace(SNAPSHOT, peers=(*others, joystick, pc))
     found = [f for f in judge_agents({"base": shown}, "0.1.0") if f.name in ("peer", "clock")]
     assert [(f.where, f.level) for f in found] == [
         ("base-joystick", CheckLevel.WARN),
@@ -83,7 +81,7 @@ def test_of_many_peers_those_with_a_problem_are_listed() -> None:
         ("base-pc", CheckLevel.WARN),
         ("base", CheckLevel.OK),
     ]
-    assert found[-1].text == "999 of 1,001 have no problem: 999 parked"
+    assert found[-1].text == "999 of 1,001 have no problem: 999 relayed"
 
 
 def test_what_permissions_refused() -> None:

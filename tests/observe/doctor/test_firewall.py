@@ -66,7 +66,7 @@ IPTABLES_UFW = """\
         (NFT_CLOSED, CheckLevel.WARN, "inet filter input drops what no rule lets in"),
         (NFT_OURS, CheckLevel.OK, "lets ours in: udp dport { 5353, 11400-11450 } accept"),
         (NFT_AGAINST, CheckLevel.FAIL, "drops what agents send: udp dport 11411 counter"),
-        (NFT_UDP, CheckLevel.FAIL, "drops all UDP, also beacons and probes of agents: meta l4proto udp drop"),
+        (NFT_UDP, CheckLevel.FAIL, "drops all UDP, also beacons of agents: meta l4proto udp drop"),
         (NFT_UDP.replace("l4proto udp", "l4proto { tcp, udp }"), CheckLevel.FAIL, "drops all UDP"),
         (NFT_UDP.replace('iif "lo"', "udp dport 11411"), CheckLevel.OK, "none against agents"),
         (NFT_UDP.replace('iif "lo"', "tcp dport 40001"), CheckLevel.FAIL, "drops all UDP"),

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.observe.peer_info import ProbesInfo
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.patch import Tree, apply, difference
@@ -181,20 +180,12 @@ def test_patches_of_the_recorded_demo_are_small() -> None:
     [
         (peer(), "up"),
         (peer(link=msgspec.structs.replace(LINK, heard_ago=1.5)), "silent"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=6.5, rests=True)), "up"),
-        (peer(link=msgspec.structs.replace(LINK, heard_ago=8.5, rests=True)), "silent"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=6.5, rests=True, lease=16.0)), "up"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=8.5, rests=True, lease=16.0)), "silent"),
+        (peer(link=msgspec.structs.replace(LINK, heard_ago=20.0, rests=True, lease=58.0)), "up"),
         (peer(state="linking", link=None, beacon_ago=0.5), "linking"),
         (peer(state="linking", link=None, beacon_ago=8.0), "away"),
         (peer(state="linking", link=None), "away"),
-        (
-            peer(state="linking", link=None, beacon_ago=30.0, probes=ProbesInfo(state="alive", heard_ago=2.0)),
-            "linking",
-        ),
-        (
-            peer(state="linking", link=None, beacon_ago=30.0, probes=ProbesInfo(state="suspect", heard_ago=8.0)),
-            "away",
-        ),
-        (peer(state="parked", link=None, beacon_ago=30.0), "parked"),
         (peer(state="refused", link=None), "refused"),
         (peer(state="conflict", link=None), "refused"),
         (peer(state="relayed", link=None, via="gate"), "relayed"),
@@ -212,15 +203,6 @@ def test_a_state_of_a_huge_mesh_is_bounded_and_says_what_is_left_out() -> None:
     assert len(state["topics"]) == limits.TOPICS_SHOWN
     assert len(state["modules"]) <= limits.MODULES_SHOWN + 1
     assert state["hidden"] == {"topics": 5, "modules": 3}
-
-
-def test_parked_modules_of_a_large_mesh_are_counted_and_leave_room_to_the_others() -> None:
-    parked = tuple(peer(f"a{number:04d}", state="parked", link=None) for number in range(limits.MODULES_SHOWN))
-    linked = tuple(peer(f"z{number}") for number in range(3))
-    state = build(msgspec.structs.replace(RECORDED[0], peers=(*parked, *linked), topics_left=7, services_left=2))
-    assert state["parked"] == limits.MODULES_SHOWN
-    assert {"z0", "z1", "z2"} <= state["modules"].keys(), "no place is kept from them by parked ones"
-    assert state["hidden"] == {"topics": 7, "services": 2, "modules": 3}
 
 
 def test_without_an_agent_the_last_state_stays_and_says_so() -> None:

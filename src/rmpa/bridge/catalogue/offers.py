@@ -110,8 +110,6 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         """The entries within the limit, by key; which of them a peer is sent is decided by ``offer``."""
         self._beyond: OrderedDict[KeyT, LocalT] = OrderedDict()
         self._peers: dict[int, CataloguePeer[KeyT, LocalT, OfferT, WireT]] = {}
-        self.changes = 0
-        """Counts the changes that any peer may have to be sent."""
         self._with_news: dict[int, None] = {}
         """The peers that have, or had when last looked at, entries to examine."""
 
@@ -198,7 +196,6 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
 
     def note(self, key: KeyT) -> None:
         """Have an entry examined for every peer: it was put, changed or removed."""
-        self.changes += 1
         for number, known in self._peers.items():
             known.news.setdefault(key)
             self._with_news[number] = None

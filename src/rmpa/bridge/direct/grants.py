@@ -242,7 +242,7 @@ class Grants:
         """
         if crashed:
             return
-        shared = any(other.address == session.address for other in self._sessions.reachable() if other is not session)
+        shared = any(other.address == session.address for other in self._sessions.linked() if other is not session)
         if session.link.silent and not shared:
             for port in {grant.port for peer, _, grant in self if peer == session.peer}:
                 self._end(session, port)

@@ -276,7 +276,7 @@ class Paths:
         if self._closed:
             return
         session = self._sessions.get(path.peer)
-        unmet = path.unmet_here or (None if session is not None and session.reachable else NO_LINK)
+        unmet = path.unmet_here or (None if session is not None and session.linked else NO_LINK)
         if unmet is not None:
             self._decide(path, unmet)
             return

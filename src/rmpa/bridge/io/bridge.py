@@ -95,7 +95,6 @@ class Bridge:
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
         """The sessions of the peers."""
-        self.rpc.reach, self.rpc.want = self.sessions.reach, self.sessions.want
         self.relay = Relay(enabled=relay)
         """Which sources of one peer are offered to others."""
         self.topics = Topics(
@@ -114,7 +113,6 @@ class Bridge:
             find=self.proxy_nodes.publication,
         )
         self.add(self.topics)
-        self.sessions.offers.listen(self.rpc)
         self._reconciler: asyncio.TimerHandle | None = None
 
     def add(self, part: Part) -> None:

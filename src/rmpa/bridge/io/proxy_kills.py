@@ -77,7 +77,7 @@ class ProxyKills:
         if self._all.get(caller, 0.0) > loop.time():
             self._all[caller] = loop.time() + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
-        if not session.reachable:
+        if not session.linked:
             return f"{session.link.name} is not linked"
         if self._under_way >= limits.NODE_KILLS_AT_ONCE:
             return f"{self._under_way} other nodes are being ended; try again"

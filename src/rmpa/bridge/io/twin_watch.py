@@ -71,7 +71,7 @@ class TwinWatch(Part):
         if state is not self._state:
             self._state = state
             self._offered, self._taken = telling(_own(state.publishers)), telling(_own(state.subscribers))
-        for session in self._bridge.sessions.reachable():
+        for session in self._bridge.sessions.linked():
             yield_to_data()
             self._judge(session)
 

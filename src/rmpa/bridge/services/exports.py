@@ -146,11 +146,6 @@ class ServiceExports:
         """Whether there is something to ``advertise``."""
         return self._catalogue.pending
 
-    @property
-    def changes(self) -> int:
-        """Counts the changes of what is offered to any peer."""
-        return self._catalogue.changes
-
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
@@ -177,7 +172,6 @@ class ServiceExports:
             The actions for one service after the other; each service is judged when its item is requested.
         """
         self._rules, self._catalogue.limit = rules, limit_settings.services
-        self._catalogue.changes += 1
         for known in self._catalogue.peers():
             self._catalogue.note_all(known)
         return self._rejudge()

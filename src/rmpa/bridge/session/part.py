@@ -70,10 +70,6 @@ class Part:
         """
         return False
 
-    def holds(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
-        """Whether a link that nothing depends on must stay nevertheless: without it something would be missed."""
-        return False
-
     # --- messages ----------------------------------------------------------------------------------------------
 
     def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Notification, Request, Response, encode, op_of
+from rmpa.bridge.messages import Notification, Request, Response, encode
 from rmpa.bridge.session.part import Part
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.core.sizes import UINT32_MAX
@@ -34,8 +34,6 @@ _log = logging.getLogger(__name__)
 UNKNOWN_QUESTION: Final = "does not know the question"
 """In the response of an agent of an earlier release."""
 Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
-_REPEATED: Final = frozenset({"ask", "tell"})
-"""The control messages that are sent over the next link if a parked one held them back; others follow from it."""
 Listener = Callable[["PeerSession", dict[str, Any]], None]
 
 
@@ -53,12 +51,6 @@ class PeerRpc(Part):
         self._handlers: dict[str, Handler] = {}
         self._listeners: dict[str, Listener] = {}
         self._answering: dict[int, set[asyncio.Task[None]]] = {}
-        self._unsent: dict[int, list[bytes]] = {}
-        """Requests and notifications for the next link, by peer: its link was parked before they were sent."""
-        self.reach: Callable[[PeerSession], Awaitable[None]] = _no_way
-        """Waits until a parked peer is linked again; see ``PeerSessions.reach``."""
-        self.want: Callable[[PeerSession], None] = lambda _: None
-        """Has a parked peer linked again; see ``PeerSessions.want``."""
 
     def on_request(self, what: str, handler: Handler, _needs: Needs) -> None:
         """Set the handler of the requests named ``what``, which asks for the permissions that ``_needs`` declares."""
@@ -69,17 +61,8 @@ class PeerRpc(Part):
         self._listeners[what] = listener
 
     def notify(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:
-        """Send a notification to a linked peer, or to a parked one, which is linked for it."""
-        payload = encode(Notification(what, args))
-        if session.linked or not session.reachable:
-            session.link.send_control(payload)
-            return
-        unsent = self._unsent.setdefault(session.peer, [])
-        if len(unsent) < limits.UNSENT_MAX:
-            unsent.append(payload)
-            self.want(session)
-        else:
-            self._counters.add("tell.dropped")
+        """Send a notification to a linked peer."""
+        session.link.send_control(encode(Notification(what, args)))
 
     async def request(
         self,
@@ -88,15 +71,12 @@ class PeerRpc(Part):
         args: dict[str, Any],
         timeout: float = limits.ASK_TIMEOUT,  # noqa: ASYNC109 - the message names it
     ) -> Any:
-        """Send a request to a reachable peer, and return the value of its response; a parked peer is linked first.
+        """Send a request to a linked peer, and return the value of its response.
 
         Raises:
             PeerRefused: The peer responds with an error.
-            UnreachableError: The peer does not respond within ``timeout`` seconds, or its link ends meanwhile, or it
-                was parked and cannot be linked.
+            UnreachableError: The peer does not respond within ``timeout`` seconds, or its link ends meanwhile.
         """
-        if not session.linked and session.reachable:
-            await self.reach(session)
         number = next(self._numbers)
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self._waiting[session.peer, number] = (future, session.link.name)
@@ -110,34 +90,8 @@ class PeerRpc(Part):
         finally:
             self._waiting.pop((session.peer, number), None)
 
-    def link_up(self, session: PeerSession) -> None:
-        """Send what the last link held back when it was parked, and what was for a parked peer."""
-        for payload in self._unsent.pop(session.peer, ()):
-            session.link.send_control(payload)
-
     def link_down(self, session: PeerSession) -> None:
-        """Fail the requests to a peer whose link is gone, and cancel the handlers of its own requests.
-
-        Requests that a link held back when it was parked are sent over the next one.
-        """
-        if session.link.parked:
-            if held := [payload for payload in session.link.held if op_of(payload) in _REPEATED]:
-                self._unsent.setdefault(session.peer, []).extend(held)
-            return
-        self._unsent.pop(session.peer, None)
-        self._fail(session)
-
-    def grace_over(self, session: PeerSession) -> bool:
-        """Fail the requests to a parked peer that could not be linked."""
-        self._unsent.pop(session.peer, None)
-        self._fail(session)
-        return False
-
-    def gone(self, session: PeerSession) -> None:
-        """As ``grace_over``."""
-        self.grace_over(session)
-
-    def _fail(self, session: PeerSession) -> None:
+        """Fail the requests to a peer whose link is gone, and cancel the handlers of its own requests."""
         for (peer, _), (future, name) in list(self._waiting.items()):
             if peer == session.peer and not future.done():
                 future.set_exception(UnreachableError("agent", name, "its link has just ended; try again"))
@@ -222,7 +176,3 @@ class PeerRpc(Part):
             text = f"the answer has {len(payload)} bytes, more than {mesh_limits.CONTROL_PAYLOAD_MAX}"
             payload = encode(Response(answer.number, ok=False, error=text))
         session.link.send_control(payload)
-
-
-async def _no_way(session: PeerSession) -> None:
-    raise UnreachableError("agent", session.link.name, "it has no link")

@@ -22,18 +22,12 @@ class PeerState(Enum):
     LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
       ▲  ├──closed in order──────────────────►  │
       ├──┼────────────── a new link ────────────┘   (from SILENT, too)
-      │  └──both agree──► PARKED ──wanted──► WANTED ──WANT_GRACE──► AWAY
-      └──────── a new link ──┴──────────────────┘
     """
 
     LINKED = auto()
     """The peer has a link."""
     SILENT = auto()
     """Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``."""
-    PARKED = auto()
-    """Both sides ended the link, as nothing needed it; the peer is there, and is linked again when it is wanted."""
-    WANTED = auto()
-    """It was parked, something needs it, and it is being dialled."""
     AWAY = auto()
     """It has no link, and a part of the bridge keeps something for it."""
 
@@ -50,11 +44,7 @@ class PeerSession:
         time: The time base of its link: the offset between its clock and the local one.
         state: Whether it has a link.
         away_since: When its last link ended, monotonic seconds.
-        wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link, or is parked.
-        offers_told: The version of this module's offers that the peer was told completely over its link.
-        offers_held: The version of the peer's offers that this module has completely.
-        offers_heard: The highest version of the peer's offers that this module heard of.
-        unparked: Whether its link is the one after it was parked: nothing was interrupted.
+        wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
     """
 
     peer: int
@@ -65,15 +55,6 @@ class PeerSession:
     state: PeerState = PeerState.LINKED
     away_since: float = 0.0
     wait: float | None = None
-    unparked: bool = False
-    offers_told: int | None = None
-    offers_held: int | None = None
-    offers_heard: int = 0
-
-    @property
-    def reachable(self) -> bool:
-        """Whether the peer has a link, or gets one as soon as something is sent to it (``PeerSessions.reach``)."""
-        return self.state in (PeerState.LINKED, PeerState.PARKED, PeerState.WANTED)
 
     @property
     def linked(self) -> bool:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import random
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.session.offer_versions import OfferVersions
 from rmpa.bridge.session.part import guarded
 from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.proxy_namespaces import ProxyNamespaces
-from rmpa.core.errors import UnreachableError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
@@ -25,8 +22,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.session.part import Part
     from rmpa.bridge.session.proxy_nodes import ProxyNodes
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -60,13 +55,6 @@ class PeerSessions:
         self._by_link: dict[PeerLink, PeerSession] = {}
         self._namespaces = ProxyNamespaces()
         self._closing: set[asyncio.Task[None]] = set()
-        self._reaching: dict[int, set[asyncio.Future[None]]] = {}
-        self.offers: Final = OfferVersions(lambda: self, self.want, random.random)
-        """The versions of what this module and its peers offer."""
-        self.on_want: Callable[[Guid], None] = lambda _: None
-        """Called to have a parked peer dialled; set with the agent's place in the network, as the next one."""
-        self.may_park: Callable[[PeerLink], bool] = lambda _: False
-        """Whether this agent would do without the link to a peer while nothing needs it."""
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
 
     def __iter__(self) -> Iterator[PeerSession]:
@@ -76,10 +64,6 @@ class PeerSessions:
     def linked(self) -> Iterator[PeerSession]:
         """The sessions that have a link."""
         return (session for session in self if session.linked)
-
-    def reachable(self) -> Iterator[PeerSession]:
-        """The sessions that have a link, or get one when something is sent to the peer."""
-        return (session for session in self if session.reachable)
 
     def get(self, peer: int) -> PeerSession | None:
         """A session by its number."""
@@ -105,21 +89,16 @@ class PeerSessions:
         """Attach a link to the session that waits for it, or begin a session."""
         session = self._waiting_for(link)
         if session is not None:
-            session.unparked = session.state in (PeerState.PARKED, PeerState.WANTED)
             session.link, session.state, session.wait = link, PeerState.LINKED, None
             self._timer.arm()
         else:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
-        self.offers.link_up(session)
         self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
             with guarded(part):
                 part.link_up(session)
-        for waiting in self._reaching.pop(session.peer, ()):
-            if not waiting.done():
-                waiting.set_result(None)
 
     def _begin(self, link: PeerLink) -> PeerSession:
         peer = next(self._numbers)
@@ -138,11 +117,7 @@ class PeerSessions:
                 return session
         for session in waiting:
             if session.link.identity.is_same_module(link.identity, secured=self._gate.on):
-                unsure = session.state is PeerState.PARKED
                 self._end(session)
-                if unsure:
-                    # Two modules may have one name by mistake: this one is dialled, and shown again if it answers.
-                    self.on_want(session.link.guid)
         return None
 
     def link_down(self, link: PeerLink) -> None:
@@ -152,72 +127,20 @@ class PeerSessions:
             return
         self._receiver.link_down(link)
         session.away_since = asyncio.get_running_loop().time()
-        session.state = PeerState.PARKED if link.parked else PeerState.SILENT
+        session.state = PeerState.SILENT
         for part in self._parts:
             with guarded(part):
                 part.link_down(session)
         session.handlers.clear()
-        if link.parked:
-            self.offers.parked(session)
-            if link.held:
-                self.want(session)
-        elif link.silent:
+        if link.silent:
             session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
         else:
             self._grace_over(session)
 
-    # --- parked peers ----------------------------------------------------------------------------------------------
-
-    def want(self, session: PeerSession) -> None:
-        """Have a parked peer linked again; if that fails for ``mesh.limits.WANT_GRACE``, it counts as away."""
-        if session.state is PeerState.PARKED:
-            session.state = PeerState.WANTED
-            session.away_since, session.wait = asyncio.get_running_loop().time(), mesh_limits.WANT_GRACE
-            self._timer.arm()
-            self.on_want(session.link.guid)
-
-    async def reach(self, session: PeerSession) -> None:
-        """Wait until a reachable peer is linked; at most ``mesh.limits.WANT_GRACE``.
-
-        Raises:
-            UnreachableError: The peer was parked, and could not be linked.
-        """
-        if session.linked:
-            return
-        self.want(session)
-        if session.state is PeerState.WANTED:
-            waiting: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            self._reaching.setdefault(session.peer, set()).add(waiting)
-            try:
-                await waiting
-                return
-            finally:
-                self._reaching.get(session.peer, set()).discard(waiting)
-        raise self._unreachable(session)
-
-    def _unreachable(self, session: PeerSession) -> UnreachableError:
-        return UnreachableError("agent", session.link.name, "it has no link; `rmpa peer list` says why")
-
-    def lost(self, identity: Identity) -> None:
-        """The membership has lost this run of a peer; a parked one is over, one with a link ends by the link."""
-        session = next((one for one in self if one.link.identity.is_same_run(identity)), None)
-        if session is not None and session.state in (PeerState.PARKED, PeerState.WANTED):
-            session.away_since = asyncio.get_running_loop().time()
-            self._grace_over(session)
-
-    def leave(self) -> None:
-        """This agent leaves its place in the network: parked peers are over."""
-        for session in self:
-            if session.state in (PeerState.PARKED, PeerState.WANTED):
-                self.lost(session.link.identity)
-
     def _grace_over(self, session: PeerSession) -> None:
         """Asks the parts what they keep for a peer that is not back; ends the session if they keep nothing."""
         session.state, session.wait = PeerState.AWAY, 0.0
-        for waiting in self._reaching.pop(session.peer, ()):
-            if not waiting.done():
-                waiting.set_exception(self._unreachable(session))
         waits = False
         for part in self._parts:
             with guarded(part):
@@ -247,7 +170,7 @@ class PeerSessions:
         for session in self:
             due = session.due
             if due is not None and due <= now:
-                if session.state in (PeerState.SILENT, PeerState.WANTED):
+                if session.state is PeerState.SILENT:
                     self._grace_over(session)
                 else:
                     self._outlasted(session, now)
@@ -258,11 +181,7 @@ class PeerSessions:
         """Ends a session for good: the rest of the peer is removed from the local graph."""
         session.wait = None
         self._timer.arm()
-        for waiting in self._reaching.pop(session.peer, ()):
-            if not waiting.done():
-                waiting.set_exception(self._unreachable(session))
         self._by_number.pop(session.peer, None)
-        self.offers.gone(session)
         if self._by_link.pop(session.link, None) is not None:
             self._receiver.link_down(session.link)
             for part in self._parts:
@@ -279,7 +198,6 @@ class PeerSessions:
     async def close(self) -> None:
         """End every session, and wait until all proxies are closed."""
         self._timer.close()
-        self.offers.close()
         for session in self:
             self._end(session)
         if self._closing:
@@ -305,21 +223,13 @@ class PeerSessions:
         """Whether anything of this module needs to know within a second that a peer is gone."""
         return bool(session.handlers) or any(part.depends(session) for part in self._parts)
 
-    def _may_park(self, session: PeerSession) -> bool:
-        """Whether this module would do without the link to a peer that nothing needs now."""
-        if not self.may_park(session.link) or not self.offers.is_known(session):
-            return False
-        return not any(part.holds(session) for part in self._parts)
-
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
         now = asyncio.get_running_loop().time()
-        self.offers.settled(lambda session: self.may_park(session.link))
         for session in self.linked():
             yield_to_data()
             if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
-                needed = self._depends(session)
-                session.link.need(needed=needed, parks=not needed and self._may_park(session))
+                session.link.need(needed=self._depends(session))
         for session in self:
             yield_to_data()
             session.proxies.reconcile()

@@ -234,11 +234,6 @@ class Exports:
         """Whether a peer has not received all changes yet, so that ``advertise`` has something to send."""
         return self._catalogue.pending
 
-    @property
-    def changes(self) -> int:
-        """Counts the changes of what is offered to any peer."""
-        return self._catalogue.changes
-
     def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, limit_settings: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
@@ -249,7 +244,6 @@ class Exports:
         self._policy, self._contracts, self._names, self._limit_settings = policy, contracts, names, limit_settings
         self._rules += 1
         self._catalogue.limit = limit_settings.topics
-        self._catalogue.changes += 1
         for known in self._catalogue.peers():
             before, known.judged = known.judged, self._is_judged(known.name)
             if before or known.judged:

@@ -112,9 +112,9 @@ class ImportRoutes:
             return self.close(peer, source, entry)
         return []
 
-    def suspend(self, entry: RemoteTopic, problem: str) -> None:
-        """Suspends the route of an entry that outlives its peer's link; ``problem`` says why, for users."""
-        entry.problem = problem
+    def suspend(self, entry: RemoteTopic) -> None:
+        """Suspends the route of an entry that outlives its peer's link."""
+        entry.problem = "its peer is away"
         if entry.state is RouteState.LINGERING:
             entry.enter(RouteState.IDLE)
         elif entry.state in {RouteState.OPEN, RouteState.OPENING}:

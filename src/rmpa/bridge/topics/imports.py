@@ -236,14 +236,13 @@ class Imports:
         self._routes.link_up(peer)
         return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
 
-    def link_away(self, peer: int, *, briefly: bool = False, parked: bool = False) -> tuple[list[Action], bool]:
+    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
         """Suspends the routes of a peer that may come back; sources that do not outlive the link are dropped.
 
         Args:
             peer: The peer's number.
             briefly: Drop nothing yet: the link fell silent, and most silent peers are back soon. The method is
                 called again without it if the peer is not.
-            parked: The peer is there, and is linked again when something needs it.
 
         Returns:
             The actions, and whether a source waits for the peer; if none does, call ``link_down`` next.
@@ -264,7 +263,7 @@ class Imports:
                 actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
             entry.route = 0
             if keep:
-                self._routes.suspend(entry, "" if parked else "its peer is away")
+                self._routes.suspend(entry)
             else:
                 actions += self._drop(peer, source, entry)
         return actions, bool(known.entries)

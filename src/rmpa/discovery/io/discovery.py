@@ -1,4 +1,4 @@
-"""Runs the membership protocol and the failure detector: UDP sockets, timer, interfaces and seeds."""
+"""Runs the membership protocol: UDP sockets, timer, interfaces and seeds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import random
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon
@@ -22,11 +21,9 @@ from rmpa.discovery.io.interfaces import (
     list_interfaces,
     unknown_names,
 )
-from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
+from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
-from rmpa.discovery.member_watch import MemberWatch
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.swim.failure_detector import FailureDetector
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 from rmpa.runtime.system_clock import SystemClock
@@ -44,7 +41,6 @@ if TYPE_CHECKING:
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.events import Event, Output, PeerView
     from rmpa.discovery.strangers import Stranger
-    from rmpa.discovery.swim.events import DetectorView, MemberView, SendSwim, SwimEvent
     from rmpa.trust.packets import PacketTrust
 
 _log = logging.getLogger(__name__)
@@ -61,7 +57,6 @@ class Discovery:
         settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
         udp_socket: Bound to the mesh's port, non-blocking; lent, not closed here.
         on_event: Called in the loop with each event of the membership protocol, in order.
-        on_member: Called in the loop with each event of the failure detector, in order.
         on_interfaces: Called in the loop with all interfaces, used or not, after a change. Returns whether the
             identity still fits them; if not, ``close`` is about to be called, and nothing more is announced.
         clock: The source of monotonic seconds.
@@ -77,7 +72,6 @@ class Discovery:
         udp_socket: socket.socket,
         *,
         on_event: Callable[[Event], None],
-        on_member: Callable[[SwimEvent], None] = lambda _: None,
         on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
         clock: Clock | None = None,
         look: Callable[[], tuple[Interface, ...]] = list_interfaces,
@@ -93,16 +87,12 @@ class Discovery:
         self._on_event = on_event
         self._on_interfaces = on_interfaces
         self._clock: Clock = clock if clock is not None else SystemClock()
-        self._on_member = on_member
-        self._detector = FailureDetector(identity, rng=random.random, counters=self.counters)
         self._membership = MembershipProtocol(
             identity,
             rng=random.random,
             multicast=settings.multicast.enabled,
             counters=self.counters,
-            vouches=self._detector.vouches,
         )
-        self._watch = MemberWatch(self._detector, self._membership)
         self._filter = PacketFilter(
             settings.domain, self.counters, is_verified=self._membership.is_verified, trust=trust
         )
@@ -115,7 +105,7 @@ class Discovery:
         self._receivers: list[socket.socket] = []
         self._joined: sockets.GroupMembership | None = None
         self._warned: set[str] = set()
-        self._timer = MachineTimer(self._next_timer, self._timer_due, now=self._clock.now)
+        self._timer = MachineTimer(self._membership.next_timer, self._timer_due, now=self._clock.now)
         self._started = False
         self._flushing = False
 
@@ -145,7 +135,6 @@ class Discovery:
         self._watcher.close()
         await self._seeds.close()
         self._timer.close()
-        self._detector.leave()
         self._membership.goodbye(self._clock.now())
         self._flush()
         loop = asyncio.get_running_loop()
@@ -158,54 +147,21 @@ class Discovery:
 
     # --- links ------------------------------------------------------------------------------------------------
 
-    def link_up(self, identity: Identity, endpoint: Address | None = None, *, answers_probes: bool = False) -> None:
+    def link_up(self, identity: Identity, endpoint: Address | None = None) -> None:
         """A link to this peer is up; for as long as it is, the peer is a member.
 
         Args:
             identity: As the link's handshake said.
             endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
                 (not the port of a connection that it dialled).
-            answers_probes: Whether its handshake says that it has a failure detector.
         """
-        now = self._clock.now()
-        self._membership.link_up(identity, now, endpoint)
-        self._watch.link_up(identity, now, answers_probes=answers_probes)
+        self._membership.link_up(identity, self._clock.now(), endpoint)
         self._flush()
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._watch.link_down(guid, instance)
         self._membership.link_down(guid, self._clock.now(), instance)
         self._flush()
-
-    def set_demand(self, *, on: bool) -> None:
-        """Take in whether this agent links on demand (``mesh.mode``).
-
-        Beacons then become rarer as the mesh grows, and the failure detector probes the members.
-        """
-        now = self._clock.now()
-        self._membership.set_demand(now, on=on)
-        self._detector.set_active(now, active=on)
-        self._flush()
-
-    def set_version(self, version: int) -> None:
-        """Spread the version of what this agent offers; 32 bits, only ever higher."""
-        self._detector.set_version(version, self._clock.now())
-        self._flush()
-
-    def learn_version(self, guid: Guid, instance: bytes, version: int) -> None:
-        """Take in the version of what a peer offers, from its link or its beacon."""
-        self._detector.learn_version(guid, instance, version, self._clock.now())
-        self._flush()
-
-    def member(self, guid: Guid, instance: bytes) -> MemberView | None:
-        """What the failure detector knows of a run; ``None`` if it does not watch it."""
-        return self._detector.member(guid, instance)
-
-    @property
-    def detector(self) -> DetectorView:
-        """The state of the failure detector."""
-        return self._detector.view()
 
     def peers(self) -> tuple[PeerView, ...]:
         """All known peers, in GUID order."""
@@ -272,10 +228,8 @@ class Discovery:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, packet)
                 if isinstance(packet, Beacon):
                     self._membership.receive(packet, source, now, multicast=multicast)
-                elif isinstance(packet, Recognised):
-                    self._membership.recognise(packet.beacon, source, packet.key)
                 else:
-                    self._detector.receive(packet, source, now)
+                    self._membership.recognise(packet.beacon, source, packet.key)
             elif self._filter.overrun:
                 return
 
@@ -353,21 +307,14 @@ class Discovery:
         self._flushing = True
         try:
             while True:
-                beacons, packets = self._membership.outputs(), self._detector.outputs()
-                self._send(beacons)
-                self._send_packets(packets)
-                if beacons or packets:
+                if beacons := self._membership.outputs():
+                    self._send(beacons)
                     continue
-                found = self._watch.events(self._clock.now())
-                for one in found:
-                    yield_to_data()
-                    self._on_member(one)
                 events = self._membership.events()
                 for event in events:
                     yield_to_data()
-                    self._watch.membership_changed(event, self._clock.now())
                     self._deliver(event)
-                if not (found or events):
+                if not events:
                     break
         finally:
             self._flushing = False
@@ -384,16 +331,6 @@ class Discovery:
                 _log.debug("> %s:%d: %s", *output.address, output.beacon)
                 self._sender.unicast(self._packet(output.beacon, output.key), output.address)
 
-    def _send_packets(self, outputs: list[SendSwim]) -> None:
-        trust = self._trust
-        for output in outputs:
-            yield_to_data()
-            data = output.packet.serialize()
-            if trust is not None:
-                data = trust.signer.sign(data, KeyPurpose.SWIM, self._clock.now(), trust.wall())
-            _log.debug("> %s:%d: %s", *output.address, output.packet)
-            self._sender.unicast(data, output.address, count="swim.out")
-
     def _packet(self, beacon: Beacon, key: int = 0) -> bytes:
         """The bytes of a beacon, signed in a secured mesh; ``key`` as for ``SendUnicast``."""
         trust = self._trust
@@ -408,10 +345,6 @@ class Discovery:
             self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", host, str(event))
         self._on_event(event)
 
-    def _next_timer(self) -> float | None:
-        return earliest(self._membership.next_timer(), self._detector.next_timer())
-
     def _timer_due(self, now: float) -> None:
         self._membership.handle_timer(now)
-        self._detector.handle_timer(now)
         self._flush()

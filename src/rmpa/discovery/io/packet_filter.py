@@ -14,7 +14,6 @@ from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 from rmpa.discovery.strangers import Strangers
-from rmpa.discovery.swim.packets import SwimPacket, is_swim
 from rmpa.trust.keyring import KeyPurpose
 from rmpa.trust.packets import Verdict
 from rmpa.trust.reasons import TrustReason, not_of_this_mesh
@@ -57,11 +56,9 @@ class PacketFilter:
     Args:
         domain: This agent's domain id.
         counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
-            ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``; ``swim.in``,
-            ``swim.unlinked_limited``, ``swim.limited`` and ``swim.malformed`` of packets of the failure detector,
-            which have limits of their own.
+            ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
         is_verified: Whether a run of a peer has or had a link: beacons of such peers, and echoes of this agent's
-            own, are not limited in rate; packets of the failure detector are limited over all agents.
+            own, are not limited in rate.
         trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
             ``beacon.forged`` and so on count the others.
     """
@@ -78,8 +75,7 @@ class PacketFilter:
         self._domain = domain
         self._counters = counters
         self._is_verified = is_verified
-        self._unlinked: dict[tuple[int, bool], TokenBucket] = {}
-        self._swim = TokenBucket(limits.SWIM_PER_SECOND, limits.SWIM_BURST)
+        self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
         self.strangers = Strangers()
         """The modules whose beacons are refused, for the user."""
@@ -91,7 +87,7 @@ class PacketFilter:
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
-    ) -> Beacon | SwimPacket | Recognised | None:
+    ) -> Beacon | Recognised | None:
         """What a packet contains; ``None`` if it is dropped, which is counted and, where it helps, logged.
 
         Other domains have other ports, so their multicasts are ignored silently. A unicast of another domain is
@@ -119,17 +115,14 @@ class PacketFilter:
             return None
         return self._read(data, host, now, multicast=multicast, interface=interface)
 
-    def _read(
-        self, data: bytes, host: str, now: float, *, multicast: bool, interface: int
-    ) -> Beacon | SwimPacket | None:
+    def _read(self, data: bytes, host: str, now: float, *, multicast: bool, interface: int) -> Beacon | None:
         """Parse a packet within the limits of its sender."""
-        swim = is_swim(data)
-        name = "swim" if swim else "beacon"
         try:
             verified = self._is_verified(*sender_of(data, self._domain))
-            if not self._within_limits(interface, now, swim=swim, verified=verified):
+            if not verified and not self._unlinked_limit(interface).take(now):
+                self._counters.add("beacon.unlinked_limited")
                 return None
-            packet = SwimPacket.parse(data, self._domain) if swim else Beacon.parse(data, self._domain)
+            packet = Beacon.parse(data, self._domain)
         except BeaconOtherDomain as error:
             if multicast:
                 self._counters.add("beacon.other_domain")
@@ -139,9 +132,9 @@ class PacketFilter:
         except BeaconOtherVersion as error:
             self._refusals.refuse(now, "beacon.version", host, f"the peer at {host} {error}")
         except RemoteProtocolError as error:
-            self._refusals.refuse(now, f"{name}.malformed", host, f"from {host}: {error}; is another program there?")
+            self._refusals.refuse(now, "beacon.malformed", host, f"from {host}: {error}; is another program there?")
         else:
-            self._counters.add(f"{name}.in")
+            self._counters.add("beacon.in")
             return packet
         return None
 
@@ -164,17 +157,15 @@ class PacketFilter:
         if len(data) > limits.BEACON_MAX_BYTES:
             self._counters.add("beacon.malformed")
             return None
-        swim = is_swim(data)
-        purpose = KeyPurpose.SWIM if swim else KeyPurpose.BEACON
-        found = trust.verifier.verify(data, purpose, RUN_AT, now, trust.wall())
+        found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
         if found.verdict is Verdict.OLD_KEY:
-            self._counters.add("swim.old_key" if swim else "beacon.old_key")
-            return None if swim else found
+            self._counters.add("beacon.old_key")
+            return found
         if found.verdict is Verdict.ACCEPTED:
             return found
         self.overrun = not self._unproved.take(now)
         problem = _problem(found)
-        beacon = self._stranger(data, now) if problem and not swim else None
+        beacon = self._stranger(data, now) if problem else None
         if beacon is not None and self.strangers.hear(beacon, problem, now):
             identity = beacon.identity
             at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
@@ -198,25 +189,14 @@ class PacketFilter:
             self._counters.add("beacon.malformed")
             return None
 
-    def _within_limits(self, interface: int, now: float, *, swim: bool, verified: bool) -> bool:
-        """Whether one more packet may be read; one that may not is counted."""
-        if not verified and not self._unlinked_limit(interface, swim=swim).take(now):
-            self._counters.add("swim.unlinked_limited" if swim else "beacon.unlinked_limited")
-            return False
-        if swim and not self._swim.take(now):
-            self._counters.add("swim.limited")
-            return False
-        return True
-
-    def _unlinked_limit(self, interface: int, *, swim: bool) -> TokenBucket:
+    def _unlinked_limit(self, interface: int) -> TokenBucket:
         """The limit of packets of unlinked peers on this interface."""
-        bucket = self._unlinked.get((interface, swim))
+        bucket = self._unlinked.get(interface)
         if bucket is None:
             if len(self._unlinked) >= _INTERFACES:
                 self._unlinked.clear()  # interfaces of containers come and go, each with a new index
-            rate = limits.SWIM_UNLINKED_PER_SECOND if swim else limits.BEACONS_UNLINKED_PER_SECOND
-            burst = limits.SWIM_UNLINKED_BURST if swim else limits.BEACONS_UNLINKED_BURST
-            bucket = self._unlinked[interface, swim] = TokenBucket(rate, burst)
+            rate, burst = limits.BEACONS_UNLINKED_PER_SECOND, limits.BEACONS_UNLINKED_BURST
+            bucket = self._unlinked[interface] = TokenBucket(rate, burst)
         return bucket
 
     def _is_flood(self, host: str, now: float) -> bool:

@@ -21,8 +21,6 @@ from rmpa.mesh.connection_events import (
     HandshakeDone,
     HelloReceived,
     MarkReceived,
-    Parted,
-    PartingEnded,
     PongReceived,
     Refused,
 )
@@ -96,10 +94,6 @@ class ConnectionOwner(Protocol):
         """The connection is up and its timer fired, about once in a keepalive interval."""
         ...
 
-    def connection_parted(self, connection: Connection) -> None:
-        """Both sides agreed to end the connection for now; ``connection_closing`` follows."""
-        ...
-
     def connection_closing(self, connection: Connection, reason: str) -> None:
         """The connection sends no more data; ``connection_ended`` follows. May be called more than once."""
         ...
@@ -158,8 +152,6 @@ class Connection:
         """Whether the remote side broke the protocol."""
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
-        self.held: list[bytes] = []
-        """Payloads of control frames that were not sent, because this side has agreed to park the link."""
         self._owner = owner
         self._clock = clock
         self._loop = asyncio.get_running_loop()
@@ -271,23 +263,15 @@ class Connection:
         """
         if self._machine.state is not ConnectionState.UP:
             return
-        if self._machine.holding:
-            self.held.append(payload)
-            return
         self.stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
 
-    def need(self, *, needed: bool, parks: bool = False) -> None:
+    def need(self, *, needed: bool) -> None:
         """Say whether something depends on this connection; see ``ConnectionProtocol.need``."""
-        self._machine.need(self._clock.now(), needed=needed, parks=parks)
+        self._machine.need(self._clock.now(), needed=needed)
         if self._machine.has_output:
             self._send_output()
             self._timer.arm()
-
-    @property
-    def holding(self) -> bool:
-        """Whether this side has agreed to part, so that control frames are held back; see ``ConnectionProtocol``."""
-        return self._machine.holding
 
     @property
     def rests(self) -> bool:
@@ -298,11 +282,6 @@ class Connection:
     def remote_lease(self) -> float:
         """Seconds after which the silence of the remote side ends the connection."""
         return self._machine.remote_lease
-
-    @property
-    def remote_parks(self) -> bool:
-        """Whether the remote side would end the link for now, because nothing there needs it."""
-        return self._machine.remote_parks
 
     @property
     def quiet_after(self) -> float:
@@ -382,10 +361,6 @@ class Connection:
             self._owner.connection_opened(self)
         elif isinstance(event, Refused):
             self._owner.connection_refused(self, event.refuse, by_us=event.by_us)
-        elif isinstance(event, Parted):
-            self._owner.connection_parted(self)
-        elif isinstance(event, PartingEnded):
-            self._send_held()
         elif isinstance(event, ConnectionClosed):
             self._finish(event.reason)
 
@@ -394,12 +369,6 @@ class Connection:
             self._owner.connection_lane(self)
         else:
             self._on_mark(event.kind, event.route, event.sequence)
-
-    def _send_held(self) -> None:
-        self._send_output()
-        held, self.held = self.held, []
-        for payload in held:
-            self.send_control(payload)
 
     def _ponged(self, event: PongReceived) -> None:
         if (answer := self._pings.get(event.stamp)) is not None and not answer.done():

@@ -73,8 +73,6 @@ class PeerLink:
         """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.crashed = False
         """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
-        self.parked = False
-        """Once the link is down: whether both sides ended it for now; it is made again when something needs it."""
         self.mark: Final = connection.send_mark
         """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
         self.touched_at = clock.now()
@@ -176,22 +174,13 @@ class PeerLink:
         """Seconds of silence after which the link counts as lost."""
         return self.connection.remote_lease
 
-    @property
-    def held(self) -> list[bytes]:
-        """Once the link is parked: the payloads of control frames that were not sent, oldest first."""
-        return self.connection.held
-
-    def need(self, *, needed: bool, parks: bool = False) -> None:
+    def need(self, *, needed: bool) -> None:
         """Say whether something of this module depends on the link; it rests when neither side needs it.
 
         A control frame in either direction makes the link needed; only its user can say that it is not.
-
-        Args:
-            needed: Whether something depends on it.
-            parks: Whether this module would also do without the link for now (``mesh.parting``).
         """
         self._needed = needed
-        self.connection.need(needed=needed, parks=parks)
+        self.connection.need(needed=needed)
         if self.bulk_connection is not None:
             self.bulk_connection.need(needed=needed)
 

@@ -14,7 +14,7 @@ from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
-from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.mesh.handshake import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.bulk_lanes import BulkLanes
 from rmpa.mesh.io.connection import Connection
 from rmpa.mesh.io.dialler import Dialler
@@ -203,15 +203,9 @@ class Mesh:
         self._peering.peer_gone(guid, self._clock.now())
         self._act()
 
-    def want(self, guid: Guid) -> None:
-        """Link with a parked peer again at once, because something needs it."""
-        self._peering.want(guid, self._clock.now())
-        self._act()
-
-    def unpark(self, spread: float) -> None:
-        """Link with all parked peers again, within some ``spread`` seconds."""
-        self._peering.unpark(self._clock.now(), spread)
-        self._act()
+    def notes(self) -> tuple[str, ...]:
+        """Problems of this module in the mesh, as texts for the user."""
+        return (FULL.text,) if self._peering.left_out else ()
 
     def count_peers(self, peers: int) -> None:
         """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
@@ -329,12 +323,6 @@ class Mesh:
         if connection.lane == Lane.BULK:
             bound_queue(connection.sock)
 
-    def connection_parted(self, connection: Connection) -> None:
-        """Both sides ended a connection for now; it is not waited for its socket, since nothing more comes."""
-        if (link := self._used(connection)) is not None:
-            self._peering.link_down(link.id, LinkDownCause.PARKED.value, self._clock.now(), parked=True)
-            self._act()
-
     def connection_closing(self, connection: Connection, reason: str) -> None:
         """A connection sends no more data; that of the express lane ends its link."""
         if (link := self._links.get(connection.id)) is not None:
@@ -412,13 +400,9 @@ class Mesh:
                 _log.info("= %s: link down: %s", output.identity, output.reason)
                 replaced = output.cause is LinkDownCause.REPLACED
                 down = self._links.get(output.link_id, ended)
-                # The next link of a peer that parted may be there before the bye of this one.
-                parted = replaced and down is not None and down.connection.holding
-                parked = parted or output.cause is LinkDownCause.PARKED
-                self.counters.add("link.parked" if parked else "link.replaced" if replaced else "link.down")
+                self.counters.add("link.replaced" if replaced else "link.down")
                 if down is not None:
-                    down.parked = parked
-                    down.silent = down.silent or replaced or parked
+                    down.silent = down.silent or replaced
                     # The link of a peer that restarted within its lease: its agent died, the host is there.
                     down.crashed = down.crashed or replaced or output.cause is LinkDownCause.RESTARTED
                     down.use(None)

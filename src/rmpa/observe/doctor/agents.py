@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _PERMISSION: Final = "permission."
 """The counters of what ``[[permission]]`` refused begin so."""
 _WITHOUT_LINK: Final = {
-    "parked": "nothing needs its link, which is made again on demand; probes watch it",
     "relayed": "another peer passes on its topics",
 }
 """States in which a peer has no link, and needs none."""

@@ -110,7 +110,7 @@ def judge_rules(rules: FirewallRules, ports: str) -> Check:
         remedy = f"take it out, or let {ports} in before it"
         return Check("firewall", FAIL, f"drops what agents send: {rules.drops[0]}", remedy, where=rules.source)
     if rules.drops_udp:
-        text = f"drops all UDP, also beacons and probes of agents: {rules.drops_udp[0]}"
+        text = f"drops all UDP, also beacons of agents: {rules.drops_udp[0]}"
         return Check("firewall", FAIL, text, f"take it out, or let {ports} in before it", where=rules.source)
     if rules.closed and not rules.accepts:
         text = f"{', '.join(rules.closed)} drops what no rule lets in, and no rule names our ports"

@@ -100,7 +100,6 @@ class ControlOperations:
         count = args.get("count", 1)
         if not isinstance(count, int) or not 1 <= count <= limits.CONTROL_PINGS_MAX:
             raise ConfigError("count", f"{count!r} is not between 1 and {limits.CONTROL_PINGS_MAX}")
-        await self._bridge.sessions.reach(session)
         link = session.link
         link.touch()
         times = [await link.ping() for _ in range(count)]
@@ -145,11 +144,7 @@ class ControlOperations:
         if peer is None and what == node_requests.INFO:
             return await self._nodes.info(args)
         if peer is None:
-            sessions = list(self._bridge.sessions.reachable())
-            few = sum(not session.linked for session in sessions) <= limits.PARKED_ASKED_MAX
-            return await asyncio.gather(
-                *(self._nodes_of(one) if one.linked or few else _proxies_of(one) for one in sessions)
-            )
+            return await asyncio.gather(*map(self._nodes_of, self._bridge.sessions.linked()))
         session = self._session(peer)
         if what == node_requests.LIST:
             return [await self._nodes_of(session)]
@@ -178,14 +173,14 @@ class ControlOperations:
         return self._snapshots.contract(topic, type_name)
 
     def _session(self, name: object) -> PeerSession:
-        """The linked or parked peer of a name or GUID.
+        """The linked peer of a name or GUID.
 
         Raises:
             PeerRefused: Several peers have that name.
             UnreachableError: No such peer has it.
         """
         peer = str(name)
-        sessions = list(self._bridge.sessions.reachable())
+        sessions = list(self._bridge.sessions.linked())
         fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
         if len(fitting) == 1:
             return fitting[0]
@@ -194,13 +189,6 @@ class ControlOperations:
         similar = did_you_mean(peer, [session.link.name for session in sessions])
         remedy = "`rmpa peer list` shows who is there, and why one is not linked"
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
-
-
-async def _proxies_of(session: PeerSession) -> PeerNodes:
-    """The nodes of a parked peer as far as this module has proxies of them; the peer is not asked."""
-    nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
-    problem = "parked: only nodes with topics or services that cross; `rmpa node list --peer` asks it"
-    return PeerNodes(peer=session.link.name, nodes=nodes, problem=problem)
 
 
 def _topics(args: Args) -> frozenset[str] | None:

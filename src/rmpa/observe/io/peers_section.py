@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from rmpa.bridge.session.peer_session import PeerState
 from rmpa.observe.io.direct_section import direct_counts
-from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo, ProbesInfo
+from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo
 from rmpa.observe.shared_address import mark_shared_addresses
-from rmpa.observe.snapshot import DetectorInfo
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.reasons import not_of_this_mesh
@@ -26,11 +24,9 @@ if TYPE_CHECKING:
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
     from rmpa.discovery.strangers import Stranger
-    from rmpa.discovery.swim.events import DetectorView, MemberView
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.mode import MeshMode
     from rmpa.mesh.peering_events import PeerStatus
     from rmpa.runtime.stream import Stream
 
@@ -44,7 +40,6 @@ class EndpointView(Protocol):
     identity: Identity
     mesh: Mesh
     discovery: Discovery
-    mode: MeshMode
 
 
 class PeersSection:
@@ -65,20 +60,18 @@ class PeersSection:
     def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name, and behind them the modules that are not of this mesh."""
         now = self._clock.now()
-        links = {session.link.guid: session for session in self._bridge.sessions.reachable()}
+        links = {session.link.guid: session for session in self._bridge.sessions.linked()}
         yield_to_data()  # a millisecond each with a full roster
         roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
         statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
-        detecting = endpoint.discovery.detector.active
         infos = []
         for guid in {*roster, *statuses, *links}:
             yield_to_data()
             session = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), session, now)
             if session is not None:
-                if session.linked:
-                    info = msgspec.structs.replace(info, link=self._link(session.link, now))
+                info = msgspec.structs.replace(info, link=self._link(session.link, now))
                 theirs = len(self._bridge.topics.imports.offered_by(session.peer))
                 ours = self._bridge.topics.exports.topics_for(session.peer)
                 yield_to_data()
@@ -93,9 +86,6 @@ class PeersSection:
                     direct_in=to_it,
                     direct_out=from_it,
                 )
-            probed = endpoint.discovery.member(guid, bytes.fromhex(info.instance)) if detecting else None
-            if probed is not None:
-                info = msgspec.structs.replace(info, probes=_probes(probed, now))
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
         infos = [info for info in infos if info.instance not in {one.instance for one in relayed}] + relayed
@@ -143,10 +133,8 @@ class PeersSection:
         identity = (view or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
         unlinked = status.since if status is not None and status.since is not None else view.since if view else now
-        if session is not None and session.linked:
+        if session is not None:
             state, since = "linked", session.link.since or now
-        elif session is not None:
-            state, since = "parked" if session.state is PeerState.PARKED else "linking", session.away_since
         elif status is not None and status.foreign is not None:
             state, since = FOREIGN, unlinked
         elif view is not None and not view.present:
@@ -213,29 +201,6 @@ def _stranger(one: Stranger, now: float) -> PeerInfo:
         found_ago=now - one.since,
         beacon_ago=now - one.heard,
         last_error=one.problem,
-    )
-
-
-def _probes(member: MemberView, now: float) -> ProbesInfo:
-    return ProbesInfo(
-        state=member.state.name.lower(),
-        heard_ago=now - member.heard if member.heard is not None else None,
-        rtt=member.rtt,
-        refuted=member.incarnation,
-        version=member.version or None,  # versions begin with 1
-    )
-
-
-def detector_info(view: DetectorView) -> DetectorInfo | None:
-    """The failure detector, while it probes."""
-    if not view.active:
-        return None
-    return DetectorInfo(
-        members=view.members,
-        suspects=view.suspects,
-        health=view.health,
-        refuted=view.incarnation,
-        news=view.news,
     )
 
 

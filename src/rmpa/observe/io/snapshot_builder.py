@@ -14,7 +14,7 @@ import psutil
 import rmpa
 from rmpa.observe import limits
 from rmpa.observe.io.direct_section import DirectSection
-from rmpa.observe.io.peers_section import PeersSection, detector_info, own_bounds
+from rmpa.observe.io.peers_section import PeersSection, own_bounds
 from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.peer_agent import PeerAgent
@@ -175,7 +175,8 @@ class SnapshotBuilder:
             yield from (endpoint.mesh.counters, endpoint.discovery.counters)
 
     def _notes(self, endpoint: EndpointView | None) -> tuple[str, ...]:
-        notes = [*(endpoint.discovery.notes() if endpoint is not None else ()), *self._sources.core.notes()]
+        notes = [] if endpoint is None else [*endpoint.discovery.notes(), *endpoint.mesh.notes()]
+        notes += self._sources.core.notes()
         if DESCRIPTORS.problem:
             notes.append(DESCRIPTORS.problem)
         notes += self._sources.notes()
@@ -202,7 +203,6 @@ class SnapshotBuilder:
             rss=self._memory(),
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
-            links=str(endpoint.mode) if endpoint is not None else "",
             config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
             realtime=self._sources.realtime,
             files=_files(),
@@ -210,7 +210,6 @@ class SnapshotBuilder:
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
             proxy_listening=bridge.proxy_nodes.listening,
             core_memory=core.restored(),
-            detector=detector_info(endpoint.discovery.detector) if endpoint is not None else None,
         )
 
     def _cpu_share(self) -> float | None:

@@ -222,7 +222,7 @@ class TopicsSection:
 
     def _outbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo | None, list[str]]]:
         """Each source of this module with its mismatches, and then with its route to each peer that wants it."""
-        names = {session.peer: session.link.name for session in self._bridge.sessions.reachable()}
+        names = {session.peer: session.link.name for session in self._bridge.sessions.linked()}
         for source, local in yielding_to_data(list(self._bridge.topics.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue

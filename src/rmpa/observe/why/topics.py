@@ -48,7 +48,7 @@ _FLOWING: Final = frozenset({"open", "lingering"})
 def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
     """The peer with a name or GUID; of several peers of one name, a linked one."""
     fitting = _fitting(snapshot.peers, name)
-    return min(fitting, key=lambda p: (p.state != "linked", p.state != "parked"), default=None)
+    return min(fitting, key=lambda p: p.state != "linked", default=None)
 
 
 def _fitting(peers: Iterable[PeerInfo], name: str) -> list[PeerInfo]:
@@ -84,9 +84,6 @@ def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     if peer.conflicts:  # two peers of one name, say: both are linked
         found = _conflict(peer, WARN)
-    if peer.state == "parked":
-        text = f"parked for {peer.since_ago:.0f} s: nothing needed the link; it is made on demand, in a round trip"
-        return (found, Check("link", OK, text))
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
     return (found, _linked(peer))

@@ -64,12 +64,10 @@ LOG_LINES: Final = 500
 LOG_CHARACTERS: Final = 1024
 """Characters of one line of the log; the rest is cut."""
 SILENT_AFTER: Final = 1.0
-"""Time without a word on a link after which its module is shown as silent. Keepalives come more often."""
-SILENT_AFTER_REST: Final = 8.0
-"""The same for a link at rest, whose keepalives come every 5 s."""
+"""Time without a word on a link after which its module is shown as silent. Keepalives come more often. For a
+link at rest it is half of its lease."""
 AWAY_AFTER: Final = 7.0
-"""Time without a beacon, or a packet of the failure detector, after which a module without a link is shown as away.
-Heartbeats come every 5 s; in a large mesh they are rarer, and probes come."""
+"""Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
 AGENT_SETTLES: Final = 10.0
 """Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""

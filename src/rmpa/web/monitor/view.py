@@ -26,23 +26,22 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
     from rmpa.web.monitor.resources import ResourceFacts
 
-_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed", "parked": "parked"}
+_STATES = {"refused": "refused", "conflict": "refused", "relayed": "relayed"}
 _GONE: Final = "has left the roster: no beacon and no link"
 _LOST: Final = frozenset({"linking", "refused", "away"})
 """States of a module of which nothing comes any more."""
 
 
 def module_state(peer: PeerInfo) -> str:
-    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed``, ``parked`` or ``away``."""
+    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
     if peer.state == "linked":
         if peer.link is None or peer.link.heard_ago is None:
             return "up"
-        after = limits.SILENT_AFTER_REST if peer.link.rests else limits.SILENT_AFTER
+        after = peer.link.lease / 2 if peer.link.rests else limits.SILENT_AFTER
         return "silent" if peer.link.heard_ago > after else "up"
     if peer.state in _STATES:
         return _STATES[peer.state]
-    heard = [peer.beacon_ago, peer.probes.heard_ago if peer.probes is not None else None]
-    return "linking" if any(ago is not None and ago <= limits.AWAY_AFTER for ago in heard) else "away"
+    return "linking" if peer.beacon_ago is not None and peer.beacon_ago <= limits.AWAY_AFTER else "away"
 
 
 class _ByteRates:
@@ -108,14 +107,6 @@ class _KnownTopic(NamedTuple):
 _UNKNOWN_FIGURES: _Figures = (None, None, None)
 
 
-def _first_peers(peers: tuple[PeerInfo, ...]) -> Sequence[PeerInfo]:
-    """The peers that are shown, by name: of very many, parked ones only where there is room."""
-    if len(peers) <= limits.MODULES_SHOWN:
-        return peers
-    first = sorted(peers, key=lambda peer: peer.state == "parked")[: limits.MODULES_SHOWN]
-    return sorted(first, key=lambda peer: peer.name)
-
-
 class StateBuilder:
     """Makes the state of each snapshot.
 
@@ -152,7 +143,7 @@ class StateBuilder:
             parameters: How often the parameters of this module's core have changed.
         """
         taken = snapshot.taken
-        peers = _first_peers(snapshot.peers)
+        peers = snapshot.peers[: limits.MODULES_SHOWN]
         self._bytes.keep(peer.name for peer in peers)
         self._remember(peers, taken)
         topics, flows = self._topics_and_flows(snapshot.topics)
@@ -173,7 +164,6 @@ class StateBuilder:
                 for index, alarm in enumerate(alarms)
                 if alarm.get("module") not in lost
             },
-            "parked": sum(peer.state == "parked" for peer in snapshot.peers),
             "parameters": parameters,
             "notes": [
                 *snapshot.notes[:100],
@@ -248,7 +238,7 @@ class StateBuilder:
 
     def _remember(self, peers: Sequence[PeerInfo], taken: float) -> None:
         """Keep modules that have left the roster for a while, as many as can be shown."""
-        self._seen |= {peer.name: taken for peer in peers if peer.state != "parked"}
+        self._seen |= {peer.name: taken for peer in peers}
         known = sorted(self._seen, key=self._seen.__getitem__, reverse=True)[: limits.MODULES_SHOWN]
         self._seen = {name: self._seen[name] for name in known if taken - self._seen[name] <= limits.FORGET_AFTER}
 

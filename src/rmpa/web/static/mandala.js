@@ -94,7 +94,7 @@ const Wire = memo(({ name, module, a, b, geo, labelled }) => {
   const line = chord(a, b, geo.node, 0);
   const middle = line.at(0.5);
   const about = known(module.state);
-  const quiet = module.state === "up" || module.state === "relayed" || module.state === "parked";
+  const quiet = module.state === "up" || module.state === "relayed";
   return html`<g class="wire ${module.state} ${about.tone}"><path d=${line.d} />
     ${!quiet && html`<g class="seal" transform="translate(${middle.x} ${middle.y})"><circle r="19" /><svg x="-11" y="-11" width="22" height="22" viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
     ${!quiet && labelled && html`<text class="word" x=${middle.x} y=${middle.y + 42}>${about.word}</text>`}</g>`;
@@ -184,11 +184,10 @@ function same(key, list) {
 // The slot of each module: who has one keeps it, and a new one takes the free slot that is farthest from all others.
 // When all are taken the ring gets more; the order around it stays. Slot 0, at the top, is this module's.
 const SLOTS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
-const FULL = 64; // from so many modules on parked ones have no place: the names of more overlap
 const around = { slots: SLOTS[0], places: new Map() };
 function arrange(state) {
   const modules = entries(state, "modules"), own = section(state, "agent").name;
-  const names = modules.filter(([, one]) => modules.length < FULL || one.state !== "parked").map(([name]) => name).sort();
+  const names = modules.map(([name]) => name).sort();
   if (!around.places.has(own)) around.places = new Map([[own, 0]]);
   for (const name of [...around.places.keys()]) if (name !== own && !names.includes(name)) around.places.delete(name);
   for (const name of names.filter((each) => !around.places.has(each))) {
@@ -236,7 +235,7 @@ function concerns(state) {
   const found = [];
   for (const [id, alarm] of entries(state, "alarms")) found.push({ id, level: alarm.level, text: alarm.text, who: alarm.resource || alarm.module, to: alarm.resource ? href("resource", alarm.resource) : href("alarms"), since: alarm.at });
   for (const [name, module] of entries(state, "modules")) {
-    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed" && module.state !== "parked")
+    if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
       found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
     else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
@@ -273,12 +272,12 @@ const FlowRow = memo(({ from, to, flow }) => html`<tr><th scope="row">${from} �
 export function Mandala({ state, connection }) {
   const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
   const modules = entries(state, "modules"), resources = entries(state, "resources");
-  const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length + (state.parked || 0);
+  const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
   const total = modules.length + (section(state, "hidden").modules || 0);
-  const marks = ["up", "parked", "relayed", "silent", "linking", "refused", "away"].filter((each) => (each !== "parked" && each !== "relayed") || modules.some(([, one]) => one.state === each));
+  const marks = ["up", "relayed", "silent", "linking", "refused", "away"].filter((each) => each !== "relayed" || modules.some(([, one]) => one.state === each));
   const { places } = arrange(state);
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
-  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${state.parked ? `, ${state.parked} of them parked` : ""}${current ? "" : " when last heard of"}`}>
+  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${current ? "" : " when last heard of"}`}>
     <div class="overview"><div class="stage-area"><${Ring} state=${state} current=${current} />
       <p class="legend" aria-hidden="true">${marks.map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
     <div class="beside">

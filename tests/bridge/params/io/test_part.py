@@ -106,7 +106,7 @@ class Side:
             SimpleNamespace(
                 peer=number,
                 linked=True,
-                link=SimpleNamespace(name=other.name, send_control=send, parked=False, abandoned=False),
+                link=SimpleNamespace(name=other.name, send_control=send, abandoned=False),
             ),
         )
         self.links[number] = attached

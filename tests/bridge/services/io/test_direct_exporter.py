@@ -32,9 +32,7 @@ class Module:
         self.handlers: dict[str, Any] = {}
         self.offered = {"/add": SimpleNamespace(node="/adder", uri=URI, origin=None)}
         link = SimpleNamespace(name="pad")
-        self.session: Any = SimpleNamespace(
-            peer=1, link=link, linked=True, reachable=True, same_machine=False, address="10.0.0.2"
-        )
+        self.session: Any = SimpleNamespace(peer=1, link=link, linked=True, same_machine=False, address="10.0.0.2")
         trust = Permissions(TrustSettings()) if secured else None
         local = lambda _, service: service if self.permitted else None  # noqa: E731 - a double
         rpc = SimpleNamespace(

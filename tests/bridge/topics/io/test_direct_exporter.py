@@ -84,7 +84,7 @@ class Module:
             cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),
             cast(
                 "Any",
-                SimpleNamespace(get=self.sessions.get, linked=self.sessions.values, reachable=self.sessions.values),
+                SimpleNamespace(get=self.sessions.get, linked=self.sessions.values),
             ),
             cast(
                 "Any",
@@ -112,7 +112,6 @@ class Module:
             peer=number,
             link=link,
             linked=True,
-            reachable=True,
             same_machine=False,
             address=f"10.0.0.{number}",
             proxies=Proxies(f"/rmpa/peer{number}"),

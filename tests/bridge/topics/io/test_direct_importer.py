@@ -74,7 +74,6 @@ class Module:
             peer=1,
             link=link,
             linked=True,
-            reachable=True,
             same_machine=False,
             address="10.0.0.1",
             proxies=SimpleNamespace(get=lambda _: None),

@@ -83,10 +83,6 @@ class ParamFollower:
             if session.peer != peer and session.link.name in owners:
                 self.link_up(session)
 
-    def follows(self, peer: int) -> bool:
-        """Whether this module follows a parameter of a peer."""
-        return any(entry.peer == peer for entry in self.following)
-
     def touched(self, key: str) -> bool:
         """Note a change of a local parameter, to be compared by ``look``.
 

@@ -122,10 +122,6 @@ class ParamOwner:
         if self._followers.pop(peer, None) is not None:
             self._forget_unfollowed()
 
-    def follows(self, peer: int) -> bool:
-        """Whether a peer follows a parameter of this module."""
-        return peer in self._followers and bool(self._followers[peer][1])
-
     def touched(self, key: str) -> bool:
         """Notify the followers of a parameter that has changed.
 

@@ -92,10 +92,6 @@ class Params(Part):
         self._server.link_down(session.peer)
         self._follower.link_down(session.peer)
 
-    def holds(self, session: PeerSession) -> bool:
-        """Whether one of both modules follows a parameter of the other: its changes come over the link."""
-        return self._server.follows(session.peer) or self._follower.follows(session.peer)
-
     def param_update(self, key: str) -> bool:
         """Handle a notification of the local core that a parameter has changed."""
         return any((self._server.touched(key), self._follower.touched(key)))

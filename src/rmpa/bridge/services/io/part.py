@@ -180,7 +180,6 @@ class Services(Part):
             gate=gate,
         )
         """Direct calls of local nodes to peers' servers."""
-        sessions.offers.add(self.exports)
         rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -328,7 +327,6 @@ class Services(Part):
 
     def _settled(self) -> None:
         self._serving.changed()
-        self._sessions.offers.changed()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
@@ -509,8 +507,6 @@ class Services(Part):
         elif session is not None and session.state is PeerState.AWAY:
             text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
-        elif session is not None and not session.linked:
-            self._sessions.want(session)
         elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 
@@ -541,8 +537,7 @@ class Services(Part):
             caller, shown.caller = shown.caller, None
             caller.close(action.reason)
         shown = self._shown.get((action.peer, action.service))
-        parked = session is not None and session.state is PeerState.PARKED
-        if shown is not None and shown.caller is None and not parked:  # the next link opens it for calls that wait
+        if shown is not None and shown.caller is None:
             self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name}: {action.reason}")
 
     def _fail_waiting(self, shown: ShownService, text: str) -> None:

@@ -148,7 +148,6 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
-        sessions.offers.add(self.exports)
         self._pasts: OrderedDict[str, dict[Source, ReceptionHistory]] = OrderedDict()
         """By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``."""
         self._unchanged = UnchangedGraph()
@@ -225,8 +224,7 @@ class Topics(Part):
         """Begins the advertisement to a peer, and waits for the peer's own; suspended routes may go on."""
         peer, identity = session.peer, session.link.identity
         if peer in self._peers:
-            if not session.unparked:
-                _log.info("= %s is back: reliable topics go on", session.link.name)
+            _log.info("= %s is back: reliable topics go on", session.link.name)
             self.outbound.back(peer)
         else:
             self._begin(session)
@@ -270,7 +268,7 @@ class Topics(Part):
         self._act(exports)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            imports, _ = self.imports.link_away(peer, briefly=True, parked=session.link.parked)
+            imports, _ = self.imports.link_away(peer, briefly=True)
             self._act(imports)
 
     def grace_over(self, session: PeerSession) -> bool:
@@ -413,9 +411,6 @@ class Topics(Part):
                 topics.reconcile(state.publishers)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
-        session = self._sessions.get(peer)
-        if wanted and session is not None:
-            self._sessions.want(session)
         self._act(self.imports.demand(peer, source, asyncio.get_running_loop().time(), wanted=wanted))
 
     def _occurred(self, session: PeerSession, source: Source, occurred: QosEvent) -> None:
@@ -430,7 +425,6 @@ class Topics(Part):
         """Drops what belongs to sources that are gone, or that new rules keep home."""
         self._mismatches.forget_gone()
         self.direct_exports.judge_again(refused=False)
-        self._sessions.offers.changed()
 
     # --- carrying out ------------------------------------------------------------------------------------------
 

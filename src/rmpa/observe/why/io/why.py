@@ -46,8 +46,8 @@ HERE: Final = "why.here"
 """The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
 _NO_PUBLISHER: Final = frozenset({"publisher", PERMISSION_THERE})
 """The stages that fail where a peer has no publisher, or does not tell of one: the name may be something else's."""
-_REACHED: Final = frozenset({"linked", "relayed", "parked"})
-"""States of peers that can be asked; a parked one is linked for it."""
+_REACHED: Final = frozenset({"linked", "relayed"})
+"""States of peers that can be asked."""
 _MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 
@@ -152,9 +152,7 @@ class WhyService:
         told, refusal = None, ""
         snapshot = self._snapshots.build(frozenset())
         found = find_peer(snapshot, name)
-        session = next(
-            (s for s in self._bridge.sessions.reachable() if found and str(s.link.guid) == found.guid), None
-        )
+        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
         if session is not None:
             try:
                 told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
@@ -180,7 +178,7 @@ class WhyService:
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
         """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for session in self._bridge.sessions.reachable():
+        for session in self._bridge.sessions.linked():
             if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
                 return session
         return None
@@ -192,14 +190,13 @@ class WhyService:
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
         if not coming and not own and not self._adrift(topic):
             # No peer offers it; one may have it, and not let it cross.
-            asked = _without_many_parked(peers)
-            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in asked))
-            told = [(p.guid, e.there) for p, e in zip(asked, known, strict=True) if e.there is not None]
+            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
+            told = [(p.guid, e.there) for p, e in zip(peers, known, strict=True) if e.there is not None]
             coming = [guid for guid, there in told if there.sources]
             coming = coming or [guid for guid, there in told if there.permitted is False]
         coming += self._adrift(topic)
         ways = [self._arrives(guid, topic) for guid in coming]
-        to = [peer for peer in _without_many_parked(peers) if own and peer.state in ("linked", "parked")]
+        to = [peer for peer in peers if own and peer.state == "linked"]
         ways += [self._leaves(topic, peer.guid) for peer in to]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
         return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
@@ -297,7 +294,7 @@ class WhyService:
             carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
             offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
             found = await asyncio.gather(
-                *(self._calls(guid, service) for guid in offering or [p.guid for p in _without_many_parked(peers)])
+                *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
             served = served or tuple(diagnosis for diagnosis in found if _is_denied(diagnosis))
@@ -352,9 +349,3 @@ def _with_calls(found: Diagnosis) -> Diagnosis:
 def _no_link(peer: str) -> Check:
     remedy = "ask on its own machine; or try again in a moment"
     return Check("link", FAIL, f"there is no link to {peer} that could be asked", remedy)
-
-
-def _without_many_parked(peers: list[PeerInfo]) -> list[PeerInfo]:
-    """The peers to ask all at once: with very many parked ones, those alone that have a link."""
-    many = sum(peer.state == "parked" for peer in peers) > observe_limits.PARKED_ASKED_MAX
-    return [peer for peer in peers if not (many and peer.state == "parked")]
