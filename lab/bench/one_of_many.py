@@ -32,7 +32,6 @@ _PEERS: Final = Path(__file__).with_name("one_of_many_peers.py")
 _DEADLINE: Final = 600.0
 _CPU_LIMIT: Final = 2.0
 _RSS_LIMIT: Final = 100.0
-_TRAFFIC_LIMIT: Final = 5000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +107,6 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     claims = [
         Claim(f"{most} peers: the whole agent at rest, % of a core", rows[most].cpu, _CPU_LIMIT),
         Claim(f"{most} peers: the whole agent, MB", rows[most].rss, _RSS_LIMIT),
-        Claim(f"{most} peers: bytes a second at rest", rows[most].traffic, _TRAFFIC_LIMIT),
     ]
     result: dict[str, object] = {"peers": {str(peers): asdict(row) for peers, row in rows.items()}}
     return finish(console, "one_of_many", asdict(plan), result, json, claims=claims)
