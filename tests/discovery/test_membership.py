@@ -28,7 +28,6 @@ from rmpa.discovery.events import (
     SendMulticast,
     SendUnicast,
 )
-from rmpa.discovery.goodbye_checks import GoodbyeChecks
 from rmpa.discovery.membership import MembershipProtocol
 
 T0 = 1000.0
@@ -241,68 +240,27 @@ def was_linked(one: Harness) -> Speaker:
     return speaker
 
 
-@pytest.mark.parametrize("ahead", [1, 1000])
-def test_a_forged_goodbye_is_refuted_by_the_next_heartbeat(one: Harness, ahead: int) -> None:
+def test_a_forged_goodbye_is_refuted_by_a_later_beacon(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
-    one.hear(Speaker(who(2), speaker.sequence + ahead)(BeaconKind.GOODBYE))
+    one.hear(Speaker(who(2), speaker.sequence)(BeaconKind.GOODBYE))
     assert one.membership.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
-    one.run(limits.GOODBYE_LATE)
+    one.hear(speaker())
     one.hear(speaker())
     assert [type(event) for event in one.membership.events()] == [PeerFound]
-    one.run(5.0)
-    one.hear(speaker())
-    assert one.present() == ["peer2"]
-
-
-def test_a_peer_that_was_linked_is_asked_whether_it_said_goodbye(one: Harness) -> None:
-    speaker = was_linked(one)
-    forger = ("10.0.0.66", 6666)
-    one.hear(Speaker(who(2), 1000)(BeaconKind.GOODBYE), source=forger, multicast=False)
-    assert one.present() == []
-    asked = one.run(limits.GOODBYE_CHECK)
-    assert unicasts(asked, BeaconKind.ANNOUNCE) == [who(2).guid.endpoint]
-    one.hear(speaker(BeaconKind.ANSWER), multicast=False)
-    assert one.present() == ["peer2"]
-    assert unicasts(one.run(10.0), BeaconKind.ANNOUNCE) == [], "one announcement is enough"
-
-
-def test_peers_that_were_never_linked_are_not_asked(one: Harness) -> None:
-    speaker = Speaker(who(2))
-    one.hear(speaker())
-    one.hear(speaker(BeaconKind.GOODBYE))
-    assert unicasts(one.run(30.0), BeaconKind.ANNOUNCE) == []
-
-
-def test_checks_of_goodbyes_are_bounded() -> None:
-    checks = GoodbyeChecks(lambda: 0.5)
-    for number in range(1000):
-        checks.add((("10.0.0.2", number),), 10, T0)
-    assert len(checks.take(T0 + limits.GOODBYE_CHECK)) == limits.GOODBYE_CHECKS_BURST
-    checks.add((("10.0.0.2", 1),), 2 * limits.GOODBYE_CHECKS, T0 + 60.0)
-    assert checks.at is None, "of many members some others ask"
 
 
 def test_a_forged_goodbye_of_a_linked_peer_is_forgotten_with_its_next_heartbeat(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
     one.membership.link_up(who(2), one.now)
-    one.hear(Speaker(who(2), 1000)(BeaconKind.GOODBYE))
+    one.hear(Speaker(who(2), speaker.sequence)(BeaconKind.GOODBYE))
     assert one.membership.events()[-1] == RunDoubted(who(2)), "a link at rest is to show whether it works"
     one.run(1.0)
     one.hear(speaker())
+    one.hear(speaker())
     one.membership.link_down(who(2).guid, one.now)
     assert one.present() == ["peer2"], "as after any lost link, its lease begins"
-
-
-def test_a_repeated_goodbye_puts_off_nothing(one: Harness) -> None:
-    speaker, forger = Speaker(who(2)), Speaker(who(2), 1000)
-    one.hear(speaker())
-    for _ in range(3):
-        one.hear(forger(BeaconKind.GOODBYE))
-        one.run(limits.GOODBYE_LATE / 2)
-    one.hear(speaker())
-    assert one.present() == ["peer2"]
 
 
 def test_a_stranger_that_says_goodbye_is_not_met(one: Harness) -> None:
@@ -778,20 +736,6 @@ def flood(one: Harness, count: int, *, first: int = 0) -> None:
         one.membership.events()
 
 
-def test_unlinked_peers_share_a_few_unicast_heartbeats(one: Harness) -> None:
-    flood(one, 500)
-    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
-    one.membership.link_up(who(2), one.now)
-    one.run(limits.MULTICAST_SILENCE + limits.HEARTBEAT_INTERVAL)
-    sent = unicasts(one.run(60.0), BeaconKind.HEARTBEAT)
-    linked = who(2).guid.endpoint
-    assert sent.count(linked) >= 11, "who is linked gets each heartbeat"
-    others = [address for address in sent if address != linked]
-    assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.UNICAST_HEARTBEATS_PER_SECOND
-    assert len(set(others)) == 500, "each in turn"
-    assert one.membership.counters["beacon.whisper_limited"]
-
-
 def test_who_spoke_once_and_has_no_link_is_not_passed_on_for_long(one: Harness) -> None:
     flood(one, 300)
     one.membership.link_up(who(3), one.now)
@@ -814,18 +758,15 @@ def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
     assert sent >= 40 * limits.CANDIDATES_PER_SECOND
 
 
-def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> None:
+def test_a_full_membership_takes_in_no_stranger_until_one_is_silent(one: Harness) -> None:
     flood(one, limits.STRANGERS_MAX)
     one.hear(Speaker(who(3))())
-    assert "peer3" not in one.present(), "all spoke a moment ago"
-    one.run(limits.HEARTBEAT_LATE)
-    one.hear(Speaker(who(4))())
-    assert "peer4" in one.present()
-    flood(one, 1000, first=5000)
-    assert len(one.present()) == limits.STRANGERS_MAX
-    new = [name for name in one.present() if name.startswith("n5") and len(name) > 4]
-    assert len(new) <= limits.EVICTIONS_PER_SECOND
-    assert one.membership.counters["roster.full"] >= 1000 - limits.EVICTIONS_PER_SECOND
+    assert "peer3" not in one.present()
+    one.membership.link_up(who(4), one.now)
+    assert "peer4" in one.present(), "a link proves that it is there"
+    one.run(120.0)
+    one.hear(Speaker(who(3))())
+    assert "peer3" in one.present()
 
 
 def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
 from rmpa.core.timer_queue import TimerQueue
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.events import ConflictKind, HeardBy, PeerConflict, PeerView
 
@@ -146,20 +145,14 @@ class EndpointTable:
         """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""
         return [self._all[place] for place in self._by_name.get(name, ())]
 
-    def oldest_unlinked(self, *, verified: bool) -> tuple[float, int] | None:
-        """``(heard, place)`` of the endpoint without a linked peer that has been silent the longest.
-
-        Args:
-            verified: Whether peers that had a link count too, if there are no others.
-        """
-        never = float("-inf")
+    def oldest_unlinked(self) -> int | None:
+        """The place of the unlinked peer that has been silent for longest; one that never had a link comes first."""
         unlinked = [
-            (peer is not None and peer.verified, peer.heard if peer is not None else never, place)
+            (peer is not None and peer.verified, peer.heard if peer is not None else float("-inf"), place)
             for place, peer in ((place, endpoint.current) for place, endpoint in self._all.items())
             if peer is None or not peer.linked
         ]
-        had_link, heard, place = min(unlinked, default=(True, never, -1))
-        return None if place < 0 or (had_link and not verified) else (heard, place)
+        return min(unlinked)[2] if unlinked else None
 
     def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
         """Pairs of this endpoint's peer and each other live peer with its name, the newer peer first."""
@@ -208,35 +201,3 @@ class EndpointTable:
             tuple(conflicts),
             endpoint.present and peer is endpoint.current,
         )
-
-
-class Eviction:
-    """Selects the peers that give way to new ones when as many are known as may be.
-
-    Args:
-        endpoints: All of them.
-    """
-
-    def __init__(self, endpoints: EndpointTable) -> None:
-        self._endpoints = endpoints
-        self._rate = TokenBucket(limits.EVICTIONS_PER_SECOND, limits.EVICTIONS_PER_SECOND)
-        self._none_until = float("-inf")
-
-    def for_linked(self) -> int | None:
-        """The place of the peer that gives way to a linked one: an unlinked one, silent for longest."""
-        oldest = self._endpoints.oldest_unlinked(verified=True)
-        return oldest[1] if oldest is not None else None
-
-    def for_heard(self, now: float) -> int | None:
-        """The place of the peer that gives way to a newly heard one: it never had a link, and missed a heartbeat.
-
-        The rate is limited, because the newly heard peer may be forged too.
-        """
-        if now < self._none_until:
-            return None
-        heard, place = self._endpoints.oldest_unlinked(verified=False) or (now, -1)
-        self._none_until = heard + limits.HEARTBEAT_LATE
-        if now >= self._none_until and self._rate.take(now):
-            return place
-        self._none_until = max(self._none_until, self._rate.next(now))
-        return None

@@ -30,19 +30,6 @@ ADDRESS_SHARED_AFTER: Final = 5.0
 conflict."""
 ADDRESS_SHARED_MARGIN: Final = 1.0
 """Seconds after the end of a peer's link in which its beacon may still be one from before."""
-GOODBYE_LATE: Final = 0.2
-"""Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A
-beacon that comes later refutes the goodbye."""
-GOODBYE_CHECK: Final = 0.25
-"""Seconds from a goodbye to the announcement that asks whether it was forged: the answer comes after
-``GOODBYE_LATE``."""
-GOODBYE_CHECKS: Final = 16
-"""Members that ask so, on average: in larger meshes each decides by chance. A goodbye then costs the
-network no more than this many packets."""
-GOODBYE_CHECKS_PER_SECOND: Final = 25.0
-"""Goodbyes a second that one agent checks; those beyond it are refuted by the next heartbeat."""
-GOODBYE_CHECKS_BURST: Final = 64
-"""Goodbyes that wait for their check at one time, and that are checked at once."""
 ANSWER_INTERVAL: Final = 0.2
 """The shortest time between two unicast answers to one address."""
 INTERFACE_SETTLE: Final = 0.2
@@ -92,17 +79,11 @@ CANDIDATES_BURST: Final = 256
 """Announcements to addresses known from gossip that may be sent at once."""
 CANDIDATES_PER_SECOND: Final = 25.0
 """Announcements a second to all addresses known from gossip, beyond one for each: gossiped peers may be forged."""
-UNICAST_HEARTBEATS_PER_SECOND: Final = 10.0
-"""Heartbeats by unicast to peers that never had a link, over all of them: each takes 0.2 ms, and with 500 such peers
-each still gets one a minute."""
 UNICAST_HEARTBEATS_AT_ONCE: Final = 8
 """Unicast heartbeats, to linked and unlinked peers, in one run of the timer; each takes some 0.1 ms."""
 STRANGERS_MAX: Final = 1024
 """Peers that were never linked and may be known at one time: they may be forged, and each of them costs a few
 microseconds wherever all peers are looked at. Peers of a large mesh are linked once, and then count no more."""
-EVICTIONS_PER_SECOND: Final = 10.0
-"""Peers a second that are removed for new ones when ``PEERS_MAX`` or ``STRANGERS_MAX`` is reached: unlinked ones that
-missed a heartbeat."""
 BEACONS_PER_WAKE: Final = 64
 """Packets handled in one callback, 100 microseconds each; pending data is handled between them."""
 BEACONS_UNPROVED_PER_SECOND: Final = 4000.0

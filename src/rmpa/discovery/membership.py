@@ -9,6 +9,7 @@ member by a beacon of its own or a link, never because another peer says so.
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
@@ -19,7 +20,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Address, Beacon, BeaconKind
 from rmpa.discovery.beacon_sender import BeaconSender
 from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
-from rmpa.discovery.endpoint_table import EndpointTable, Eviction
+from rmpa.discovery.endpoint_table import EndpointTable
 from rmpa.discovery.events import (
     ConflictCleared,
     ConflictKind,
@@ -34,10 +35,8 @@ from rmpa.discovery.events import (
     PeerRestarted,
     RunDoubted,
 )
-from rmpa.discovery.goodbye_checks import GoodbyeChecks
 from rmpa.discovery.gossip import GossipCandidates
 from rmpa.discovery.pacing import LateAnswers, dissemination_interval, is_many
-from rmpa.discovery.unicast import UnicastHeartbeats
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -73,17 +72,17 @@ class MembershipProtocol:
         self._rng = rng
         self._endpoints = EndpointTable()
         self._sender = BeaconSender(identity, self._endpoints, lease, self.counters, multicast=multicast)
-        self._eviction = Eviction(self._endpoints)
         self._reported_names: set[frozenset[bytes]] = set()
         self._late_answers = LateAnswers(rng)
         self._candidates = GossipCandidates(rng)
-        self._goodbye_checks = GoodbyeChecks(rng)
         self._seeds: tuple[Address, ...] = ()
         self._burst: list[float] = []
         self._heartbeat_at: float | None = None
         self._disseminate_at: float | None = None
         self._disseminated_at = _NEVER
-        self._unicast_heartbeats = UnicastHeartbeats()
+        self._unicasts: dict[int, PeerInstance] = {}
+        """The peers that get a heartbeat by unicast now, by place."""
+        self._unicast_at = _NEVER
         self._events: list[Event] = []
 
     # --- inputs -----------------------------------------------------------------------------------------------
@@ -113,7 +112,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if self._endpoints.is_full and not self._evict(self._eviction.for_heard(now)):
+            if self._endpoints.is_full:
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
@@ -167,7 +166,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict(self._eviction.for_linked()):
+            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict():
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
@@ -234,7 +233,7 @@ class MembershipProtocol:
         """Send a goodbye to the peers; afterwards nothing is sent, and beacons are ignored."""
         if self._sender.closed or self._heartbeat_at is None:
             return
-        self._sender.send_goodbye(self._unicast_heartbeats.choose(self._sender.unheard_by_multicast(now), now)[0])
+        self._sender.send_goodbye(self._sender.unheard_by_multicast(now))
 
     def next_timer(self) -> float | None:
         """When to call ``handle_timer``, in seconds of the clock; ``None``: never."""
@@ -244,10 +243,9 @@ class MembershipProtocol:
             self._heartbeat_at,
             self._disseminate_at,
             self._late_answers.at,
-            self._unicast_heartbeats.at,
+            self._unicast_at if self._unicasts else None,
             self._burst[0] if self._burst else None,
             self._candidates.next_timer(),
-            self._goodbye_checks.at,
             self._endpoints.next_timer(),
         )
 
@@ -272,11 +270,12 @@ class MembershipProtocol:
         if self._disseminate_at is not None and self._disseminate_at <= now:
             self._disseminate(now)
         self._send_late_answers(now)
-        for peer in self._unicast_heartbeats.take_some():
+        for place in tuple(islice(self._unicasts, limits.UNICAST_HEARTBEATS_AT_ONCE)):
+            peer = self._unicasts.pop(place)
             gossip = self._sender.gossip(self._endpoints.present(), peer, now)
             for address in peer.addresses:
                 self._sender.send(BeaconKind.HEARTBEAT, address, gossip)
-        for address in (*self._candidates.take_due(now), *self._goodbye_checks.take(now)):
+        for address in self._candidates.take_due(now):
             self._sender.send(BeaconKind.ANNOUNCE, address)
 
     # --- outputs and views ------------------------------------------------------------------------------------
@@ -361,14 +360,8 @@ class MembershipProtocol:
             return
         self._peer_lost(endpoint, LossReason.GOODBYE)
         endpoint.remove_current()
-        self._check_goodbye(current, now)
         self._clear_conflict(endpoint, now)
         self._endpoints.changed(current.identity.guid.place)
-
-    def _check_goodbye(self, peer: PeerInstance, now: float) -> None:
-        """Ask a peer that is lost by a goodbye whether it is there, if it was linked: others may be forged too."""
-        if peer.verified:
-            self._goodbye_checks.add(peer.addresses, self.members, now)
 
     def _run_waits(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
         if current.linked and not endpoint.own:
@@ -463,8 +456,9 @@ class MembershipProtocol:
         if endpoint is not None and endpoint.current is None and not endpoint.others:
             self._endpoints.remove(key)
 
-    def _evict(self, place: int | None) -> bool:
-        """Remove the peer that gives way to another one; return whether there is one."""
+    def _evict(self) -> bool:
+        """Make room for a linked peer: the unlinked one that has been silent for longest goes, if there is one."""
+        place = self._endpoints.oldest_unlinked()
         endpoint = self._endpoints.get(place) if place is not None else None
         if place is None or endpoint is None:
             return False
@@ -480,8 +474,8 @@ class MembershipProtocol:
 
     def _plan_unicast_heartbeats(self, now: float) -> None:
         """Queue unicast heartbeats, with gossip about all peers, for the peers that multicast does not reach."""
-        if not self._unicast_heartbeats.plan(self._sender.unheard_by_multicast(now), now):
-            self.counters.add("beacon.whisper_limited")
+        self._unicasts |= {peer.identity.guid.place: peer for peer in self._sender.unheard_by_multicast(now)}
+        self._unicast_at = now
 
     def _disseminate(self, now: float) -> None:
         """Send heartbeats early, so that their gossip reports newly found peers."""
