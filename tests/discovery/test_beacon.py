@@ -18,13 +18,14 @@ from rmpa.discovery.beacon import Beacon, BeaconKind, BeaconMalformed, BeaconOth
 from tests.fuzz import target_beacon
 
 GOLDEN = bytes.fromhex(
-    "524d5041 01 03 0005"  # RMPA, version 1, answer, domain 5
+    "524d5041 02 03 0005"  # RMPA, version 2, answer, domain 5
     "0a000001 9c41 0007"  # 10.0.0.1:40001#7
     "000102030405060708090a0b0c0d0e0f"
     "00003e80 0000002a"  # lease 16000 ms, sequence 42
     "04 62617365"  # base
     "01 c0a80002"  # 192.168.0.2
     "02 0a0000029c420000 0a0000039c430001"
+    "00"
 )
 BEACON = Beacon(
     BeaconKind.ANSWER,
@@ -46,16 +47,16 @@ def test_text_is_short_and_safe() -> None:
 
 def test_where_gossiped_peers_are_heard_follows_if_it_is_said() -> None:
     observed = replace(BEACON, observed=(("192.168.7.3", 40003), ("10.9.0.2", 1)))
-    wire = GOLDEN + bytes.fromhex("02 c0a807039c43 0a0900020001")
+    wire = GOLDEN[:-1] + bytes.fromhex("02 c0a807039c43 0a0900020001")
     assert observed.serialize() == wire
     assert Beacon.parse(wire, 5) == observed
     assert Beacon.parse(wire + b"later", 5) == observed
-    for length in range(len(GOLDEN) + 1, len(wire)):
+    for length in range(len(GOLDEN), len(wire)):
         with pytest.raises(BeaconMalformed):
             Beacon.parse(wire[:length], 5)
     for damaged in ("41 c0a807039c43", "01 e0a807039c43", "01 c0a807030000", "01 000000019c43"):
         with pytest.raises(BeaconMalformed):
-            Beacon.parse(GOLDEN + bytes.fromhex(damaged), 5)
+            Beacon.parse(GOLDEN[:-1] + bytes.fromhex(damaged), 5)
 
 
 def test_bytes_behind_are_left_for_later_versions() -> None:
@@ -88,14 +89,14 @@ def test_another_domain_is_told_first() -> None:
     with pytest.raises(BeaconOtherDomain, match="is of domain 5"):
         Beacon.parse(GOLDEN, 6)
     with pytest.raises(BeaconOtherDomain):
-        Beacon.parse(GOLDEN[:4] + b"\x02" + GOLDEN[5:8], 6)
+        Beacon.parse(GOLDEN[:4] + b"\x03" + GOLDEN[5:8], 6)
 
 
 def test_other_version_is_recognised_by_eight_bytes() -> None:
     with pytest.raises(
-        BeaconOtherVersion, match="speaks version 2 of the protocol, we speak 1: update the older one"
+        BeaconOtherVersion, match="speaks version 3 of the protocol, we speak 2: update the older one"
     ):
-        Beacon.parse(GOLDEN[:4] + b"\x02" + GOLDEN[5:8], 5)
+        Beacon.parse(GOLDEN[:4] + b"\x03" + GOLDEN[5:8], 5)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
 
 SEEDS: list[bytes] = [
     b"",
-    b"RMPA\x02\x01\x00\x00",
+    b"RMPA\x03\x01\x00\x00",
     Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize(),
     Hello.of(_THEIRS, lease=1.0, expected=None).serialize() + b"later versions",
     Hello.of(_OURS, lease=60.0, expected=None, lane=2).serialize(),

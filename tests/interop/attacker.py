@@ -288,7 +288,7 @@ def flood(given: Arguments) -> None:
         sent += 1
         if given["kind"] == "beacons":
             identity = Identity(Guid.of("10.77.9.9", RNG.randrange(1, 65536)), RNG.randbytes(16), "arm9", 0)
-            packet = Beacon(BeaconKind.ANNOUNCE, identity, 60_000, sent).serialize(extended=True)
+            packet = Beacon(BeaconKind.ANNOUNCE, identity, 60_000, sent).serialize()
             udp.sendto(with_trailer(packet, false_key, sent), (given["group"], given["udp"]))
             continue
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -363,7 +363,7 @@ def tell_beacon(given: Arguments) -> None:
     udp = udp_socket()
     identity = Identity(Guid.of(given["here"], given["listen"], 1), os.urandom(16), given["name"], 0)
     for number in range(1, 6):
-        packet = Beacon(BeaconKind.ANNOUNCE, identity, 60_000, number).serialize(extended=True)
+        packet = Beacon(BeaconKind.ANNOUNCE, identity, 60_000, number).serialize()
         udp.sendto(with_trailer(packet, bytes.fromhex(given["key"]), number), (given["group"], given["udp"]))
         time.sleep(0.1)
     say("done")
@@ -398,7 +398,7 @@ def former(given: Arguments) -> None:
             sequence = (beacon.sequence + 500 + number) & 0xFFFFFFFF
             lies.append(Beacon(BeaconKind.GOODBYE, beacon.identity, 60_000, sequence))
         for lie in lies:
-            packet = with_trailer(lie.serialize(extended=True), key, number)
+            packet = with_trailer(lie.serialize(), key, number)
             udp.sendto(packet, (given["group"], given["udp"]))
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         sock.settimeout(0.2)

@@ -96,9 +96,9 @@ def with_byte(data: bytes, offset: int, value: int) -> bytes:
     ("offset", "value", "code"),
     [
         (0, 0x58, Refusal.MALFORMED),
-        (4, 2, Refusal.VERSION),
-        (48, 60, Refusal.MALFORMED),
-        (49, 0x2F, Refusal.MALFORMED),
+        (4, 3, Refusal.VERSION),
+        (44, 60, Refusal.MALFORMED),
+        (45, 0x2F, Refusal.MALFORMED),
     ],
 )
 def test_an_unreadable_hello_is_refused_with_its_code(offset: int, value: int, code: Refusal) -> None:

@@ -17,10 +17,9 @@ from tests.mesh.worlds import HIGH, LOW
 if TYPE_CHECKING:
     from rmpa.core.identity import Identity
 
-HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2), features=9)
+HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2))
 WIRE = bytes.fromhex(
-    "524d5041 01 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 00000009 04"
-    "62617365"
+    "524d5041 02 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 0462617365"
 )
 
 
@@ -43,14 +42,14 @@ def test_every_shorter_hello_is_malformed(cut: int) -> None:
 
 def test_other_version_is_distinguished_from_garbage() -> None:
     with pytest.raises(HandshakeError, match="same release") as caught:
-        Hello.parse(b"RMPA\x02\x01\x00\x00")
+        Hello.parse(b"RMPA\x03\x01\x00\x00")
     assert caught.value.refuse.code == Refusal.VERSION
 
 
 @pytest.mark.parametrize("name", [b"\xff\xff", b"a/b", b"a b", b"", b"a" * 65])
 def test_names_that_are_not(name: bytes) -> None:
     with pytest.raises(HandshakeError) as caught:
-        Hello.parse(WIRE[:48] + bytes([len(name)]) + name)
+        Hello.parse(WIRE[:44] + bytes([len(name)]) + name)
     assert caught.value.refuse.code == Refusal.MALFORMED
 
 

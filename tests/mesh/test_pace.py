@@ -12,7 +12,6 @@ from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
 from rmpa.mesh.connection_events import ConnectionClosed, PongReceived
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Feature, Hello
 from rmpa.mesh.keepalive import RestPace
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
@@ -253,35 +252,6 @@ def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_ask
     dialler.link.need(time.now, needed=True)
     pass_time(dialler.link, time, limits.WAKE_TIMEOUT + 0.01)
     assert dialler.link.state is ConnectionState.CLOSED, "the peer has gone meanwhile"
-
-
-def test_an_earlier_release_never_rests_and_gets_no_frame_that_it_does_not_know() -> None:
-    time = Time()
-    dialler, _ = pair(time)
-    assert dialler.link.remote is not None
-    dialler.link.remote = replace(dialler.link.remote, features=0)
-    dialler.link.need(time.now, needed=False)
-    assert not dialler.link.has_output
-    assert not dialler.link.rests
-
-
-def test_the_hello_of_the_last_release_is_taken_as_one_that_cannot_rest() -> None:
-    time = Time()
-    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
-    hello = replace(Hello.of(LOW, lease=1.0, expected=HIGH.guid), features=0).serialize()
-    golden = bytes.fromhex(
-        "524d5041 01 01 0000 0a0000019c410001".replace(" ", "")
-        + (b"L" * 16).hex()
-        + "000003e80a0000029c420001 00000000 03".replace(" ", "")
-        + b"low".hex()
-    )
-    assert hello == golden
-    deliver(Frame(FrameKind.HELLO, golden).serialize(), acceptor.link, time.now)
-    acceptor.link.accept(time.now)
-    acceptor.link.take_output()
-    acceptor.link.need(time.now, needed=False)
-    assert not acceptor.link.has_output
-    assert not Hello.parse(golden).features & Feature.PACE
 
 
 @pytest.mark.parametrize("needed", [False, True])

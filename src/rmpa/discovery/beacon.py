@@ -29,7 +29,7 @@ Address = tuple[str, int]
 """A numeric IPv4 address and a UDP port, as sockets have it."""
 
 MAGIC: Final = b"RMPA"
-VERSION: Final = 1
+VERSION: Final = 2
 
 RUN_AT: Final = (16, 32)
 """Where the instance id stands in a beacon of any version 1: begin and end."""
@@ -151,10 +151,10 @@ class Beacon:
         if count[0] > limits.BEACON_GOSSIP_MAX:
             raise BeaconMalformed(f"{count[0]} gossiped peers")
         gossip, offset = _take(data, offset, 8 * count[0], "gossip")
-        number = data[offset] if offset < len(data) else 0  # a beacon without observed addresses ends here
-        if number > limits.BEACON_GOSSIP_MAX:
-            raise BeaconMalformed(f"{number} further addresses of gossiped peers")
-        observed, _ = _take(data, offset + 1, _ENDPOINT.size * number, "gossiped addresses") if number else (b"", 0)
+        count, offset = _take(data, offset, 1, "number of further addresses")
+        if count[0] > limits.BEACON_GOSSIP_MAX:
+            raise BeaconMalformed(f"{count[0]} further addresses of gossiped peers")
+        observed, _ = _take(data, offset, _ENDPOINT.size * count[0], "gossiped addresses")
         try:
             return cls(
                 BeaconKind(kind),
@@ -173,13 +173,8 @@ class Beacon:
         except ValueError as error:
             raise BeaconMalformed(str(error)) from error
 
-    def serialize(self, *, extended: bool = False) -> bytes:
-        """The packet; never longer than ``limits.BEACON_MAX_BYTES``.
-
-        Args:
-            extended: Whether further bytes will follow, such as the trailer of a secured mesh: the count of observed
-                addresses then stands in front of them, even if it is 0.
-        """
+    def serialize(self) -> bytes:
+        """The packet; never longer than ``limits.BEACON_MAX_BYTES``."""
         identity = self.identity
         name = identity.name.encode("ascii")
         return b"".join(
@@ -200,7 +195,7 @@ class Beacon:
                 *(address.packed for address in identity.addresses),
                 bytes((len(self.gossip),)),
                 *(_GUID.pack(guid.value) for guid in self.gossip),
-                bytes((len(self.observed),)) if self.observed or extended else b"",
+                bytes((len(self.observed),)),
                 *(_ENDPOINT.pack(IPv4Address(host).packed, at) for host, at in self.observed),
             )
         )

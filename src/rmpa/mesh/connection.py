@@ -37,7 +37,7 @@ from rmpa.mesh.connection_events import (
     Refused,
 )
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Feature, HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.keepalive import Keepalive, RestPace
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
@@ -336,12 +336,10 @@ class ConnectionProtocol:
     def need(self, now: float, *, needed: bool) -> None:
         """Say whether something depends on this connection; if neither side needs it, it rests.
 
-        Without effect on a connection that is not up, or whose remote side cannot rest.
+        Without effect on a connection that is not up.
         """
         keepalive = self._keepalive
-        if self._state is not ConnectionState.UP or self.remote is None or not self.remote.features & Feature.PACE:
-            return
-        if keepalive.needed is needed:
+        if self._state is not ConnectionState.UP or keepalive.needed is needed:
             return
         keepalive.needed = needed
         if keepalive.agree() and needed:

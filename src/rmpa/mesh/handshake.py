@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MAGIC: Final = b"RMPA"
-VERSION: Final = 1
+VERSION: Final = 2
 
 _PREFIX: Final = struct.Struct(">4sBBH")
-_HELLO: Final = struct.Struct(">4sBBHQ16sIQIB")
+_HELLO: Final = struct.Struct(">4sBBHQ16sIQB")
 _CODE: Final = struct.Struct(">H")
 
 
@@ -38,17 +38,6 @@ class Lane(IntEnum):
 
 LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
 """The lanes that this version knows."""
-
-
-class Feature(IntFlag):
-    """What a side of a link can do beyond the first release; a bit that is not known is ignored."""
-
-    PACE = 1
-    """It takes pace frames: the link may rest."""
-
-
-FEATURES: Final = Feature.PACE
-"""The features of this version."""
 
 
 class Refusal(IntEnum):
@@ -133,7 +122,6 @@ class Hello:
         expected: Hello: the GUID that the sender dialled, ``None`` if it knows only an address; welcome: the
             hello's GUID.
         lane: What the connection is for; an ``int``, because a later version may know more lanes.
-        features: What the sender can do, as bits of ``Feature``; a later version may have more.
     """
 
     guid: Guid
@@ -143,7 +131,6 @@ class Hello:
     lease_ms: int
     expected: Guid | None = None
     lane: int = Lane.EXPRESS
-    features: int = 0
 
     @classmethod
     def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
@@ -156,7 +143,6 @@ class Hello:
             round(lease * 1000),
             expected,
             lane,
-            FEATURES,
         )
 
     @classmethod
@@ -176,7 +162,7 @@ class Hello:
             raise HandshakeError(Refuse(Refusal.VERSION, text))
         if len(payload) < _HELLO.size:
             raise _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")
-        _, _, lane, domain, guid, instance, lease_ms, expected, features, size = _HELLO.unpack_from(payload)
+        _, _, lane, domain, guid, instance, lease_ms, expected, size = _HELLO.unpack_from(payload)
         raw = bytes(payload[_HELLO.size : _HELLO.size + size])
         if len(raw) != size:
             raise _malformed("it is shorter than its name")
@@ -189,7 +175,7 @@ class Hello:
             # Discovery would gossip about this GUID, and no beacon may carry such a one.
             raise _malformed(f"no peer can be reached at {Guid(guid)}")
         dialled = Guid(expected) if expected else None
-        return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane, features)
+        return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane)
 
     def serialize(self) -> bytes:
         """The bytes on the wire."""
@@ -204,7 +190,6 @@ class Hello:
             self.instance,
             self.lease_ms,
             expected,
-            self.features,
             len(name),
         )
         return head + name

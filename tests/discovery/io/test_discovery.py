@@ -133,7 +133,7 @@ async def test_garbage_is_counted_said_once_and_survived(
     far = Beacon(BeaconKind.ANNOUNCE, Identity(Guid.of("127.0.0.1", 9), os.urandom(16), "far", 7), 1, 1).serialize()
     new = Beacon(BeaconKind.ANNOUNCE, Identity(Guid.of("127.0.0.1", 9), os.urandom(16), "new"), 1, 1)
     newer = bytearray(new.serialize())
-    newer[4] = 2
+    newer[4] = 3
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, caplog.at_level(logging.WARNING):
         for n in range(30):
             sock.sendto(b"GET / HTTP/1.1 %d" % n, to)
@@ -147,7 +147,7 @@ async def test_garbage_is_counted_said_once_and_survived(
     assert counters["beacon.other_domain"] == 1
     lines = [r.getMessage() for r in caplog.records]
     assert len([line for line in lines if "malformed" in line]) == 1
-    assert any("127.0.0.1 speaks version 2 of the protocol, we speak 1: update" in line for line in lines)
+    assert any("127.0.0.1 speaks version 3 of the protocol, we speak 2: update" in line for line in lines)
     assert len([line for line in lines if "is of domain 7, we are of domain 0" in line]) == 1
     pc = Agent("pc", settings)
     await start(agents, pc)

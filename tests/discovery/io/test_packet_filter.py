@@ -105,7 +105,7 @@ class SecuredDoor:
 
     def signed(self, sequence: int, wall: float = WALL) -> bytes:
         beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, sequence)
-        return self._signer.sign(beacon.serialize(extended=True), KeyPurpose.BEACON, 10.0, wall)
+        return self._signer.sign(beacon.serialize(), KeyPurpose.BEACON, 10.0, wall)
 
     def hears(self, data: bytes, host: str = "10.0.0.2", now: float = 10.0) -> bool:
         return self.intake.parse(data, (host, 4000), now, multicast=True, interface=1) is not None
@@ -124,7 +124,7 @@ def test_a_secured_mesh_hears_its_members_once() -> None:
 def test_a_secured_mesh_hears_nothing_else() -> None:
     door = SecuredDoor()
     foreign = PacketSigner(KeyRing([GroupKey(1, b"x" * 32)], 0.0))
-    body = Beacon(BeaconKind.ANNOUNCE, FRIEND, 16_000, 1).serialize(extended=True)
+    body = Beacon(BeaconKind.ANNOUNCE, FRIEND, 16_000, 1).serialize()
     newer = PacketSigner(KeyRing([GroupKey(2, b"x" * 32)], 0.0))
     for data, reason in (
         (packet(FRIEND, 1), "untagged"),
@@ -146,7 +146,7 @@ def test_a_module_with_an_older_group_key_is_recognised_and_counts_for_no_limit(
     old, member = PacketSigner(KeyRing([GroupKey(1, b"k" * 32)], 0.0)), PacketSigner(ring)
 
     def found(signer: PacketSigner, number: int, now: float) -> object:
-        beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, number).serialize(extended=True)
+        beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, number).serialize()
         data = signer.sign(beacon, KeyPurpose.BEACON, now, WALL)
         return door.parse(data, ("10.0.0.2", 4000), now, multicast=True, interface=1)
 
@@ -214,12 +214,3 @@ def test_strangers_fill_no_table_and_no_time(caplog: pytest.LogCaptureFixture) -
     assert len(shown) == limits.STRANGERS_SHOWN
     assert len(caplog.records) < limits.STRANGERS_SHOWN
     assert not door.intake.strangers.shown(15.0 + limits.STRANGER_KEPT)
-
-
-def test_an_extended_beacon_has_room_for_the_trailer() -> None:
-    beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, 1)
-    assert beacon.serialize(extended=True) == beacon.serialize() + b"\x00"
-    heard = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, 1, observed=(("10.0.0.9", 1),))
-    assert heard.serialize(extended=True) == heard.serialize()
-    assert Beacon.parse(heard.serialize() + b"trailer", 0) == heard
-    assert Beacon.parse(beacon.serialize(extended=True) + b"\x41railer", 0) == beacon

@@ -55,7 +55,7 @@ def packets(real: list[Guid]) -> Iterator[bytes]:
         yield good[:end]
     for size in (1201, 1400, 9000, 60_000):
         yield good + bytes(size - len(good))
-    for version in (0, 2, 255):
+    for version in (0, 3, 255):
         yield good[:4] + bytes([version]) + good[5:]
     yield beacon(Guid.of("10.77.0.200", 4000), "eve", domain=1)
     for guid in real:

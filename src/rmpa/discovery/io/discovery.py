@@ -336,7 +336,7 @@ class Discovery:
         trust = self._trust
         if trust is None:
             return beacon.serialize()
-        packet = beacon.serialize(extended=True)
+        packet = beacon.serialize()
         return trust.signer.sign(packet, KeyPurpose.BEACON, self._clock.now(), trust.wall(), key=key)
 
     def _deliver(self, event: Event) -> None:
