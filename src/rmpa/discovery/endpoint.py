@@ -57,7 +57,8 @@ class PeerInstance:
         multicast_at: When it was last heard by multicast.
         linked: Whether there is a link with it.
         verified: Whether it had a link: it is no forgery.
-        leaving: Whether it said goodbye.
+        leaving: Whether it said goodbye. The goodbye may be forged: its number does not count for what comes after.
+        before_goodbye: The number of its last beacon before the goodbye.
         superseded_at: When another run took its endpoint.
         doubted: Whether the silence of its beacons, while it is linked, was reported.
     """
@@ -74,6 +75,7 @@ class PeerInstance:
     linked: bool = False
     verified: bool = False
     leaving: bool = False
+    before_goodbye: int | None = None
     superseded_at: float = _NEVER
     doubted: bool = False
 
@@ -88,18 +90,28 @@ class PeerInstance:
         endpoint = self.identity.guid.endpoint
         return (endpoint,) if self.source is None or self.source == endpoint else (endpoint, self.source)
 
-    def accepts(self, sequence: int) -> bool:
-        """Whether a beacon is newer than the last one (serial numbers, RFC 1982: they wrap)."""
-        return self.sequence is None or is_later(sequence, self.sequence)
+    def accepts(self, sequence: int, now: float) -> bool:
+        """Whether a beacon is newer than the last one (serial numbers, RFC 1982: they wrap).
+
+        A beacon that was late behind a goodbye comes soon after it. One that comes later was sent after it, and shows
+        that the goodbye was forged, whatever number that had.
+        """
+        last = self.sequence
+        if self.leaving and now - self.heard >= limits.GOODBYE_LATE:
+            last = self.before_goodbye
+        return last is None or is_later(sequence, last)
 
     def update(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> None:
-        """Take over the content of a newer beacon; of a goodbye only its number."""
+        """Take over the content of a newer beacon; of a goodbye, which may be forged, only that it was said."""
         self.leaving = beacon.kind is BeaconKind.GOODBYE
-        self.sequence, self.heard = beacon.sequence, now
         if self.leaving:
+            self.before_goodbye, self.sequence = self.sequence, beacon.sequence
+            self.heard = now
             return
         self.identity = beacon.identity
+        self.sequence = beacon.sequence
         self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
+        self.heard = now
         self.doubted = False
         self.source = source
         self.heard_by = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
@@ -134,7 +146,7 @@ class Endpoint:
         if multicast:
             peer.multicast_at = now
         again = peer.leaving and beacon.kind is BeaconKind.GOODBYE  # one of an agent is its last beacon
-        if again or not peer.accepts(beacon.sequence):
+        if again or not peer.accepts(beacon.sequence, now):
             return EndpointChange.STALE
         previous, departed = peer.identity, peer.leaving
         peer.update(beacon, now, source, multicast=multicast)

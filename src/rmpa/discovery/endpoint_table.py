@@ -145,14 +145,19 @@ class EndpointTable:
         """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""
         return [self._all[place] for place in self._by_name.get(name, ())]
 
-    def oldest_unlinked(self) -> int | None:
-        """The place of the unlinked peer that has been silent for longest; one that never had a link comes first."""
+    def oldest_unlinked(self, silent_since: float | None = None) -> int | None:
+        """The place of the unlinked peer that has been silent for longest; one that never had a link comes first.
+
+        Args:
+            silent_since: Only one that never had a link, and was not heard since then.
+        """
         unlinked = [
             (peer is not None and peer.verified, peer.heard if peer is not None else float("-inf"), place)
             for place, peer in ((place, endpoint.current) for place, endpoint in self._all.items())
             if peer is None or not peer.linked
         ]
-        return min(unlinked)[2] if unlinked else None
+        had_link, heard, place = min(unlinked, default=(True, 0.0, None))
+        return None if silent_since is not None and (had_link or heard > silent_since) else place
 
     def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
         """Pairs of this endpoint's peer and each other live peer with its name, the newer peer first."""

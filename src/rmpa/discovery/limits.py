@@ -30,6 +30,9 @@ ADDRESS_SHARED_AFTER: Final = 5.0
 conflict."""
 ADDRESS_SHARED_MARGIN: Final = 1.0
 """Seconds after the end of a peer's link in which its beacon may still be one from before."""
+GOODBYE_LATE: Final = 0.2
+"""Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A
+beacon that comes later refutes the goodbye."""
 ANSWER_INTERVAL: Final = 0.2
 """The shortest time between two unicast answers to one address."""
 INTERFACE_SETTLE: Final = 0.2

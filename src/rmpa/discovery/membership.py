@@ -112,7 +112,7 @@ class MembershipProtocol:
         key = identity.guid.place
         endpoint = self._endpoints.get(key)
         if endpoint is None:
-            if self._endpoints.is_full:
+            if self._endpoints.is_full and not self._evict(now - limits.HEARTBEAT_LATE):
                 self.counters.add("roster.full")
                 return
             endpoint = self._endpoints.add(key, Endpoint())
@@ -456,9 +456,13 @@ class MembershipProtocol:
         if endpoint is not None and endpoint.current is None and not endpoint.others:
             self._endpoints.remove(key)
 
-    def _evict(self) -> bool:
-        """Make room for a linked peer: the unlinked one that has been silent for longest goes, if there is one."""
-        place = self._endpoints.oldest_unlinked()
+    def _evict(self, silent_since: float | None = None) -> bool:
+        """Make room for a linked peer: the unlinked one that has been silent for longest goes, if there is one.
+
+        Args:
+            silent_since: For a peer that is only heard: one goes that was never linked, and not heard since then.
+        """
+        place = self._endpoints.oldest_unlinked(silent_since)
         endpoint = self._endpoints.get(place) if place is not None else None
         if place is None or endpoint is None:
             return False
