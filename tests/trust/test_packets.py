@@ -149,18 +149,6 @@ def test_a_rotation_loses_no_packet() -> None:
         assert _verify(verifier, signed, now=float(now)).verdict is Verdict.ACCEPTED
 
 
-def test_a_module_that_was_away_is_recognised_at_a_low_rate() -> None:
-    verifier = PacketVerifier(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0))
-    signer = _signer(KEY)
-    verdicts = [
-        _verify(verifier, signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)).verdict
-        for _ in range(int(limits.OLD_KEY_PACKETS_RATE) + 2)
-    ]
-    assert verdicts == [Verdict.OLD_KEY] * int(limits.OLD_KEY_PACKETS_RATE) + [Verdict.LIMITED] * 2
-    later = signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
-    assert _verify(verifier, later, now=NOW + 1).verdict is Verdict.OLD_KEY
-
-
 def _numbered(signer: PacketSigner, number: int) -> bytes:
     """A packet of this number, which a module with the group key can make for any run."""
     signer._number = number - 1

@@ -42,11 +42,14 @@ revocation made signs at once."""
 KEY_OVERLAP: Final = 3600.0
 """The group key before verifies for this long after the next one began to sign, unless a revocation made that one."""
 OLD_KEYS_MAX: Final = 256
-"""Runs of modules with an older group key that are remembered; beyond it they are forgotten, and
+"""Runs, and addresses, of modules with an older group key that are remembered; beyond it they are forgotten, and
 heard again."""
 OLD_KEY_PACKETS_RATE: Final = 50.0
 """Packets a second with an older group key that are read, over all senders: each leads to one packet as an answer,
 0.2 ms in all."""
+OLD_KEY_PACKETS_PER_ADDRESS: Final = 5
+"""Such packets a second of one address, a tenth of all: one former member does not keep modules that were away from
+an answer. A module that starts announces itself four times; twenty on one machine have four heartbeats a second."""
 
 # --- joining ----------------------------------------------------------------------------------------------------
 TOKEN_SECRET_BYTES: Final = 16

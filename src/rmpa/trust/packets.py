@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.trust import limits
 from rmpa.trust.replay import Freshness, ReplayWindow
 
@@ -63,8 +62,6 @@ class Verdict(StrEnum):
     """It is older than the last packets of its run."""
     LEAP = "leap"
     """Its number is further ahead than its run can have come: a member claims the run of another one."""
-    LIMITED = "limited"
-    """It has an older group key, and too many such packets came."""
 
 
 _STALE: Final = {
@@ -130,7 +127,6 @@ class PacketVerifier:
         self._ring = ring
         self._window = ReplayWindow()
         self._old_window = ReplayWindow(limits.OLD_KEYS_MAX)  # so that old keys push no run out of the other one
-        self._old_keys = TokenBucket(limits.OLD_KEY_PACKETS_RATE, limits.OLD_KEY_PACKETS_RATE)
 
     def verify(
         self, data: bytes, purpose: KeyPurpose, run: tuple[int, int], now: float, wall: float | None
@@ -166,8 +162,6 @@ class PacketVerifier:
         freshness = window.take((key.number, data[slice(*run)]), number, now)
         if freshness is not Freshness.NEW:
             return Verification(_STALE[freshness])
-        if old and not self._old_keys.take(now):
-            return Verification(Verdict.LIMITED)
         return Verification(Verdict.OLD_KEY if old else Verdict.ACCEPTED, size, skew, short)
 
 

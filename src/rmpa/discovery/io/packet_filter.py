@@ -14,6 +14,7 @@ from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 from rmpa.discovery.strangers import Strangers
+from rmpa.trust import limits as trust_limits
 from rmpa.trust.keyring import KeyPurpose
 from rmpa.trust.packets import Verdict
 from rmpa.trust.reasons import TrustReason, not_of_this_mesh
@@ -50,6 +51,31 @@ class Recognised:
     key: int
 
 
+class AddressLimit:
+    """Allows each address so many packets in one second, and forgets the address that was silent for longest.
+
+    Args:
+        rate: Packets a second of one address.
+        addresses: How many are remembered.
+    """
+
+    def __init__(self, rate: int, addresses: int) -> None:
+        self._rate = rate
+        self._addresses = addresses
+        self._counts: OrderedDict[str, tuple[float, int]] = OrderedDict()
+
+    def take(self, host: str, now: float) -> bool:
+        """Count a packet; return whether it is allowed."""
+        since, count = self._counts.get(host, (now, 0))
+        if now - since >= 1.0:
+            since, count = now, 0
+        self._counts[host] = (since, count + 1)
+        self._counts.move_to_end(host)
+        if len(self._counts) > self._addresses:
+            self._counts.popitem(last=False)
+        return count < self._rate
+
+
 class PacketFilter:
     """Parses packets; those that are dropped are counted.
 
@@ -83,7 +109,9 @@ class PacketFilter:
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
         self._refusals = RefusalLog(_log, counters)
         self._recent: OrderedDict[bytes, None] = OrderedDict()
-        self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
+        self._sources = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
+        self._old_key_sources = AddressLimit(trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX)
+        self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
@@ -106,7 +134,7 @@ class PacketFilter:
             proof = self._verify(self._trust, data, host, now)
             if proof is None or proof.verdict is Verdict.OLD_KEY:
                 return self._recognise(data, proof.key) if proof is not None else None
-        if self._is_flood(host, now):
+        if not self._sources.take(host, now):
             self._refusals.refuse(
                 now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
             )
@@ -158,12 +186,16 @@ class PacketFilter:
             self._counters.add("beacon.malformed")
             return None
         found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
-        if found.verdict is Verdict.OLD_KEY:
-            self._counters.add("beacon.old_key")
-            return found
         if found.verdict is Verdict.ACCEPTED:
             return found
+        # One address must not use up what there is for all.
+        if found.verdict is Verdict.OLD_KEY and self._old_key_sources.take(host, now) and self._old_keys.take(now):
+            self._counters.add("beacon.old_key")
+            return found
         self.overrun = not self._unproved.take(now)
+        if found.verdict is Verdict.OLD_KEY:
+            self._counters.add("beacon.limited")
+            return None
         problem = _problem(found)
         beacon = self._stranger(data, now) if problem else None
         if beacon is not None and self.strangers.hear(beacon, problem, now):
@@ -198,16 +230,6 @@ class PacketFilter:
             rate, burst = limits.BEACONS_UNLINKED_PER_SECOND, limits.BEACONS_UNLINKED_BURST
             bucket = self._unlinked[interface] = TokenBucket(rate, burst)
         return bucket
-
-    def _is_flood(self, host: str, now: float) -> bool:
-        since, count = self._sources.get(host, (now, 0))
-        if now - since >= 1.0:
-            since, count = now, 0
-        self._sources[host] = (since, count + 1)
-        self._sources.move_to_end(host)
-        if len(self._sources) > limits.BEACON_SOURCES_MAX:
-            self._sources.popitem(last=False)
-        return count >= limits.BEACONS_PER_SOURCE
 
 
 def _problem(found: Verification) -> str:
