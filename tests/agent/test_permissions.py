@@ -189,13 +189,9 @@ async def test_parameters_are_read_and_set_only_with_permission(
                 return error.reason
 
         async def sets(key: str, value: XmlRpcValue) -> str:
-            steps = transfer.writing(key, serialize_response(value).decode(), 1)
+            args = {"key": key, "text": serialize_response(value).decode()}
             try:
-                question = next(steps)
-                while True:
-                    question = steps.send(await b.bridge.rpc.request(link, *question))
-            except StopIteration as done:
-                return f"set {done.value}"
+                return f"set {(await b.bridge.rpc.request(link, transfer.SET, args))['count']}"
             except PeerRefused as error:
                 return error.reason
 

@@ -80,28 +80,22 @@ def test_mistakes_change_nothing(place: Place, core: RosCore, words: tuple[str, 
 @pytest.fixture
 def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
     """A fake agent whose only peer, base, has these parameters."""
-    kept: dict[str, Any] = {"/speed": 1.5, "/big": "x" * (3 * limits.PARAM_PORTION)}
-    transfers = transfer.Transfers()
+    kept: dict[str, Any] = {"/speed": 1.5, "/big": "x" * (3 * limits.ASK_EXPRESS_MAX)}
 
     def ask(args: dict[str, object]) -> object:
         assert args["peer"] == "base"
-        inner = args["args"]
-        assert isinstance(inner, dict)
+        key = str(args.get("key"))
         match args["what"]:
-            case transfer.GET if inner["key"] not in kept:
-                raise PeerRefused("base", f"there is no parameter {inner['key']}")
+            case transfer.GET if key not in kept:
+                raise PeerRefused("base", f"there is no parameter {key}")
             case transfer.GET:
-                return transfers.answer(serialize_response(kept[inner["key"]]).decode(), 0.0)
+                return {"text": serialize_response(kept[key]).decode()}
             case transfer.NAMES:
-                return transfers.answer(serialize_response(list(kept)).decode(), 0.0)
-            case transfer.MORE:
-                return transfers.more(inner, 0.0)
-            case transfer.PUT:
-                return transfers.put(inner, 0.0)
+                return {"text": serialize_response(list(kept)).decode()}
             case transfer.SET:
-                kept[inner["key"]] = parse_response(transfers.written(inner, 0.0).encode())
+                kept[key] = parse_response(transfer.text_of(args).encode())
                 return {"count": 1}
-        del kept[inner["key"]]
+        del kept[key]
         return {}
 
     rows = (

@@ -76,17 +76,17 @@ ASKS_AT_ONCE: Final = 64
 """Requests of one peer that are being answered; further ones are refused at once."""
 ASK_TIMEOUT: Final = 5.0
 """Seconds that another agent has to answer a request."""
-PARAM_PORTION: Final = 16 * KIB
-"""Characters of a parameter that cross in one message: a millisecond on a 100 Mbit/s link. The next portion is
-requested when this one has arrived, so commands do not wait for megabytes to pass."""
+ASK_EXPRESS_MAX: Final = 16 * KIB
+"""Bytes of a request or response, or characters of the text in one, that take the control lane: a millisecond on a
+100 Mbit/s link. Larger ones take the bulk lane, so commands do not wait for megabytes to pass."""
+ASK_BYTES_MAX: Final = 17 * MIB
+"""Bytes of one request or response: the text of a parameter, and what is around it."""
+ASK_BYTES: Final = 64 * MIB
+"""Bytes of large requests and responses on one link that wait, are reassembled or are answered, each way: four of the
+largest parameters."""
 PARAM_TEXT_MAX: Final = 16 * MIB
 """Characters of a parameter, as XML-RPC text, that may cross between modules; within one module ``HTTP_BODY_MAX``
-holds. A peer may read and write ``PARAM_TRANSFERS`` of these at a time: 128 MiB."""
-PARAM_TRANSFERS: Final = 4
-"""Parameters that one peer may read in portions at a time, and as many that it may write; a further one makes the
-oldest be given up."""
-PARAM_TRANSFER_IDLE: Final = 30.0
-"""Seconds without a further portion after which a parameter's transfer may be dropped."""
+holds."""
 PARAMS_SET_MAX: Final = 10_000
 """Parameters in one value that a peer sets: each takes the core some 0.25 ms, between data; a large robot has some
 thousand in all."""

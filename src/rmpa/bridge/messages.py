@@ -359,6 +359,26 @@ def encode(message: Message) -> bytes:
     return _ENCODER.encode(message)
 
 
+def without_text(fields: Any) -> tuple[Any, bytes]:
+    """Arguments, or a value, without their ``text`` if that is long; and that text."""
+    text = fields.get("text") if isinstance(fields, dict) else None
+    if not isinstance(text, str) or len(text) <= limits.ASK_EXPRESS_MAX:
+        return fields, b""
+    return {name: value for name, value in fields.items() if name != "text"}, text.encode()
+
+
+def with_text(fields: Any, text: bytes | memoryview) -> None:
+    """Put a text that came behind its JSON into arguments, or a value.
+
+    Raises:
+        RemoteProtocolError: It is none, or does not belong there.
+    """
+    try:
+        fields["text"] = str(text, "utf-8")
+    except (UnicodeDecodeError, TypeError) as error:
+        raise RemoteProtocolError(f"a text behind its message: {error}") from None
+
+
 def op_of(payload: bytes | bytearray | memoryview) -> str:
     """The kind of a control message, without parsing it; empty if its text does not begin with ``op``.
 

@@ -53,8 +53,6 @@ SITE_PARAMS_AT_ONCE: Final = 256
 """Questions of other sites about parameters that are answered at once."""
 SITE_PARAM_BYTES_MAX: Final = 64 * MIB
 """Bytes of one question or answer about parameters between gateways: some of the largest values."""
-SITE_PARAM_TRANSFERS_MAX: Final = 64
-"""Modules here that read or write parameters of other sites in portions at once; of each ``PARAM_TRANSFERS`` hold."""
 SITE_PARAM_TIMEOUT: Final = 20.0
 """Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 SITE_NAME_MAX: Final = 63

@@ -5,6 +5,9 @@
     {"op": "ping", "args": {"peer": "base", "count": 1}}
     {"ok": true, "value": {"times": [0.0004], "remote": "10.0.0.2:40001"}}
     {"ok": false, "error": "no peer named 'bse'", "remedy": "did you mean base?"}
+
+A long ``text`` in the arguments or the value is not part of the JSON, whose reading would delay data: ``follows`` has
+the number of its bytes, and they follow the line.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
+from rmpa.bridge.messages import without_text
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.observe import limits
 from rmpa.observe.json_pieces import json_pieces
@@ -38,16 +42,18 @@ def _parse(line: bytes, type_: type[_T], what: str, most: int) -> _T:
         raise RemoteProtocolError(f"not a {what}: {error}") from None
 
 
-class ControlRequest(msgspec.Struct, frozen=True):
+class ControlRequest(msgspec.Struct, frozen=True, omit_defaults=True):
     """A client's request.
 
     Attributes:
         op: The name of an operation (``control_operations.REPLIES``).
         args: Its arguments, by name.
+        follows: Bytes of the argument ``text`` that follow the line.
     """
 
     op: str
     args: dict[str, object] = {}
+    follows: int = 0
 
     @classmethod
     def parse(cls, line: bytes) -> ControlRequest:
@@ -60,7 +66,8 @@ class ControlRequest(msgspec.Struct, frozen=True):
 
     def serialize(self) -> bytes:
         """One line."""
-        return msgspec.json.encode(self) + b"\n"
+        args, text = without_text(self.args)
+        return msgspec.json.encode(msgspec.structs.replace(self, args=args, follows=len(text))) + b"\n" + text
 
     def __str__(self) -> str:
         """The op and the names of its arguments, safe to log."""
@@ -76,12 +83,14 @@ class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
         value: Anything that JSON can hold.
         error: What happened.
         remedy: What to do; may be empty.
+        follows: Bytes of the value's ``text`` that follow the line.
     """
 
     ok: bool
     value: Any = None  # the edge: each operation has its own type, and its caller converts the value
     error: str = ""
     remedy: str = ""
+    follows: int = 0
 
     @classmethod
     def parse(cls, line: bytes) -> ControlReply:
@@ -102,7 +111,9 @@ class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
             LocalProtocolError: The value is something that JSON cannot hold, or too large.
         """
         try:
-            line = b"".join((*yielder(json_pieces(self)), b"\n"))
+            value, text = without_text(self.value)
+            reply = msgspec.structs.replace(self, value=value, follows=len(text))
+            line = b"".join((*yielder(json_pieces(reply)), b"\n", text))
         except (TypeError, ValueError, RecursionError) as error:
             raise LocalProtocolError(f"a handler's value is not JSON: {error}") from None
         if len(line) > limits.CONTROL_REPLY_MAX:

@@ -12,6 +12,8 @@ from rmpa.core.sizes import MIB
 # --- control socket, snapshot, /diagnostics ------------------------------------------------------------------------
 CONTROL_REQUEST_MAX: Final = 1 * MIB
 """Bytes of one request; the longest request names the topics that a client wants."""
+CONTROL_TEXT_BYTES_MAX: Final = 17 * MIB
+"""Bytes of a text that follows a request: a parameter."""
 CONTROL_REPLY_MAX: Final = 64 * MIB
 """Bytes of one reply: the snapshot of a very large graph."""
 CONTROL_CLIENTS_MAX: Final = 32

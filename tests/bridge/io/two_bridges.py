@@ -306,12 +306,12 @@ class World:
                 assert not topics.flows
                 assert not topics._latest
                 assert not topics._watches
-                assert not attached.handlers
+                assert not any(attached.handlers), "but route 0, which every link has"
         for end in self._ends:
             for lane in (end.express, end.bulk):
                 assert lane.outbox.pending_bytes == 0
                 assert not lane._open
-                assert not lane.outbox._own_bounds
+                assert not any(lane.outbox._own_bounds), "likewise"
 
 
 @contextmanager

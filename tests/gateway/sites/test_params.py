@@ -38,22 +38,17 @@ class ArmParams:
     def __init__(self) -> None:
         self.values: dict[str, Any] = {"/speed": 1.5, "/gains": {"p": 1, "i": 2}, "/big": "x" * 100_000}
         self.there = True
-        self.transfers = transfer.Transfers()
 
     async def ask(self, module: str, what: str, args: dict[str, Any]) -> object:
         if not self.there or module != "arm":
             raise UnreachableError("linked peer", repr(module))
         if what == transfer.GET:
-            return self.transfers.answer(serialize_response(self._get(args["key"])).decode(), 0.0)
+            return {"text": serialize_response(self._get(args["key"])).decode()}
         if what == transfer.NAMES:
             names = [name for key, value in self.values.items() for name, _ in leaves(key, value)]
-            return self.transfers.answer(serialize_response(names).decode(), 0.0)
-        if what == transfer.MORE:
-            return self.transfers.more(args, 0.0)
-        if what == transfer.PUT:
-            return self.transfers.put(args, 0.0)
+            return {"text": serialize_response(names).decode()}
         if what == transfer.SET:
-            self.values[args["key"]] = parse_response(self.transfers.written(args, 0.0).encode())
+            self.values[args["key"]] = parse_response(args["text"].encode())
             return {"count": 1}
         self._get(args["key"])
         del self.values[args["key"]]
@@ -78,19 +73,17 @@ class ParamSites:
     def _why_not(self, asker: SiteAsker, module: str, name: str, told: str) -> str:
         return f"a rule keeps {told} of {module} from {asker.site}" if name in self.denied else ""
 
-    async def drive(self, steps: Any) -> Any:
-        try:
-            question = next(steps)
-            while True:
-                question = steps.send(await self.imports.ask("desk", "warehouse", "arm", *question))
-        except StopIteration as done:
-            return done.value
+    async def ask(self, what: str, **args: str) -> Any:
+        return await self.imports.ask("desk", "warehouse", "arm", what, args)
 
     async def get(self, key: str) -> Any:
-        return parse_response((await self.drive(transfer.reading(transfer.GET, {"key": key}))).encode())
+        return parse_response((await self.ask(transfer.GET, key=key))["text"].encode())
+
+    async def names(self) -> Any:
+        return parse_response((await self.ask(transfer.NAMES))["text"].encode())
 
     async def set(self, key: str, value: Any) -> Any:
-        return await self.drive(transfer.writing(key, serialize_response(value).decode(), 7))
+        return (await self.ask(transfer.SET, key=key, text=serialize_response(value).decode()))["count"]
 
 
 @pytest.fixture
@@ -106,11 +99,11 @@ async def test_parameters_of_another_site_are_read_and_written_also_large_ones(s
     assert await sites.get("/big") == "x" * 100_000
     assert await sites.set("/speed", 2.5) == 1
     assert sites.arm.values["/speed"] == 2.5
-    large = "y" * (5 * bridge_limits.PARAM_PORTION)
+    large = "y" * (5 * bridge_limits.ASK_EXPRESS_MAX)
     assert await sites.set("/big", large) == 1
     assert sites.arm.values["/big"] == large
-    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
-    assert parse_response(names.encode()) == ["/speed", "/gains/p", "/gains/i", "/big"]
+    names = await sites.names()
+    assert names == ["/speed", "/gains/p", "/gains/i", "/big"]
     assert await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"}) == {}
     assert "/speed" not in sites.arm.values
 
@@ -134,8 +127,8 @@ async def test_a_rule_of_the_gateway_keeps_parameters_home_also_within_a_namespa
     with pytest.raises(PeerRefused, match="a rule keeps"):
         await sites.set("/gains", {"p": 5})
     assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
-    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
-    assert parse_response(names.encode()) == ["/gains/i", "/big"]
+    names = await sites.names()
+    assert names == ["/gains/i", "/big"]
 
 
 async def test_a_program_reads_and_sets_them_as_json(sites: ParamSites) -> None:
@@ -231,8 +224,8 @@ async def test_a_module_here_gets_what_it_may_have_by_this_gateways_permissions_
         with pytest.raises(PeerRefused, match="desk may not have"):
             await sites.set(key, 5)
     assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
-    names = await sites.drive(transfer.reading(transfer.NAMES, {}))
-    assert parse_response(names.encode()) == ["/speed", "/gains/p", "/big"]
+    names = await sites.names()
+    assert names == ["/speed", "/gains/p", "/big"]
     answer = await sites.imports.ask("", "warehouse", "arm", transfer.GET, {"key": "/gains"})
     assert "p" in cast("Any", answer)["text"], "this machine's user"
 
@@ -248,27 +241,11 @@ async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSit
     sites.exports._ask = ask
     await sites.get("/speed")
     await sites.set("/speed", 2)
-    await sites.drive(transfer.reading(transfer.NAMES, {}))
+    await sites.names()
     await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"})
     assert {(site, tuple(askers)) for _, site, askers in asked} == {("office", ("desk",))}
     await sites.session.get("rmpa/1/warehouse/arm/p/gains")
     assert asked[-1] == (transfer.GET, "", [])
-
-
-async def test_no_module_reads_or_replaces_what_another_one_transfers(sites: ParamSites) -> None:
-    def ask(asker: str, what: str, args: dict[str, Any]) -> Any:
-        return sites.imports.ask(asker, "warehouse", "arm", what, args)
-
-    reading = (await ask("desk", transfer.GET, {"key": "/big"}))["reading"]
-    await ask("desk", transfer.PUT, {"writing": 7, "offset": 0, "text": "x"})
-    for what, args in (
-        (transfer.MORE, {"reading": reading, "offset": 0}),
-        (transfer.PUT, {"writing": 7, "offset": 1, "text": "y"}),
-        (transfer.SET, {"key": "/speed", "writing": 7, "size": 1}),
-    ):
-        with pytest.raises(RemoteProtocolError, match="given up"):
-            await ask("thief", what, args)
-    assert await ask("desk", transfer.PUT, {"writing": 7, "offset": 1, "text": "z"}) == {"size": 2}
 
 
 async def test_the_own_sites_modules_are_asked_by_themselves(sites: ParamSites) -> None:

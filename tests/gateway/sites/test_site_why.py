@@ -225,15 +225,14 @@ async def test_questions_are_checked_before_they_are_passed_on() -> None:
         hall = await asked(bed, "hall")
         for what, args in (
             ("site.shout", {"site": "hall", "module": "arm"}),
-            (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get", "args": {}}),
-            (PARAM, {"site": "hall", "module": "*", "what": "param.get", "args": {}}),
-            (PARAM, {"site": "hall", "module": "arm", "what": "param.get"}),
+            (PARAM, {"site": "ha ll", "module": "arm", "what": "param.get"}),
+            (PARAM, {"site": "hall", "module": "*", "what": "param.get"}),
         ):
             with pytest.raises(RmpaError):
                 await hall.answers.answer(what, args)
         assert hall.params == []
-        question = {"site": "hall", "module": "arm", "what": "param.get", "args": {"key": "/x"}}
-        assert await hall.answers.answer(PARAM, question) == {"key": "/x"}
+        question = {"site": "hall", "module": "arm", "what": "param.get", "key": "/x"}
+        assert await hall.answers.answer(PARAM, question) == question
         assert hall.params == [("hall", "arm", "param.get")]
 
 

@@ -122,7 +122,8 @@ class Followed:
         text: The owner's value as XML-RPC text; ``None`` if the owner has none, or it is unknown.
         known: Whether the owner's value, or its absence, is known.
         had: Whether this run of the owner has had a value. Before that, an absent value does not delete the one here.
-        ask: Whether the value is to be requested, because it is larger than a portion.
+        news: How often the owner has told of it.
+        ask: Whether the value is to be requested, because it was too large to be told.
         due: Whether the local core is to be compared with the owner's value, and set.
         doubted: Whether the local core has reported a change of it since the last comparison.
         problem: Why it is not followed, or empty.
@@ -134,6 +135,7 @@ class Followed:
     text: str | None = None
     known: bool = False
     had: bool = False
+    news: int = 0
     ask: bool = False
     due: bool = False
     doubted: bool = False
@@ -220,6 +222,7 @@ class Following:
         """
         found = [entry for entry in self._entries.values() if entry.peer == peer and entry.rule.key == key]
         for entry in found:
+            entry.news += 1
             if exists and text is None:
                 entry.ask = True
             else:

@@ -221,7 +221,7 @@ class PeerSessions:
 
     def _depends(self, session: PeerSession) -> bool:
         """Whether anything of this module needs to know within a second that a peer is gone."""
-        return bool(session.handlers) or any(part.depends(session) for part in self._parts)
+        return any(session.handlers) or any(part.depends(session) for part in self._parts)
 
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""

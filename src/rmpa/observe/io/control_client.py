@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from rmpa.bridge.messages import with_text
 from rmpa.config.module_name import NameFacts, running_agent
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.sizes import KIB
@@ -19,7 +20,7 @@ from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs
 from rmpa.observe.snapshot import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -54,7 +55,7 @@ class ControlClient:
         except OSError:
             self._sock.close()
             raise UnreachableError("agent", str(path), _START_ONE) from None
-        self._rest = b""
+        self._file = self._sock.makefile("rb", 256 * KIB)
 
     @property
     def name(self) -> str:
@@ -71,6 +72,7 @@ class ControlClient:
 
     def close(self) -> None:
         """Close the connection."""
+        self._file.close()
         self._sock.close()
 
     def call(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
@@ -107,9 +109,20 @@ class ControlClient:
         return self.snapshot(topics=(), peers=False).agent
 
     def _exchange(self, op: str, args: dict[str, object]) -> bytes:
-        try:
+        def exchange() -> bytes:
             self._sock.sendall(ControlRequest(op, args).serialize())
-            return self._line()
+            return self._file.readline(limits.CONTROL_REPLY_MAX + 1)
+
+        line = self._received(exchange)
+        if line.endswith(b"\n"):
+            return line[:-1]
+        if len(line) > limits.CONTROL_REPLY_MAX:
+            raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
+        raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
+
+    def _received(self, receive: Callable[[], bytes]) -> bytes:
+        try:
+            return receive()
         except TimeoutError:
             raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
         except OSError as error:
@@ -119,26 +132,14 @@ class ControlClient:
         reply = ControlReply.parse(line)
         if not reply.ok:
             raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)
+        if reply.follows:
+            with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
         try:
             return msgspec.convert(reply.value, type)
         except msgspec.ValidationError as error:
             raise RemoteProtocolError(
                 f"agent {self.name} answers {op} in another way: {error}; is it older?"
             ) from None
-
-    def _line(self) -> bytes:
-        parts = [self._rest]
-        size = len(self._rest)
-        while b"\n" not in parts[-1]:
-            part = self._sock.recv(256 * KIB)
-            if not part:
-                raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
-            parts.append(part)
-            size += len(part)
-            if size > limits.CONTROL_REPLY_MAX:
-                raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
-        line, _, self._rest = b"".join(parts).partition(b"\n")
-        return line
 
 
 @dataclass(frozen=True, slots=True)

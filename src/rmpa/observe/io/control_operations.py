@@ -107,17 +107,15 @@ class ControlOperations:
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
 
     async def param(self, args: Args) -> Any:
-        """Pass a request about parameters on to a peer: ``peer``, ``what`` and the ``args`` of that request.
+        """Pass a request about parameters on to a peer: ``peer``, ``what``, and ``key`` and ``text`` of that request.
 
         A peer ``site/module`` is a module of another site, which a gateway asks.
         """
-        what, inner = _request(args, PARAM_REQUESTS), args.get("args")
-        if not isinstance(inner, dict):
-            raise ConfigError("args", f"{inner!r} is no table")
+        what = _request(args, PARAM_REQUESTS)
+        inner: Args = {name: args[name] for name in ("key", "text") if name in args}
         if "/" in (peer := str(args.get("peer", ""))):
             site, module = read_site_module(peer)
-            asked = {"site": site, "module": module, "what": what, "args": inner}
-            return await self._sites.one(SITE_PARAM, asked)
+            return await self._sites.one(SITE_PARAM, {"site": site, "module": module, "what": what, **inner})
         session = self._session(args.get("peer", ""))
         return await self._bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 

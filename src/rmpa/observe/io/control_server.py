@@ -12,9 +12,10 @@ import socket
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.messages import with_text
 from rmpa.config.values import did_you_mean
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError, StartError
 from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.io.peer_credentials import ControlAccess, peer_credentials
@@ -189,7 +190,11 @@ class ControlServer:
         try:
             async with asyncio.timeout(limits.CONTROL_IDLE_TIMEOUT):
                 line = await reader.readuntil(b"\n")
-            request = ControlRequest.parse(line)
+                request = ControlRequest.parse(line)
+                if not 0 <= request.follows <= limits.CONTROL_TEXT_BYTES_MAX:
+                    raise LimitExceeded("a text of a control request", request.follows, limits.CONTROL_TEXT_BYTES_MAX)
+                if request.follows:
+                    with_text(request.args, await reader.readexactly(request.follows))
         except asyncio.LimitOverrunError:
             self._refuse("control.refused", f"a control request of more than {limits.CONTROL_REQUEST_MAX} bytes")
             await self._send(writer, ControlReply(ok=False, error=f"more than {limits.CONTROL_REQUEST_MAX} bytes"))

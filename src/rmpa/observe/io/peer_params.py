@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import secrets
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
@@ -13,8 +13,6 @@ from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
-
     from rmpa.observe.io.control_client import ControlClient
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -57,40 +55,33 @@ class PeerParams:
         Raises:
             RmpaError: There is none, or the peer does not answer or refuses.
         """
-        return self._value(transfer.GET, {"key": key})
+        return self._value(transfer.GET, key=key)
 
     def names(self) -> list[str]:
         """The names of all parameters that may be read, in order; errors as for ``get``."""
-        value = self._value(transfer.NAMES, {})
+        value = self._value(transfer.NAMES)
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
         """Set a parameter, or each member of a namespace; return the number. Errors as for ``get``."""
         parameters_in(key, value)
         try:
-            text = serialize_response(value).decode()
+            text = serialize_response(value)
         except LocalProtocolError as error:
             raise RmpaError(f"{key}: {error}") from None
-        return int(self._drive(transfer.writing(key, text, secrets.randbits(31))))
+        if len(text) > bridge_limits.PARAM_TEXT_MAX:
+            raise RmpaError(transfer.too_large(key, len(text)))
+        return transfer.count_of(self._ask(transfer.SET, key=key, text=text.decode()))
 
     def delete(self, key: str) -> None:
         """Delete a parameter or namespace; errors as for ``get``."""
-        self._ask((transfer.DELETE, {"key": key}))
+        self._ask(transfer.DELETE, key=key)
 
-    def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:
-        return parse_response(self._drive(transfer.reading(what, args)).encode())
+    def _value(self, what: str, **args: str) -> XmlRpcValue:
+        return parse_response(transfer.text_of(self._ask(what, **args)).encode())
 
-    def _drive(self, steps: Generator[transfer.Question, object, Any]) -> Any:
+    def _ask(self, what: str, **args: str) -> object:
         try:
-            question = next(steps)
-            while True:
-                question = steps.send(self._ask(question))
-        except StopIteration as done:
-            return done.value
-
-    def _ask(self, question: transfer.Question) -> object:
-        what, args = question
-        try:
-            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
+            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, **args)
         except PeerRefused as error:
             raise RmpaError(error.reason) from None  # this agent only passes on the answer of the peer's agent

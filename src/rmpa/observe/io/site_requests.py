@@ -23,7 +23,7 @@ REPORT: Final = "site.report"
 INFO: Final = "site.info"
 """The request for a ``SitesReport`` of one site with its sources: ``{site}``."""
 PARAM: Final = "site.param"
-"""A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, args}``."""
+"""A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, key, text}``."""
 WHY: Final = "site.why"
 """The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
 _ALL: Final = (REPORT, WHY)

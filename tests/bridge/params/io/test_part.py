@@ -11,17 +11,19 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
+from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.messages import decode
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
 from rmpa.bridge.params.io.part import Params
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
-from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.effects import ParamUpdate
 from rmpa.ros.master.master_api import MasterApi
+from tests.bridge.services.io.test_calls import Wire
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -96,20 +98,20 @@ class Side:
 
     def link(self, other: Side, number: int) -> PeerSession:
         def send(payload: bytes) -> None:
-            assert len(payload) < 2 * limits.PARAM_PORTION + 1000
+            assert len(payload) < 2 * limits.ASK_EXPRESS_MAX + 1000
             back = other.links.get(number)
             if back is not None:
                 asyncio.get_running_loop().call_soon(other.asks.message, back, decode(payload))
 
+        wire = Wire()
+        wire.name, wire.send_control = other.name, send
         attached = cast(
-            "PeerSession",
-            SimpleNamespace(
-                peer=number,
-                linked=True,
-                link=SimpleNamespace(name=other.name, send_control=send, abandoned=False),
-            ),
+            "PeerSession", SimpleNamespace(peer=number, linked=True, link=wire, handlers={}, time=LinkTime())
         )
         self.links[number] = attached
+        self.asks.link_up(attached)
+        if (back := other.links.get(number)) is not None:
+            wire.takers, cast("Any", back.link).takers = cast("Any", back.handlers), attached.handlers
         return attached
 
     def up(self, number: int) -> None:
@@ -130,14 +132,6 @@ class Side:
 
     async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
         return await self.asks.request(self.links[number], what, args)
-
-    async def drive(self, steps: Any) -> Any:
-        try:
-            question = next(steps)
-            while True:
-                question = steps.send(await self.ask(*question))
-        except StopIteration as done:
-            return done.value
 
     async def close(self) -> None:
         await self.asks.close()
@@ -167,7 +161,7 @@ ARM = FollowRule("/arm", "base", "/arm")
 
 @pytest.fixture
 async def sides(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(limits, "PARAM_PORTION", 1000)
+    monkeypatch.setattr(limits, "ASK_EXPRESS_MAX", 1000)
     monkeypatch.setattr(limits, "PARAM_SMALL", 4000)
     monkeypatch.setattr(limits, "PARAM_GATHER", 0.002)
     made: list[Side] = []
@@ -213,10 +207,10 @@ async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(
         text = await write_text("", {"deep": {f"p{number}": number for number in range(count)}})
         if count > 100:
             with pytest.raises(PeerRefused, match="/many has more than 100 parameters: set its parts one by one"):
-                await pad.drive(transfer.writing("/many", text, 7))
+                await pad.ask(transfer.SET, {"key": "/many", "text": text})
             assert base.core.get("/many") is None
         else:
-            assert await pad.drive(transfer.writing("/many", text, 7)) == 100
+            assert await pad.ask(transfer.SET, {"key": "/many", "text": text}) == {"count": 100}
 
 
 async def test_get_set_list_delete(sides: Any) -> None:
@@ -226,11 +220,11 @@ async def test_get_set_list_delete(sides: Any) -> None:
     join(base, pad)
     base.core.set("/open", {"a": 1, "b": "x" * 5000})
     base.core.set("/closed", 1)
-    text = await pad.drive(transfer.reading(transfer.GET, {"key": "/open"}))
-    assert await read_text(text) == {"a": 1, "b": "x" * 5000}
-    assert await read_text(await pad.drive(transfer.reading(transfer.NAMES, {}))) == ["/open/a", "/open/b"]
+    answer = await pad.ask(transfer.GET, {"key": "/open"})
+    assert await read_text(answer["text"]) == {"a": 1, "b": "x" * 5000}
+    assert await read_text((await pad.ask(transfer.NAMES, {}))["text"]) == ["/open/a", "/open/b"]
     large = await write_text("", {"c": "y" * 9000, "d": {"e": True}})
-    assert await pad.drive(transfer.writing("/open", large, 7)) == 2
+    assert await pad.ask(transfer.SET, {"key": "/open", "text": large}) == {"count": 2}
     assert base.core.get("/open") == {"a": 1, "b": "x" * 5000, "c": "y" * 9000, "d": {"e": True}}
     await pad.ask(transfer.DELETE, {"key": "/open/d"})
     assert base.core.get("/open/d") is None
@@ -248,11 +242,8 @@ async def test_get_set_list_delete(sides: Any) -> None:
         (transfer.SET, {"key": "/open/x", "text": nil}, "nil"),
         (transfer.SET, {"key": "/open//x", "text": nil}, "not a parameter's name"),
         (transfer.SET, {"key": "/run_id", "text": "x"}, "malformed XML"),
-        (transfer.SET, {"key": "/open/x", "text": "x" * 2000}, "longer than a portion"),
-        (transfer.SET, {"key": "/open/x", "writing": 99, "size": 1}, "given up"),
-        (transfer.PUT, {"writing": 1, "offset": 5, "text": "x"}, "given up"),
-        (transfer.PUT, {"writing": -1, "offset": 0, "text": "x"}, "not a whole number"),
-        (transfer.MORE, {"reading": 99, "offset": 0}, "given up"),
+        (transfer.SET, {"key": "/open/x", "text": "x" * 2000}, "malformed XML"),
+        (transfer.SET, {"key": "/open/x"}, "text of a parameter's value is missing"),
         (transfer.DELETE, {"key": "/open/nothing"}, "no parameter /open/nothing"),
         (transfer.DELETE, {"key": "/"}, "the root holds every parameter"),
         (transfer.FOLLOW, {"keys": "x"}, "not a list"),
@@ -262,6 +253,85 @@ async def test_get_set_list_delete(sides: Any) -> None:
     assert base.core.get("/") == before, "nothing is set in part"
 
 
+def large_set(text: str) -> dict[str, Any]:
+    return {"key": "/x", "text": f"<?xml version='1.0'?>{' ' * 20_000}" + text.partition("?>")[2]}
+
+
+async def owner_and_peer(sides: Any) -> tuple[Side, Side, dict[str, Any]]:
+    base, pad = Side("base", ParamSettings(remote_get=("/**",), remote_set=("/**",))), Side("pad")
+    sides(base, pad)
+    join(base, pad)
+    return base, pad, large_set(await write_text("", "y"))
+
+
+async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set(sides: Any) -> None:
+    base, pad, args = await owner_and_peer(sides)
+    base.links[1].time.set(60.0, 0.001)  # by the peer's clock it is a minute later
+    with pytest.raises(PeerRefused, match=r"came \d\d.\d s after the asking agent had given it up"):
+        await pad.ask(transfer.SET, args)
+    assert base.core.get("/x") is None
+    assert base.counters["ask.late"] == 1
+    base.links[1].time.set(60.0, 61.0)  # perhaps not
+    assert await pad.ask(transfer.SET, args) == {"count": 1}
+
+
+async def test_large_messages_are_bounded(sides: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    base, pad, args = await owner_and_peer(sides)
+    base.asks._large[1]._budget.limit = pad.asks._large[1].outgoing.limit = 30_000
+    entered, leave = asyncio.Event(), asyncio.Event()
+
+    async def hold(_session: PeerSession, _args: dict[str, Any]) -> object:
+        entered.set()
+        await leave.wait()
+        return {"text": "z" * 40_000}
+
+    base.asks.on_request("hold", hold, Needs((), ""))
+    held = asyncio.create_task(pad.ask("hold", args))
+    await entered.wait()
+    with pytest.raises(PeerRefused, match="too many large questions at once"):
+        await pad.ask(transfer.SET, args)
+    with pytest.raises(PeerRefused, match="the question was lost: large calls hold"):
+        await pad.ask(transfer.SET, args | {"text": args["text"] * 10})
+    monkeypatch.setattr(limits, "ASK_BYTES_MAX", 30_000)
+    with pytest.raises(LimitExceeded, match="message between agents"):
+        await pad.ask(transfer.SET, args | {"text": args["text"] * 2})
+    leave.set()
+    with pytest.raises(PeerRefused, match="the answer cannot be sent: message between agents"):
+        await held
+    assert await pad.ask(transfer.SET, args) == {"count": 1}, "what was answered counts no more"
+    assert base.asks._large[1]._budget.used == pad.asks._large[1].outgoing.used == 0
+
+
+async def test_a_large_value_does_not_replace_one_that_was_told_after_it(sides: Any) -> None:
+    base, pad = Side("base", ParamSettings(remote_get=("/**",))), Side("pad", follows(DESCRIPTION))
+    sides(base, pad)
+    base.core.set("/robot_description", "x" * 20_000)
+    pad.link(base, 1)
+    base.link(pad, 1)
+    lane = cast("Any", base.links[1].link).bulk
+    lane.slow = True
+    pad.up(1)
+    base.up(1)
+    await until(lambda: lane.kept)
+    base.core.set("/robot_description", "small")
+    await until(lambda: next(iter(pad.params.followed)).known)
+    for deliver in lane.kept:
+        deliver()
+    await until(lambda: not pad.params._follower._working)
+    assert pad.core.get("/base/robot_description") == "small"
+
+
+async def test_a_lost_lane_fails_what_waits(sides: Any) -> None:
+    base, pad, args = await owner_and_peer(sides)
+    cast("Any", pad.links[1].link).bulk.slow = True
+    asked = asyncio.create_task(pad.ask(transfer.SET, args))
+    await until(lambda: pad.asks._waiting)
+    pad.asks.lane_lost(pad.links[1])
+    with pytest.raises(UnreachableError, match="its connection for large messages has just ended"):
+        await asked
+    assert base.core.get("/x") is None
+
+
 async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
     sides(base, pad)
@@ -269,7 +339,7 @@ async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
     assert pad.core.get("/robot_description") is None
-    base.core.set("/robot_description", "two" * 3000)  # in portions
+    base.core.set("/robot_description", "two" * 3000)  # not told: asked for
     await until(lambda: pad.core.get("/base/robot_description") == "two" * 3000)
     base.core.set("/arm", {"p": 1, "q": {"r": 2.5}})
     await until(lambda: pad.core.get("/arm") == {"p": 1, "q": {"r": 2.5}})

@@ -180,7 +180,6 @@ class ParamFollower:
         key, exists, text, refused = (args.get(name) for name in ("key", "exists", "text", "refused"))
         if not isinstance(key, str) or not (text is None or isinstance(text, str)):
             raise RemoteProtocolError("news of a parameter without its key, or with a value that is no text")
-        transfer.check_size(len(text or ""))
         if refused is not None:
             for entry in self.following:
                 if entry.peer == session.peer and entry.rule.key == key:
@@ -221,18 +220,14 @@ class ParamFollower:
         entry.ask = False
         if session is None:
             return
-        steps = transfer.reading(transfer.GET, {"key": entry.rule.key})
-        text = ""
+        args, news = {"key": entry.rule.key}, entry.news
         try:
-            question = next(steps)
-            while True:
-                question = steps.send(await self._rpc.request(session, *question, limits.PARAM_ASK_TIMEOUT))
-        except StopIteration as done:
-            text = done.value
+            answer = await self._rpc.request(session, transfer.GET, args, limits.PARAM_ASK_TIMEOUT)
+            text = transfer.text_of(answer)
         except RmpaError:
             entry.ask = entry.peer is not None  # if its owner has deleted it meanwhile, a notification follows
             raise
-        if entry.ask or entry.peer != session.peer:
+        if entry.news != news or entry.peer != session.peer:
             return  # it has changed again since
         learn(entry, text)
 

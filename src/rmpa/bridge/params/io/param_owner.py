@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -36,7 +35,6 @@ _log = logging.getLogger(__name__)
 
 _EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
 _LISTED: Final = Needs((Access.PARAM,), "each parameter; others are left out")
-_PORTION: Final = Needs((), "portions of the peer's own requests")
 _FOLLOWED: Final = Needs((Access.PARAM,), "each parameter, and again at each change")
 
 
@@ -98,7 +96,6 @@ class ParamOwner:
         self.followed_max = followed_max
         self.policy = policy
         self._rpc = rpc
-        self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
         self._followers: dict[int, tuple[PeerSession, set[str]]] = {}
         self._last: dict[str, str | None] = {}
         """The text that was last sent of each followed key: ``None`` if there was no value, empty if it is above
@@ -108,8 +105,6 @@ class ParamOwner:
         self._telling: asyncio.Task[None] | None = None
         rpc.on_request(transfer.GET, self._get, _EACH)
         rpc.on_request(transfer.NAMES, self._names, _LISTED)
-        rpc.on_request(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()), _PORTION)
-        rpc.on_request(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()), _PORTION)
         rpc.on_request(transfer.SET, self._set, _EACH)
         rpc.on_request(transfer.DELETE, self._delete, _EACH)
         rpc.on_request(transfer.FOLLOW, self._follow, _FOLLOWED)
@@ -117,8 +112,7 @@ class ParamOwner:
     # --- events from the part ------------------------------------------------------------------------------------
 
     def link_down(self, peer: int) -> None:
-        """Forget what a peer follows and transfers."""
-        self._transfers.pop(peer, None)
+        """Forget what a peer follows."""
         if self._followers.pop(peer, None) is not None:
             self._forget_unfollowed()
 
@@ -180,7 +174,7 @@ class ParamOwner:
         self._refuse(self._why_denied(asker, key, value) or self._why_not_get(key, value))
         if not found:
             raise RmpaError(f"there is no parameter {key}")
-        return self._of(session).answer(await write_text(key, value), self._now())
+        return {"text": await write_text(key, value)}
 
     async def _names(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asker = _Asker.read(session, args)
@@ -189,11 +183,11 @@ class ParamOwner:
             for name in yielding_to_data(await self._core.names())
             if not self.policy.why_not_get(name) and self._judge(asker, name)[0].allowed
         ]
-        return self._of(session).answer(await write_text("the list of parameters", names), self._now())
+        return {"text": await write_text("the list of parameters", names)}
 
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key, asker = self._key(args.get("key")), _Asker.read(session, args)
-        value = await read_text(self._of(session).written(args, self._now()))
+        value = await read_text(transfer.text_of(args))
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
             if len(parameters) >= limits.PARAMS_SET_MAX:
@@ -343,7 +337,7 @@ class ParamOwner:
             text = None
         if text is not None:
             args |= {"exists": True, "size": len(text)}
-            if len(text) <= limits.PARAM_PORTION:
+            if len(text) <= limits.ASK_EXPRESS_MAX:
                 args["text"] = text
         if key in self._last:
             self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
@@ -361,12 +355,6 @@ class ParamOwner:
         for key in [key for key in self._last if key not in kept]:
             del self._last[key]
             self._left.add(key)
-
-    def _of(self, session: PeerSession) -> transfer.Transfers:
-        return self._transfers[session.peer]
-
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
 
 
 def _refusal(key: str, why: str) -> dict[str, object]:

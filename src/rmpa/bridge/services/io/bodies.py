@@ -155,10 +155,12 @@ class BodyReceiver:
 
     Args:
         budget: Bounds the bytes of the peer's bodies while they are reassembled.
+        most: Bytes that a body may have.
     """
 
-    def __init__(self, budget: Budget) -> None:
+    def __init__(self, budget: Budget, most: int = ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX) -> None:
         self._budget = budget
+        self._most = most
         self._sequence: int | None = None
         self._buffer: bytearray | None = None
         self._size = 0
@@ -219,8 +221,8 @@ class BodyReceiver:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
         self.drop("another one began before its end")
         size = int.from_bytes(part[:_LENGTH], "little")
-        if size > ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX:
-            raise LimitExceeded("service message", size, ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX)
+        if size > self._most:
+            raise LimitExceeded("service message", size, self._most)
         self._sequence, self._size = sequence, size
         if self._budget.take(size):
             self._buffer = bytearray()

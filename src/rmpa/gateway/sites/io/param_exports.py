@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import secrets
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
@@ -30,7 +29,7 @@ from rmpa.gateway.sites.part import SitePart
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Generator
+    from collections.abc import Awaitable, Callable
 
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
@@ -146,7 +145,7 @@ class SiteParamExports(SitePart):
 
     async def _get(self, asker: SiteAsker, module: str, key: str) -> str:
         try:
-            text: str = await self._drive(asker, module, transfer.reading(transfer.GET, {"key": key}))
+            text = transfer.text_of(await self._ask(module, transfer.GET, asker.args({"key": key})))
         except RmpaError:
             self._judge(asker, module, key, [key])  # it is not told whether it is there
             raise
@@ -154,7 +153,7 @@ class SiteParamExports(SitePart):
         return text
 
     async def _present(self, asker: SiteAsker, module: str) -> list[str]:
-        text = await self._drive(asker, module, transfer.reading(transfer.NAMES, {}))
+        text = transfer.text_of(await self._ask(module, transfer.NAMES, asker.args({})))
         names = parse_response(text.encode())
         return [str(name) for name in names] if isinstance(names, list) else []
 
@@ -167,7 +166,7 @@ class SiteParamExports(SitePart):
         self._judge(asker, module, key, names)
         # What the owner does not name it judges itself.
         self._judge(asker, module, key, lost_with(names, await self._present(asker, module)))
-        return int(await self._drive(asker, module, transfer.writing(key, text, secrets.randbits(31))))
+        return transfer.count_of(await self._ask(module, transfer.SET, asker.args({"key": key, "text": text})))
 
     async def _delete(self, asker: SiteAsker, module: str, key: str) -> None:
         self._judge(asker, module, key, [key])
@@ -177,11 +176,3 @@ class SiteParamExports(SitePart):
     def _judge(self, asker: SiteAsker, module: str, key: str, names: list[str]) -> None:
         if why := refused_one(names, lambda name: self._why_not(asker, module, name, key)):
             raise PeerRefused(f"site {self._site}", why)
-
-    async def _drive(self, asker: SiteAsker, module: str, steps: Generator[transfer.Question, object, Any]) -> Any:
-        try:
-            what, args = next(steps)
-            while True:
-                what, args = steps.send(await self._ask(module, what, asker.args(args)))
-        except StopIteration as done:
-            return done.value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
@@ -50,8 +49,6 @@ class SiteParamImports:
         self._session = session
         self._stamp = stamp
         self._why_not = why_not
-        self._transfers: dict[str, transfer.Transfers] = {}
-        """What each module here reads or writes in portions, by its name; empty: this machine's user."""
 
     async def ask(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
         """Answer a request of ``bridge.params.transfer`` for a module of another site.
@@ -69,22 +66,17 @@ class SiteParamImports:
         """
         if site == self._site:
             raise PeerRefused(site, f"{module} is a module of this very site: ask it itself, by --peer {module}")
-        transfers, now = self._transfers_of(asker), asyncio.get_running_loop().time()
         key, askers = plain_key(str(args.get("key", ""))), (asker,) if asker else ()
         match what:
             case transfer.GET:
                 question = ParamQuestion(op="get", key=key, askers=askers)
-                return transfers.answer(await self._get(asker, site, module, question), now)
+                return {"text": await self._get(asker, site, module, question)}
             case transfer.NAMES:
                 found = await self._names(asker, site, module)
                 names = [name for name in found if not self._denial(asker, name, name)]
-                return transfers.answer(await write_text("the list of parameters", list(names)), now)
-            case transfer.MORE:
-                return transfers.more(args, now)
-            case transfer.PUT:
-                return transfers.put(args, now)
+                return {"text": await write_text("the list of parameters", list(names))}
             case transfer.SET:
-                text = transfers.written(args, now)
+                text = transfer.text_of(args)
                 written = parameters_in(key, await read_text(text))
                 await self._judge_change(asker, site, module, key, written)
                 question = ParamQuestion(op="set", key=key, text=text, askers=askers)
@@ -94,12 +86,6 @@ class SiteParamImports:
                 await self._question(site, module, ParamQuestion(op="delete", key=key, askers=askers))
                 return {}
         raise RemoteProtocolError(f"{what[:40]!r} is no question about parameters")
-
-    def _transfers_of(self, asker: str) -> transfer.Transfers:
-        found = self._transfers[asker] = self._transfers.pop(asker, transfer.Transfers())
-        while len(self._transfers) > limits.SITE_PARAM_TRANSFERS_MAX:
-            del self._transfers[next(iter(self._transfers))]
-        return found
 
     async def _get(self, asker: str, site: str, module: str, question: ParamQuestion) -> str:
         key = question.key

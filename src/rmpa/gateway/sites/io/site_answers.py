@@ -84,10 +84,7 @@ class SiteAnswers(SitePart):
                 raise RemoteProtocolError(f"{name[:80]!r} is not the name of a site or a module")
         self._require(site)
         if what == PARAM:
-            inner = args.get("args")
-            if not isinstance(inner, dict):
-                raise RemoteProtocolError("a question about a parameter has no arguments")
-            return await self._ask_param(asker, site, module, str(args.get("what", "")), inner)
+            return await self._ask_param(asker, site, module, str(args.get("what", "")), args)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
 
     def _tells(self, asker: str, kind: SourceKind, name: str) -> bool:
