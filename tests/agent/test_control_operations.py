@@ -69,7 +69,6 @@ async def test_each_operation_replies_with_its_type(settings: Callable[..., Sett
         ("ping", {"peer": "c"}, "linked peer"),
         ("why", {"name": "chatter"}, "is not a topic, nor a service"),
         ("param", {"peer": "b", "what": "param.nmes"}, r"did you mean param\.names\?"),
-        ("param", {"peer": "b", "what": "param.names"}, "is no table"),
         ("graph", {"wait": -1}, "is not between 0 and"),
         ("node", {"what": "node.lst"}, r"did you mean node\.list\?"),
         ("agent", {"peer": "c"}, "linked peer"),
