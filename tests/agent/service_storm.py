@@ -28,7 +28,7 @@ from tests.agent.test_agent import running
 from tests.agent.test_services import MD5, come_back, fall_silent, serving
 
 if TYPE_CHECKING:
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
 
 TIMEOUT: Final = 2.0
 """Seconds after which the agents give a call up."""

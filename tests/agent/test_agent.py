@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.bridge import limits
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config.settings import Multicast, PolicySettings, Settings

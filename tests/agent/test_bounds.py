@@ -20,7 +20,7 @@ from tests.agent.test_diagnostics import Statuses, settings
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.observe.peer_info import BoundInfo
     from rmpa.observe.snapshot import Snapshot
 

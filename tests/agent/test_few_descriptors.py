@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import FilesInfo, RouteInfo, Snapshot
 

@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
 from rmpa.core.errors import UnreachableError

@@ -15,7 +15,7 @@ from tests.agent.test_agent import Sink, node, running, settings, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.observe.snapshot import TopicInfo
 

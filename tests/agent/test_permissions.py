@@ -13,7 +13,7 @@ from unittest import mock
 
 import pytest
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.agent.permission_notes import permission_notes
 from rmpa.bridge.io.node_requests import INFO, LIST, PING
 from rmpa.bridge.io.proxy_kills import KILL

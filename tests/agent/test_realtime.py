@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.config.settings import Multicast, Settings
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros import limits as ros_limits

@@ -21,7 +21,7 @@ from tests.agent.test_agent import running, settings, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.mesh.io.link import PeerLink
 
 __all__ = ["settings"]

@@ -23,7 +23,7 @@ from tests.agent.test_services import MD5, Server, come_back, fall_silent, provi
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import ServiceInfo

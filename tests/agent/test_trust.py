@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.agent.trust import RENEW, trust_store
 from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError

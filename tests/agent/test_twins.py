@@ -15,7 +15,7 @@ from tests.agent.test_agent import Sink, node, running, settings, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.ros.node.topics import Publisher
 
 __all__ = ["settings"]  # the fixture

@@ -19,7 +19,7 @@ from tests.agent.test_agent import node, running, settings, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.observe.why.diagnosis import Diagnosis
 

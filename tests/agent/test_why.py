@@ -18,7 +18,7 @@ from tests.agent.test_agent import DEADLINE, node, running, settings, until  # n
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.observe.why.diagnosis import Diagnosis
 
 

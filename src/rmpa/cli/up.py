@@ -56,7 +56,7 @@ def up(**options: object) -> int:
         _log.info("= the module is %s, as at its first start (%s)", chosen.name, loaded.given["name"])
     # Imports leave no garbage: without collection the start takes a third less time. The agent turns it on again.
     gc.disable()
-    from rmpa.agent import run
+    from rmpa.agent.agent import run
 
     try:
         return run(loaded.settings, load, partial(keep_first_name, loaded.settings, loaded.name_facts))

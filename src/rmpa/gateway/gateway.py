@@ -9,7 +9,7 @@ import random
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RmpaError, StartError

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from rmpa.agent import Agent
+from rmpa.agent.agent import Agent
 from rmpa.gateway.graph.own_graph import AgentGraph
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.ros.wire.tcpros import TopicDescription

@@ -24,7 +24,7 @@ from tests.gateway.graph.gateways import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
 
 __all__ = ["settings"]

@@ -18,7 +18,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.ros.master.effects import GraphChange
 

@@ -36,7 +36,7 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.mesh_sources import SourceKey
     from rmpa.ros.master.effects import GraphChange

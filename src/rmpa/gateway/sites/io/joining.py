@@ -27,7 +27,7 @@ from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
-    from rmpa.agent import Agent
+    from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import MeshSource
