@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.stats import SampleRing, SampleSummary
+from rmpa.core.counters import SampleRing, SampleSummary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -30,8 +30,7 @@ from rmpa.bridge.messages import (
     encode,
     op_of,
 )
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import PEER_LEASE
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind

@@ -29,8 +29,7 @@ from rmpa.agent.agent import Agent
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
 from rmpa.core.errors import UnreachableError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.observe.io.control_client import ControlClient

@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge.proxy_names import proxied_node, proxy_name, proxy_prefix
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 
 BASE = Identity(Guid.of("10.0.0.1", 40001), bytes(16), "base")
 

@@ -24,7 +24,7 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import PolicySettings, ServiceSettings
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

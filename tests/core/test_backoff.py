@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 
 
 def test_doubles_to_its_cap_and_starts_again() -> None:

@@ -23,7 +23,7 @@ from rmpa.core.contract import (
     combine,
     needs_agents,
 )
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 
 SECONDS = st.one_of(st.none(), st.sampled_from([0.1, 0.5, 2.0]))
 VALUES: dict[str, st.SearchStrategy[object]] = {

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 
 PORTS = st.integers(0, 0xFFFF)
 

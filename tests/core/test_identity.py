@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core import limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity, peer_name_from, peer_name_problem
+from rmpa.core.identity import Guid, Identity, peer_name_from, peer_name_problem
 
 GUID = Guid.of("10.0.0.1", 40001)
 

@@ -15,8 +15,8 @@ import pytest
 
 import rmpa
 from rmpa.config.file import SCHEMAS
-from rmpa.core import sizes
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core import limits as sizes
+from rmpa.core.limits import KIB, MIB
 from rmpa.web.monitor import limits as monitor_limits
 
 

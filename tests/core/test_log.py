@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.log import configure_logging, room_of
+from rmpa.core.counters import configure_logging, room_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -61,7 +61,7 @@ def test_a_line_to_escape_is_written_without_file_descriptors() -> None:
     """The codec's module was loaded at its first use: asyncio's line about too many open files never came."""
     script = (
         "import logging, resource, sys\n"
-        "from rmpa.core.log import configure_logging\n"
+        "from rmpa.core.counters import configure_logging\n"
         "configure_logging('info', sys.stderr, as_json=False)\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\n"
         "logging.error('too many\\nopen files')\n"

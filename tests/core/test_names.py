@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import names
+from rmpa.core import identity as names
 
 NAMES = st.from_regex(r"/[A-Za-z]\w{0,5}(/\w{1,5}){0,3}", fullmatch=True).filter(str.isascii)
 

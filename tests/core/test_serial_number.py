@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
-from rmpa.core.sizes import INT32_MAX, INT32_MIN, UINT32_MAX
+from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
+from rmpa.core.limits import INT32_MAX, INT32_MIN, UINT32_MAX
 
 NUMBERS = st.integers(0, UINT32_MAX)
 STEPS = st.integers(1, SERIAL_HALF - 1)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.stats import ArrivalStats, SampleRing, SampleSummary, percentile
+from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary, percentile
 
 SAMPLES = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50)
 

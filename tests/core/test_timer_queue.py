@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from rmpa.core.timer_queue import TimerQueue
+from rmpa.core.counters import TimerQueue
 
 
 def test_the_first_is_known_and_what_is_due_comes_in_order() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.counters import TokenBucket
 
 
 def test_a_burst_then_the_rate_and_after_a_rest_a_burst_again() -> None:

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind, BeaconMalformed, BeaconOtherDomain, BeaconOtherVersion
 from tests.fuzz import target_beacon

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.counters import Counters
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 from rmpa.discovery.beacon_sender import BeaconSender

@@ -9,8 +9,7 @@ from ipaddress import IPv4Address
 import pytest
 
 from rmpa.core import limits as core_limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import (

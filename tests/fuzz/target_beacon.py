@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 
 _IDENTITY = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")

@@ -18,7 +18,7 @@ from rmpa.config.settings import SETTINGS
 from rmpa.config.values import BadValue
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
 _READERS = (

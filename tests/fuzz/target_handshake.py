@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh.handshake import Hello, KnownLink, Refuse, judge, judge_welcome
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")

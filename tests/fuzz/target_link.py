@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.connection_events import ConnectionEvent, HelloReceived

@@ -8,8 +8,7 @@ from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
 from rmpa.mesh.connection_events import HelloReceived

@@ -30,8 +30,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello, Refuse

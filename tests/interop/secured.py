@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from lab.bed.processes import Process
 from rmpa.config import limits as config_limits
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.runtime.system_clock import SystemClock
 from rmpa.trust import certificates

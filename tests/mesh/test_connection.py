@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
 from rmpa.mesh.connection_events import (

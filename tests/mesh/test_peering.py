@@ -9,8 +9,7 @@ from ipaddress import IPv4Address
 import pytest
 
 from rmpa.core import limits as core_limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import FULL, Hello, Refusal, Refuse
 from rmpa.mesh.peering import Peering

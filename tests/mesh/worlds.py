@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.handshake import Lane

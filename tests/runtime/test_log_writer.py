@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.log import configure_logging
+from rmpa.core.counters import configure_logging
 from rmpa.runtime import limits
 from rmpa.runtime.log_writer import LogWriter
 

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("cryptography")
 
+from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import Outbox
-from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime.stream import Stream
 from tests.runtime.secure_pairs import Contexts, Slow, make_contexts, secure_pair
 

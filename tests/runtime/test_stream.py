@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime.corking import CollectedSends, after_read
 from rmpa.runtime.stream import Stream
 

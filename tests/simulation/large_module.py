@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.clock import earliest
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.counters import earliest
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.mesh import limits as mesh_limits

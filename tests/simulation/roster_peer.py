@@ -8,8 +8,7 @@ from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import Event, SendMulticast
 from rmpa.discovery.membership import MembershipProtocol

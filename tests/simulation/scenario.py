@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from rmpa.core import limits as core_limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from tests.simulation.network import Network, Weather, World

@@ -12,7 +12,7 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core import limits as core_limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.trust import limits

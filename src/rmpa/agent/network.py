@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address

@@ -9,8 +9,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from rmpa.agent.reload import SighupHandler
+from rmpa.core.counters import remedy
 from rmpa.core.errors import StartError
-from rmpa.core.open_files import remedy
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import realtime
 from rmpa.runtime.descriptors import is_shortage, raise_file_limit

@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
 from rmpa.config.state_dir import state_dir
-from rmpa.core.backoff import Backoff
-from rmpa.core.counters import RefusalLog
+from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.trust import limits
 from rmpa.trust.io.open_start import check_open
 from rmpa.trust.io.store import AuthorityPlace, TrustStore
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.trust.documents import DocumentKind
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.join_server import JoinServer

@@ -15,7 +15,7 @@ import sys
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent import limits
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB
 
 ROUTE_OPEN_TIMEOUT: Final = 5.0
 """Seconds that a peer has to answer a request to open a route. Then a topic's route is asked for again, and a

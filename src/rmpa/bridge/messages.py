@@ -16,10 +16,8 @@ from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.names import is_global_name, is_type_name
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.identity import Guid, is_global_name, is_type_name, peer_name_problem
+from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config import limits
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -9,7 +9,7 @@ from rmpa.config import limits
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
 from rmpa.config.settings import TimeSettings
-from rmpa.core.names import NEVER_CROSSING, matches
+from rmpa.core.identity import NEVER_CROSSING, matches
 
 if TYPE_CHECKING:
     from rmpa.config.settings import PeerRule, PolicySettings

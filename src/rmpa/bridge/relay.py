@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.bridge.messages import Source
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
 
 Place = tuple[str, str]
 """A topic and the proxy that publishes it, by their local names."""

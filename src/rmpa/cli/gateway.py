@@ -19,9 +19,9 @@ from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
+from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
-from rmpa.core.log import configure_logging
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.runtime.log_writer import LogWriter
 from rmpa.trust.status import TrustStatus

@@ -11,7 +11,7 @@ from rmpa.bridge.proxy_names import proxied_node, proxied_peer
 from rmpa.cli.output import printable, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.names import is_legal_name
+from rmpa.core.identity import is_legal_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.bridge.params.rules import key_problem
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.names import is_legal_name
+from rmpa.core.identity import is_legal_name
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in
@@ -108,7 +108,7 @@ def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> st
     Raises:
         ConfigError: It is no parameter's name.
     """
-    from rmpa.core.names import resolve_name
+    from rmpa.core.identity import resolve_name
 
     namespace = environ.get("ROS_NAMESPACE") or "/"
     if not text and root:

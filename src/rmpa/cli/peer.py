@@ -14,8 +14,8 @@ from rmpa.cli.options import FiniteRange, agent_option, completes, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
 from rmpa.cli.selection import LINES, Selection, summary
 from rmpa.cli.topic_crossing import shown_state
+from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused
-from rmpa.core.stats import SampleSummary
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.peer_info import FOREIGN
 from rmpa.observe.snapshot import PingReply

@@ -82,7 +82,7 @@ def run(
     """Run the Smart Resources of FILE as nodes of this module's own core."""
     from pathlib import Path
 
-    from rmpa.core.log import configure_logging
+    from rmpa.core.counters import configure_logging
 
     gc.disable()  # imports leave no garbage; collection is on again when the resources are active
     configure_logging(log_level, sys.stderr, as_json=False)

@@ -18,8 +18,8 @@ from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, size
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic_crossing import arriving, bandwidth_text, latency_text, origin, rate_text
+from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary
 from rmpa.core.errors import RmpaError
-from rmpa.core.stats import ArrivalStats, SampleRing, SampleSummary
 
 if TYPE_CHECKING:
     from collections.abc import Callable

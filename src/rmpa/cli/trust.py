@@ -13,8 +13,7 @@ from rmpa.cli.output import print_json, printable, warn
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.trust.permissions import Permissions, action_topics
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from rmpa.cli.options import agent_option, json_option
 from rmpa.config.settings import WebSettings
 from rmpa.config.sources import load_settings
 from rmpa.config.values import HOST, BadValue
+from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError
-from rmpa.core.log import configure_logging
 
 if TYPE_CHECKING:
     from rmpa.cli.module import Module

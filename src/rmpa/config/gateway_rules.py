@@ -29,7 +29,7 @@ from rmpa.config.values import (
     whole_number,
     word_of,
 )
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

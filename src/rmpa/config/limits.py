@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 
 # --- settings ---------------------------------------------------------------------------------------------------
 CONFIG_FILE_MAX: Final = 256 * KIB

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
 from rmpa.config.values import NAME, BadValue, Place, RuleKey, ValueType, read_at, read_keys, read_text, tables_of
-from rmpa.core.names import is_global_name, is_legal_name, matches
+from rmpa.core.identity import is_global_name, is_legal_name, matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

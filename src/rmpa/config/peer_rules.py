@@ -28,7 +28,7 @@ from rmpa.config.values import (
     read_text,
     tables_of,
 )
-from rmpa.core.names import NEVER_CROSSING, is_global_name, matches
+from rmpa.core.identity import NEVER_CROSSING, is_global_name, matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core import limits
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -4,14 +4,230 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from functools import lru_cache
+from ipaddress import IPv4Address
+from typing import Final
 
 from rmpa.core import limits
+from rmpa.core.limits import UINT32_MAX
 
-if TYPE_CHECKING:
-    from ipaddress import IPv4Address
+# GUIDs: they identify a peer, and decide which of two peers dials (paper, section 4.2).
 
-    from rmpa.core.guid import Guid
+
+_TEXT: Final = re.compile(r"(?P<ip>[0-9.]+):(?P<port>[0-9]+)(?:#(?P<incarnation>[0-9]+))?")
+
+_LOOPBACK: Final = 127
+_MULTICAST: Final = 224
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Guid:
+    """A 64-bit global unique identifier, ordered as an unsigned integer.
+
+    The high 32 bits are the IPv4 address, the next 16 the mesh port, as in the paper; the low 16, which the
+    paper leaves free, count incarnations, which distinguishes a restarted peer from its former run.
+
+    Args:
+        value: The 64 bits.
+
+    Raises:
+        ValueError: ``value`` does not fit in 64 bits.
+    """
+
+    value: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.value < 1 << 64:
+            raise ValueError(f"a GUID has 64 bits, not {self.value:#x}")
+
+    @classmethod
+    def of(cls, address: IPv4Address | str, port: int, incarnation: int = 0) -> Guid:
+        """Join the three parts; ``port`` and ``incarnation`` are 16-bit numbers.
+
+        Raises:
+            ValueError: A part is out of its range.
+        """
+        if not 0 <= port < 1 << 16:
+            raise ValueError(f"a port has 16 bits, not {port}")
+        if not 0 <= incarnation < 1 << 16:
+            raise ValueError(f"an incarnation has 16 bits, not {incarnation}")
+        return cls(int(IPv4Address(address)) << 32 | port << 16 | incarnation)
+
+    @classmethod
+    def parse(cls, text: str) -> Guid:
+        """Read the form that ``str`` writes, ``10.0.0.1:40001#7``; without ``#7`` the incarnation is 0.
+
+        Raises:
+            ValueError: The text is not a GUID.
+        """
+        match = _TEXT.fullmatch(text)
+        if match is None:
+            raise ValueError(f"{text!r} is not a GUID; one looks like 10.0.0.1:40001#7")
+        return cls.of(match["ip"], int(match["port"]), int(match["incarnation"] or 0))
+
+    @property
+    def address(self) -> IPv4Address:
+        """The IPv4 address in the high 32 bits."""
+        return IPv4Address(self.value >> 32)
+
+    @property
+    def port(self) -> int:
+        """The mesh port: TCP for links, UDP for unicast beacons."""
+        return self.value >> 16 & 0xFFFF
+
+    @property
+    def incarnation(self) -> int:
+        """The low 16 bits."""
+        return self.value & 0xFFFF
+
+    @property
+    def endpoint(self) -> tuple[str, int]:
+        """``(address, port)`` as sockets want it; shared by all incarnations of one peer."""
+        high = self.value >> 32
+        return f"{high >> 24}.{high >> 16 & 255}.{high >> 8 & 255}.{high & 255}", self.port
+
+    @property
+    def place(self) -> int:
+        """Address and port as one number, in GUID order: all incarnations of one peer share it."""
+        return self.value >> 16
+
+    @property
+    def dialable(self) -> bool:
+        """Whether a single peer can be reached at its address; see the function ``dialable``."""
+        return _is_unicast(self.value >> 56) and self.port != 0
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether its address is a loopback address (127.x.x.x)."""
+        return self.value >> 56 == _LOOPBACK
+
+    def __str__(self) -> str:
+        """``10.0.0.1:40001#7``."""
+        return f"{self.address}:{self.port}#{self.incarnation}"
+
+
+def dialable(address: IPv4Address, port: int) -> bool:
+    """Whether a single peer can be reached there: no multicast, broadcast or "any" address, no port 0.
+
+    A forged beacon with such an address could make its receivers send to a whole network.
+    """
+    return _is_unicast(int(address) >> 24) and port != 0
+
+
+def _is_unicast(first: int) -> bool:
+    """Whether an address with this first byte is a unicast address."""
+    return 0 < first < _MULTICAST
+
+
+# ROS graph names (wiki.ros.org/Names, REP 144) and the globs that rules are written in.
+
+
+_LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
+NEVER_CROSSING: Final = {
+    "/rosout": "log messages stay home: a bridged /rosout would loop",
+    "/rosout_agg": "log messages stay home: a bridged /rosout would loop",
+    "/clock": "time stays home: two clocks in one graph make it jump",
+    "/rmpa/**": "the agent's own topics stay home",
+}
+"""Topics that stay in their module under every policy, and why."""
+_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+
+
+def is_legal_name(name: str) -> bool:
+    """Whether a graph resource may have this name, before it is resolved (empty is legal: the namespace)."""
+    return name == "" or (_LEGAL.fullmatch(name) is not None and "//" not in name)
+
+
+def is_global_name(name: str) -> bool:
+    """Whether this is a resolved name, ``/like/this``."""
+    return name.startswith("/") and is_legal_name(name) and (name == "/" or not name.endswith("/"))
+
+
+def is_type_name(name: str) -> bool:
+    """Whether this is a message or service type, ``package/Name``."""
+    return _TYPE.fullmatch(name) is not None
+
+
+def join_names(namespace: str, name: str) -> str:
+    """``/ns`` and ``name`` to ``/ns/name``; a global ``name`` stays as it is."""
+    if name.startswith("/"):
+        return name
+    return f"{namespace.rstrip('/')}/{name}" if namespace else name
+
+
+def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
+    """Resolve a graph name as a client library does.
+
+    Args:
+        name: As written: ``/global``, ``relative``, ``~private`` or empty (the namespace itself).
+        namespace: The namespace to resolve relative names in.
+        node: The node's own global name, for private names.
+
+    Returns:
+        A global name without a trailing slash.
+
+    Raises:
+        ValueError: ``name`` is not a legal name.
+    """
+    if not is_legal_name(name):
+        raise ValueError(f"{name!r} is not a ROS name; allowed are letters, digits, _ and /, after a letter, / or ~")
+    if name.startswith("~"):
+        resolved = join_names(node or namespace, name[1:].lstrip("/"))
+    else:
+        resolved = join_names(namespace, name)
+    return "/" + "/".join(part for part in resolved.split("/") if part)
+
+
+@lru_cache(maxsize=4096)
+def _compile_glob(pattern: str) -> re.Pattern[str]:
+    # "/**/" also fits a single slash: any number of parts in between, or none. "/**" at the end fits no part, too.
+    wild = {"/**/": "/(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    pattern = re.sub(r"(?:/\*\*)+(?=/|$)", "/**", pattern)
+    begin, end = (pattern[:-3], "(?:/.*)?") if pattern.endswith("/**") and pattern != "/**" else (pattern, "")
+    pieces = re.split(r"(/\*\*/|\*\*|\*|\?)", begin)
+    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in pieces) + end)
+
+
+def matches(pattern: str, name: str) -> bool:
+    """Whether a name fits a glob: ``*`` and ``?`` stay within one part of the name, ``**`` crosses slashes.
+
+    ``/camera/**`` also fits ``/camera`` itself, as people expect of a namespace; likewise ``/**/cmd_vel`` fits
+    ``/cmd_vel``, and ``/a/**/b`` fits ``/a/b``.
+    """
+    return _compile_glob(pattern).fullmatch(name) is not None
+
+
+# Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982.
+#
+# Of two numbers the later one is less than 2³¹ ahead of the other. Code that runs once for each message writes the
+# expressions out with ``SERIAL_MASK`` and ``SERIAL_HALF``, because a call takes longer than the arithmetic.
+
+
+SERIAL_MASK: Final = UINT32_MAX
+"""``number & SERIAL_MASK`` wraps a number."""
+SERIAL_HALF: Final = 1 << 31
+"""A number that is this far or farther ahead of another number counts as the earlier one of the two."""
+
+
+def serial_add(number: int, count: int) -> int:
+    """The number ``count`` places after ``number``; ``count`` may be negative."""
+    return number + count & SERIAL_MASK
+
+
+def serial_distance(start: int, end: int) -> int:
+    """How many places ``end`` is ahead of ``start``: 0 to 2³² - 1; from 2³¹ on it is the earlier one of the two."""
+    return end - start & SERIAL_MASK
+
+
+def is_later(number: int, than: int) -> bool:
+    """Whether ``number`` comes after ``than``; false for equal numbers."""
+    return 0 < number - than & SERIAL_MASK < SERIAL_HALF
+
+
+def is_earlier(number: int, than: int) -> bool:
+    """Whether ``number`` comes before ``than``; false for equal numbers, true for two that are exactly 2³¹ apart."""
+    return number - than & SERIAL_MASK >= SERIAL_HALF
+
 
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 

@@ -7,7 +7,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB
+# Units of size, and the bounds of 32-bit integers.
+
+
+KIB: Final = 1024
+MIB: Final = 1024 * KIB
+
+INT32_MIN: Final = -(1 << 31)
+INT32_MAX: Final = (1 << 31) - 1
+UINT32_MAX: Final = (1 << 32) - 1
+
 
 # --- process ----------------------------------------------------------------------------------------------------
 OPEN_FILES_ADVICE: Final = 65_536

@@ -20,9 +20,8 @@ from ipaddress import IPv4Address
 from typing import Final
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.guid import Guid, dialable
-from rmpa.core.identity import Identity
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.identity import Guid, Identity, dialable
+from rmpa.core.limits import UINT32_MAX
 from rmpa.discovery import limits
 
 Address = tuple[str, int]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.serial_number import serial_add
+from rmpa.core.identity import serial_add
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import SendMulticast, SendUnicast
@@ -14,8 +14,7 @@ from rmpa.discovery.unicast import AnswerLimit
 
 if TYPE_CHECKING:
     from rmpa.core.counters import Counters
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoint import PeerInstance
     from rmpa.discovery.endpoint_table import EndpointTable

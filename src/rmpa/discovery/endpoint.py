@@ -7,8 +7,8 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
-from rmpa.core.clock import earliest
-from rmpa.core.serial_number import is_later
+from rmpa.core.counters import earliest
+from rmpa.core.identity import is_later
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 from rmpa.discovery.events import HeardBy

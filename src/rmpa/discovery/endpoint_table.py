@@ -6,15 +6,14 @@ from bisect import bisect_left, insort
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
-from rmpa.core.timer_queue import TimerQueue
+from rmpa.core.counters import TimerQueue
 from rmpa.discovery import limits
 from rmpa.discovery.events import ConflictKind, HeardBy, PeerConflict, PeerView
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoint import Endpoint, PeerInstance
 

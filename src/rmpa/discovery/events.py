@@ -7,8 +7,7 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address, Beacon
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core.backoff import Backoff
-from rmpa.core.timer_queue import TimerQueue
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.counters import Backoff, TimerQueue, TokenBucket
 from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Guid
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoint import PeerInstance
 

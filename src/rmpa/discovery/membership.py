@@ -13,8 +13,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
-from rmpa.core.clock import earliest
-from rmpa.core.counters import Counters
+from rmpa.core.counters import Counters, earliest
 from rmpa.core.identity import Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Address, Beacon, BeaconKind
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from ipaddress import IPv4Address
 
-    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Guid
     from rmpa.discovery.events import PeerView
 
 _NEVER: Final = float("-inf")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.counters import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 

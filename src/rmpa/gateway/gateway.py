@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph

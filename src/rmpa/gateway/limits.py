@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 
 AGENTS_LOOK_PERIOD: Final = 5.0
 """Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it."""

@@ -44,8 +44,7 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
 
 _log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity, peer_name_problem
+from rmpa.core.identity import Guid, Identity, peer_name_problem
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Buffer, parse_text, text_payload
 from rmpa.trust.reasons import TrustReason

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.limits import PEER_LEASE
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB, PEER_LEASE
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 MODULES_MAX: Final = 256

@@ -16,10 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from rmpa.core import limits as core_limits
-from rmpa.core.backoff import Backoff
-from rmpa.core.clock import earliest
-from rmpa.core.timer_queue import TimerQueue
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.counters import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import FULL, Hello, KnownLink, Lane, Refusal, Refuse, judge
 from rmpa.mesh.peering_events import (
@@ -41,8 +38,7 @@ from rmpa.trust.reasons import NOT_OF_THIS_MESH, TrustReason
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
 
 _log = logging.getLogger(__name__)
 

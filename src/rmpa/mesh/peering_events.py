@@ -10,8 +10,7 @@ from rmpa.mesh.handshake import Refusal, Refuse
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.identity import Guid, Identity
 
 SocketAddress = tuple[str, int]
 

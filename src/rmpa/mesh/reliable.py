@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
+from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.mesh import limits
 
 

@@ -22,7 +22,7 @@ from rmpa.observe import limits
 from rmpa.observe.json_pieces import json_pieces
 
 if TYPE_CHECKING:
-    from rmpa.core.yielding import Yielder
+    from rmpa.core.counters import Yielder
 
 _T = TypeVar("_T")
 ROLE: Final = "role"

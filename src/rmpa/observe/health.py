@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.open_files import remedy
+from rmpa.core.counters import remedy
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 
 # --- control socket, snapshot, /diagnostics ------------------------------------------------------------------------
 CONTROL_REQUEST_MAX: Final = 1 * MIB

@@ -14,7 +14,7 @@ from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec needs it to
 from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec needs it to decode
 
 if TYPE_CHECKING:
-    from rmpa.core.stats import SampleSummary
+    from rmpa.core.counters import SampleSummary
 
 
 class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):

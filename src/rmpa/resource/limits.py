@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 
 DESCRIPTOR_MAX: Final = 1 * MIB
 """Characters of a descriptor: one with a hundred profiles of twenty attributes has about 100 KB."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError
-from rmpa.core.names import is_legal_name, resolve_name
+from rmpa.core.identity import is_legal_name, resolve_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB
 
 MESSAGE_MAX: Final = 256 * MIB
 """One ROS message with its length; the largest point clouds and images stay below this."""

@@ -21,9 +21,8 @@ import time
 from pathlib import Path
 from typing import Final
 
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import OutOfDescriptors
-from rmpa.core.open_files import remedy
 from rmpa.runtime import limits
 
 _log = logging.getLogger(__name__)

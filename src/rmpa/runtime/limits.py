@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 
 # --- process ----------------------------------------------------------------------------------------------------
 OPEN_FILES: Final = 1_048_576

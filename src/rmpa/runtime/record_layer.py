@@ -14,7 +14,7 @@ import ssl
 from typing import TYPE_CHECKING, Final, Protocol, cast
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -20,8 +20,8 @@ from typing import Final, cast
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
-from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime import corking, limits
 from rmpa.runtime.buffers import Buffer, unsent
 from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
 from rmpa.trust.keyring import GroupKey
 

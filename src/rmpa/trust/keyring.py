@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
 
 if TYPE_CHECKING:

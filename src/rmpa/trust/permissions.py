@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.peer_rules import PEER
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect, PermissionRule
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 from rmpa.trust import limits
 
 if TYPE_CHECKING:

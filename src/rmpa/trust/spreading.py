@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

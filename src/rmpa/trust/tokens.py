@@ -28,9 +28,8 @@ from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.guid import dialable
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.identity import dialable, peer_name_problem
+from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
 
 if TYPE_CHECKING:

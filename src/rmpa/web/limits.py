@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB
 
 # --- the hub ------------------------------------------------------------------------------------------------------
 CLIENT_QUEUE_BYTES: Final = 16 * MIB

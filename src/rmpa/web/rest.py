@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import msgspec
 
-from rmpa.core.names import is_legal_name
+from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.data.peer_clock import PeerClockHistory
 from rmpa.bridge.data.quality import Quality
-from rmpa.core.stats import SampleSummary
+from rmpa.core.counters import SampleSummary
 from rmpa.mesh import limits as mesh_limits
 
 SECOND = 1_000_000_000

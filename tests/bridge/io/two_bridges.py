@@ -15,8 +15,7 @@ from rmpa.bridge.policy import Policy
 from rmpa.config.settings import PolicySettings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contracts
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.links import LinkEnd
 from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Speaker, stages

@@ -13,8 +13,7 @@ from rmpa.bridge.session.part import Part
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.peer_sessions import PeerSessions
 from rmpa.config.settings import TrustSettings
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run

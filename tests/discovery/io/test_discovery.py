@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import HostPort, Multicast, Settings
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted

@@ -6,8 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 from rmpa.core.counters import Counters
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter, Recognised

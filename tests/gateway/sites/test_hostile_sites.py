@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.attachment import AttachmentReader, SiteAttachment

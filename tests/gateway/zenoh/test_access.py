@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rmpa.config.permission_rules import Effect, ModuleGroup, PermissionRule
 from rmpa.config.settings import TrustSettings
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 from rmpa.gateway.zenoh.access import AccessTable, access_table, key_expressions
 
 zenoh = pytest.importorskip("zenoh")

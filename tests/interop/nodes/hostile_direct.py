@@ -17,7 +17,7 @@ from hostile_peer import Link, say
 from rmpa.bridge.direct.requests import DirectAsk, write
 from rmpa.bridge.messages import Advertise, TopicOffer, encode
 from rmpa.core.contract import Contract, Transport
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 from rmpa.mesh.frames import Frame, FrameKind
 
 AUTO = Contract(transport=Transport.AUTO)

@@ -20,8 +20,7 @@ import psutil
 from rmpa.bridge.messages import Advertise, Description, OpenRoute, RouteOpened, TopicOffer, encode
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind

@@ -7,8 +7,7 @@ import socket
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello, Lane

@@ -9,8 +9,7 @@ import struct
 
 import pytest
 
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind
 from tests.mesh.io.meshes import Peer, linked_pair, peers, raw, until

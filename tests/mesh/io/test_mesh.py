@@ -17,9 +17,8 @@ import pytest
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.identity import Guid, Identity
+from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, unpack_header

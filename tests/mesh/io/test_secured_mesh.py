@@ -16,9 +16,8 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
-from rmpa.core.sizes import MIB
+from rmpa.core.identity import Guid, Identity
+from rmpa.core.limits import MIB
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.frames import Frame, FrameKind

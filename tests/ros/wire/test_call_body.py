@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.wire.call_body import CallBody, call_name, too_large, too_many
 from rmpa.ros.wire.xmlrpc import serialize_call

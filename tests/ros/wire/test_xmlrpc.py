@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc import (
     CallReader,

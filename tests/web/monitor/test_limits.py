@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits, messages, session
 

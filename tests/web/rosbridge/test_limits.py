@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 from rmpa.web.rosbridge import limits
 
 PAGE = Path(__file__).parents[3] / "docs" / "rosbridge.md"

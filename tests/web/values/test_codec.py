@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.web.values import limits

@@ -16,7 +16,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
-from rmpa.core.names import is_global_name, matches
+from rmpa.core.identity import is_global_name, matches
 from rmpa.ros.core.node_calls import end_node, node_connections, ping_node
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
 from rmpa.runtime.event_loop import yielding_to_data

@@ -12,7 +12,7 @@ from rmpa.bridge.session.part import Part
 from rmpa.bridge.twins import OFFERED_MIN, telling, twin_names, twin_text
 from rmpa.config.permission_rules import Access
 from rmpa.core.counters import RefusalLog
-from rmpa.core.names import is_global_name, matches
+from rmpa.core.identity import is_global_name, matches
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 

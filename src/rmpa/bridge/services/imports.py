@@ -51,7 +51,7 @@ from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, Serv
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping

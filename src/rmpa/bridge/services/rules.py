@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import PolicyDecision, is_own
 from rmpa.config import limits as config_limits
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

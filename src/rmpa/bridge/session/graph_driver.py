@@ -12,8 +12,8 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.catalogue.pacing import Pacing
 from rmpa.bridge.messages import decode, encode
+from rmpa.core.counters import logged_failure
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.log import logged_failure
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer
 

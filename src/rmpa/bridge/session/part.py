@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.core.log import logged_failure
+from rmpa.core.counters import logged_failure
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager

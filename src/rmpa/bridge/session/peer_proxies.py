@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.proxy_names import proxy_name
+from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError
-from rmpa.core.open_files import remedy
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.descriptors import is_shortage
 from rmpa.runtime.event_loop import yielding_to_data

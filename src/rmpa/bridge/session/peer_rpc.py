@@ -27,7 +27,7 @@ from rmpa.bridge.messages import Notification, Request, Response, decode, encode
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.session.part import Part
 from rmpa.core.errors import LimitExceeded, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Message

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.proxy_names import proxy_name, proxy_prefix
-from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
+from rmpa.core.identity import Guid, Identity
 
 if TYPE_CHECKING:
     from collections.abc import Collection

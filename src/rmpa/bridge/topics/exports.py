@@ -46,7 +46,7 @@ from rmpa.bridge.relay import may_have
 from rmpa.config.permission_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
-from rmpa.core.serial_number import is_later, serial_add
+from rmpa.core.identity import is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Describe, Detach, Send, Warn
 from rmpa.bridge.messages import CloseRoute, OpenRoute, RouteClosed, RouteOpened, Source
 from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:

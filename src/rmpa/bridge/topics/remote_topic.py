@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.messages import Description, Origin
-    from rmpa.core.backoff import Backoff
+    from rmpa.core.counters import Backoff
 
 
 class RouteState(Enum):

@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from ipaddress import IPv4Address
 
     from rmpa.config.settings import Settings
-    from rmpa.core.clock import Clock
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.counters import Clock
+    from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.events import Event, Output, PeerView
     from rmpa.discovery.strangers import Stranger

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.discovery import limits
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.counters import RefusalLog
+from rmpa.core.counters import RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 from rmpa.discovery.strangers import Strangers
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.counters import Counters
-    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Guid
     from rmpa.discovery.beacon import Address
     from rmpa.trust.packets import PacketTrust, Verification
 

@@ -11,7 +11,7 @@ import threading
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING
 
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.discovery import limits
 
 if TYPE_CHECKING:

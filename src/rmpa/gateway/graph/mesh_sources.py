@@ -10,7 +10,7 @@ from rmpa.bridge.messages import is_crossing_name, is_crossing_type
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.relay import is_outside, service_place
 from rmpa.bridge.topics.io.local_sources import LocalSources
-from rmpa.core.log import logged_failure
+from rmpa.core.counters import logged_failure
 from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.runtime.event_loop import yielding_to_data

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 
 from rmpa.core.errors import ConfigError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping

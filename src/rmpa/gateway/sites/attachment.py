@@ -21,8 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.gateway import limits
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import Counters
+from rmpa.core.counters import Counters, TimerQueue
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.timer_queue import TimerQueue
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 

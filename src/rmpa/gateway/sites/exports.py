@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import UNKNOWN_TYPE, SiteModule, SiteSource

@@ -26,8 +26,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.names import is_global_name, is_type_name
+from rmpa.core.identity import is_global_name, is_type_name, peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 

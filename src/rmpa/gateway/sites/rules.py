@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.gateway_rules import ROS2, Crossing
 from rmpa.config.permission_rules import Access
-from rmpa.core.names import is_global_name, matches
+from rmpa.core.identity import is_global_name, matches
 from rmpa.gateway.neighbour import SourceKind
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE
 from rmpa.ros.wire.services import ServiceDescription

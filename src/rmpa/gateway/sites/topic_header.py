@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.ros.wire.tcpros import TopicDescription
 

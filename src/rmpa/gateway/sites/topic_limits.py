@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.counters import TokenBucket
 from rmpa.gateway import limits
 
 if TYPE_CHECKING:

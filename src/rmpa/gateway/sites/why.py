@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import GATEWAY, ROOT

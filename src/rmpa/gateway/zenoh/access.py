@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.peer_rules import PEER
 from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect
-from rmpa.core.names import matches
+from rmpa.core.identity import matches
 from rmpa.trust.permissions import action_topics
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind
 

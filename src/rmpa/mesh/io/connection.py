@@ -10,8 +10,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.connection_events import (
@@ -34,9 +34,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.core.clock import Clock
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.counters import Clock
+    from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.connection import OnData, OnPart
     from rmpa.mesh.handshake import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket

@@ -9,8 +9,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
+from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
-from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 

@@ -12,7 +12,7 @@ from rmpa.mesh.frames import FrameKind
 from rmpa.mesh.io.lane import LaneSender
 
 if TYPE_CHECKING:
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.mesh.io.connection import Connection
 
 OnLinkData = Callable[["PeerLink", int, int, int, memoryview], None]

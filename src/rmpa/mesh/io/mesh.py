@@ -45,9 +45,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Coroutine
 
-    from rmpa.core.clock import Clock
-    from rmpa.core.guid import Guid
-    from rmpa.core.identity import Identity
+    from rmpa.core.counters import Clock
+    from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.handshake import Hello
     from rmpa.mesh.io.securing import OnJoin, SecuredSocket
     from rmpa.mesh.peering_events import SocketAddress

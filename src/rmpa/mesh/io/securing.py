@@ -17,8 +17,8 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refusal, Refuse
@@ -27,8 +27,7 @@ from rmpa.trust.io.contexts import ALPN_JOIN, ALPN_LINK
 from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
-    from rmpa.core.clock import Clock
-    from rmpa.core.counters import RefusalLog
+    from rmpa.core.counters import Clock, RefusalLog
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello
     from rmpa.mesh.peering_events import SocketAddress

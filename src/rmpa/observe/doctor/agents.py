@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.open_files import remedy
+from rmpa.core.counters import remedy
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.runtime.realtime import REMEDY

@@ -13,7 +13,7 @@ import msgspec
 from rmpa.bridge.messages import with_text
 from rmpa.config.module_name import NameFacts, running_agent
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply, ControlRequest
 from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs

@@ -13,7 +13,7 @@ from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.observe import limits
 from rmpa.observe.contract_term import ContractTerm
 from rmpa.observe.graph_changes import GraphRevision

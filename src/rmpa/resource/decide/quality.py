@@ -10,7 +10,7 @@ import math
 import struct
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK
+from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK
 
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute, Value

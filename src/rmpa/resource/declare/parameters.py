@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
-from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
-from rmpa.core.names import is_legal_name
+from rmpa.core.identity import is_legal_name
 from rmpa.resource.declare.adaptation_settings import AdaptationSettings, read_adaptation
 from rmpa.resource.declare.attributes import MEASURED, Attribute, Category, Direction, Scale
 from rmpa.resource.declare.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task

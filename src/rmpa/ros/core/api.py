@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Protocol
 
-from rmpa.core.log import logged_failure
+from rmpa.core.counters import logged_failure
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import OutOfDescriptors, UnreachableError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.http.client import connect, is_own_name, split_uri
 from rmpa.ros.master.reachability import Reachability

@@ -12,7 +12,7 @@ import logging
 import random
 from typing import TYPE_CHECKING, TypeAlias
 
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at

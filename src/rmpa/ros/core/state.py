@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call_api

@@ -16,7 +16,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from rmpa.core.errors import OutOfDescriptors, UnreachableError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.http.documents import read_large, slices
 from rmpa.ros.wire.http import ResponseParser, post_request

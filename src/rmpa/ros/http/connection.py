@@ -8,7 +8,7 @@ import struct
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
 from rmpa.ros.wire.xmlrpc import serialize_fault

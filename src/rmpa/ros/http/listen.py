@@ -9,8 +9,8 @@ import ipaddress
 import socket
 from typing import TYPE_CHECKING
 
+from rmpa.core.counters import remedy
 from rmpa.core.errors import StartError
-from rmpa.core.open_files import remedy
 from rmpa.ros import limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.tcp_connections import program_at

@@ -17,7 +17,7 @@ from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rmpa.core.yielding import Yielder
+    from rmpa.core.counters import Yielder
     from rmpa.ros.master.survey import Survey
 
 Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]

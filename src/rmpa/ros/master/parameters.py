@@ -15,7 +15,7 @@ from rmpa.ros.master.resolution import join, with_slash
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.core.yielding import Yielder
+    from rmpa.core.counters import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"

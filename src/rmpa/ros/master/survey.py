@@ -16,7 +16,7 @@ from rmpa.ros.wire.xmlrpc import XmlRpcValue, brief
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.core.yielding import Yielder
+    from rmpa.core.counters import Yielder
 
 _KINDS: Final = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)
 """The kinds of the three lists of ``getSystemState``, in order."""

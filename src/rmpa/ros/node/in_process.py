@@ -11,9 +11,9 @@ import random
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
+from rmpa.core.limits import MIB
 from rmpa.core.outbox import QueuedMessage
-from rmpa.core.sizes import MIB
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import INBOUND, BusConnection
 from rmpa.ros.wire.tcpros import ANY, subscriber_header

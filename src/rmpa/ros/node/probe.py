@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, UnreachableError
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros.http.client import connect
 from rmpa.ros.wire.services import client_header
 from rmpa.ros.wire.tcpros import encode_header, parse_header, printable

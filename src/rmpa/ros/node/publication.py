@@ -12,7 +12,7 @@ from collections import deque
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from rmpa.core.log import logged_failure
+from rmpa.core.counters import logged_failure
 from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, publisher_header

@@ -17,8 +17,8 @@ from rmpa.core.errors import (
     RmpaError,
     UnreachableError,
 )
+from rmpa.core.limits import KIB
 from rmpa.core.outbox import Outbox
-from rmpa.core.sizes import KIB
 from rmpa.ros import limits
 from rmpa.ros.http.client import connect
 from rmpa.ros.node.accepted_connection import keep_alive

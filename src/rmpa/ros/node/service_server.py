@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits as config_limits
+from rmpa.core.counters import logged_failure
 from rmpa.core.errors import LimitExceeded, RmpaError
-from rmpa.core.log import logged_failure
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.node.service_stream import BODIES, INLINE, send_large
 from rmpa.ros.wire.services import (

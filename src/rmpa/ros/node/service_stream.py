@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:

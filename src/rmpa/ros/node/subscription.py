@@ -8,7 +8,7 @@ import random
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
-from rmpa.core.backoff import Backoff
+from rmpa.core.counters import Backoff
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.ros import limits

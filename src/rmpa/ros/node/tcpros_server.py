@@ -8,9 +8,8 @@ import logging
 import socket
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import StartError
-from rmpa.core.open_files import remedy
 from rmpa.ros import limits
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
@@ -21,7 +20,7 @@ from rmpa.runtime.system_clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.wire.tcpros import Header

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, RmpaError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.ros import limits
 
 if TYPE_CHECKING:

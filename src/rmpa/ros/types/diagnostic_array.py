@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 from rmpa.ros.types.std_header import HEADER_PART
 
 if TYPE_CHECKING:

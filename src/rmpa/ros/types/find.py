@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, Protocol, TypeVar
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.ros import limits
 from rmpa.ros.types.definitions import (
     DefinitionError,

@@ -20,7 +20,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.ros import limits
 from rmpa.ros.types.actions import action_message, actions_of
 from rmpa.ros.types.definitions import SEPARATOR

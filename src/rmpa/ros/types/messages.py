@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 from rmpa.ros import limits
 from rmpa.ros.types.definitions import (
     DefinitionError,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
-from rmpa.core.names import is_global_name, is_legal_name
-from rmpa.core.sizes import INT32_MAX
+from rmpa.core.identity import is_global_name, is_legal_name
+from rmpa.core.limits import INT32_MAX
 from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:

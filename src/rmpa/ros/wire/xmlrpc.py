@@ -18,7 +18,7 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
 

@@ -13,7 +13,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 
 if TYPE_CHECKING:

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.core.clock import Clock
-    from rmpa.core.counters import Counters
+    from rmpa.core.counters import Clock, Counters
     from rmpa.runtime.record_layer import TlsHandshake
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.membership import Membership

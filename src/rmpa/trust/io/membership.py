@@ -21,7 +21,7 @@ from rmpa.trust.reasons import TrustError, TrustReason
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.trust.io.store import MemberFiles, TrustStore
 
 _log = logging.getLogger(__name__)

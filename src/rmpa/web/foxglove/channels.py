@@ -11,7 +11,7 @@ import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.web import limits
 from rmpa.web.foxglove.protocol import (
     ENCODING,

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 from msgspec import UNSET, UnsetType
 
 from rmpa.core.errors import RmpaError
-from rmpa.core.names import is_global_name
-from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.core.identity import is_global_name
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.web import limits
 from rmpa.web.foxglove.protocol import FoxgloveParameter, ParameterValues
 from rmpa.web.hub import requests

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.sizes import UINT32_MAX
+from rmpa.core.limits import UINT32_MAX
 from rmpa.web import limits
 
 if TYPE_CHECKING:

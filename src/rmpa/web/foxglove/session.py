@@ -11,9 +11,9 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError
-from rmpa.core.names import is_global_name, is_type_name
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.channels import ChannelTable

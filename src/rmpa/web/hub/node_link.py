@@ -8,8 +8,8 @@ import functools
 import logging
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
+from rmpa.core.counters import logged_failure
 from rmpa.core.errors import RmpaError, UnreachableError
-from rmpa.core.log import logged_failure
 from rmpa.web import limits
 from rmpa.web.hub.rights import EVERYTHING
 

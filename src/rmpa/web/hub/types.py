@@ -7,8 +7,8 @@ import logging
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RmpaError
-from rmpa.core.token_bucket import TokenBucket
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.types.definitions import UnknownTypeError, known_text

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB
 
 PATCH_PERIOD: Final = 0.15
 """Between two patches of one client: some 7 a second, which looks live and is read at leisure."""

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.names import is_global_name
-from rmpa.core.token_bucket import TokenBucket
+from rmpa.core.identity import is_global_name
 from rmpa.web.hub import requests
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.joystick import Joystick

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.limits import KIB, MIB
 
 FRAME_MAX: Final = 10 * MIB
 """One frame of a client, and so a message that it publishes, in JSON; rosbridge_suite's default."""

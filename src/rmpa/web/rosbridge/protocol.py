@@ -15,7 +15,7 @@ import cbor2
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.names import is_type_name, resolve_name
+from rmpa.core.identity import is_type_name, resolve_name
 from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:

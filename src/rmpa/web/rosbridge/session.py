@@ -163,7 +163,9 @@ class RosbridgeSession:
         """Do what is due."""
         self._subscriptions.handle_timer(now)
         for mid in self._fragments.expire(now):
-            self._context.status("warning", f"no next fragment came for {limits.FRAGMENT_TIMEOUT:g} s", cast(Id, mid))
+            self._context.status(
+                "warning", f"no next fragment came for {limits.FRAGMENT_TIMEOUT:g} s", cast("Id", mid)
+            )
 
     def close(self) -> None:
         """The client has gone: `requests_to_send` then ends all that it had."""

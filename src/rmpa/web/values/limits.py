@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.sizes import MIB
+from rmpa.core.limits import MIB
 
 CODECS_MAX: Final = 512
 """Compiled types in the cache of the process; a module has some 50 types. The least recently used is dropped."""

@@ -32,7 +32,7 @@ from rmpa.bridge.topics.io import remote_subscribers as module
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
 from rmpa.config.permission_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
-from rmpa.core.guid import Guid
+from rmpa.core.identity import Guid
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:

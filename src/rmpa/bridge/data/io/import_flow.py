@@ -17,8 +17,8 @@ from rmpa.bridge.data.quality import Quality
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK, is_earlier
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableReceiver
 from rmpa.ros import limits as ros_limits

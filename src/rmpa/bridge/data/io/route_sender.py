@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.data.downsampling import Downsampler
 from rmpa.bridge.data.lane_switch import EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, History, Reliability
-from rmpa.core.serial_number import SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
 from rmpa.runtime import limits as runtime_limits

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.core.sizes import KIB, MIB
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime.event_loop import yield_to_data

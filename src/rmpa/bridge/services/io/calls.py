@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
-from rmpa.core.serial_number import SERIAL_MASK
-from rmpa.core.stats import SampleRing
+from rmpa.core.counters import SampleRing
+from rmpa.core.identity import SERIAL_MASK
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.services import ServiceDescription
 

@@ -19,7 +19,7 @@ from rmpa.bridge.services.actions import (
 from rmpa.bridge.services.io.calls import Budgets, CallStats, Server
 from rmpa.bridge.services.io.connection_pool import ServicePool
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.ros.core.liveness import listening_ports
 from rmpa.ros.http.client import is_own_name
 from rmpa.ros.node.local_addresses import local_addresses

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.core.names import is_type_name
+from rmpa.core.identity import is_type_name
 from rmpa.ros.master.effects import RegistrationKind
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits
 from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.core.contract import Durability, Reliability
-from rmpa.core.serial_number import serial_add
+from rmpa.core.identity import serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import TopicDescription, printable

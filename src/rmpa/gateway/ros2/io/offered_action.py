@@ -25,7 +25,7 @@ from rmpa.gateway.zenoh_api import ZenohQos
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.gateway.graph.taps import TopicTap
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.part import Ros2Context

@@ -26,7 +26,7 @@ from rmpa.gateway.ros2.tokens import EntityKind
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.gateway.graph.taps import TopicTap
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint

@@ -15,8 +15,8 @@ from rmpa.gateway.sites.traffic import SiteTraffic
 from rmpa.runtime.corking import after_read
 
 if TYPE_CHECKING:
-    from rmpa.core.clock import Clock
     from rmpa.core.contract import Contract
+    from rmpa.core.counters import Clock
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.graph.taps import TopicTap
     from rmpa.gateway.sites.part import SiteExport

@@ -20,7 +20,7 @@ from rmpa.ros.wire.tcpros import printable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.core.clock import Clock
+    from rmpa.core.counters import Clock
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.part import SiteImport

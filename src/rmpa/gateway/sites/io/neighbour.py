@@ -6,9 +6,8 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.core.clock import earliest
+from rmpa.core.counters import earliest, logged_failure
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.log import logged_failure
 from rmpa.gateway import limits
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue
 from rmpa.gateway.sites.exports import SiteExports

@@ -21,8 +21,8 @@ from rmpa.gateway.sites.report import site_counts
 from rmpa.gateway.sites.topic_header import REFUSED
 
 if TYPE_CHECKING:
-    from rmpa.core.clock import Clock
     from rmpa.core.contract import Contracts
+    from rmpa.core.counters import Clock
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.sites.attachment import MessageSource
     from rmpa.gateway.sites.keys import SiteModule

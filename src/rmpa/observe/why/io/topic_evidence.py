@@ -12,7 +12,7 @@ from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.why.diagnosis import (
     ProxyState,

@@ -13,7 +13,7 @@ from rmpa.bridge.permission_gate import Needs
 from rmpa.config.permission_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, Check
 from rmpa.observe.io.site_requests import WHY as WHY_SITES

@@ -17,7 +17,7 @@ from rmpa.bridge.io.node_requests import INFO
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.names import is_global_name
+from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.io.peer_params import PeerParams, parameters_in

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.sizes import KIB
+from rmpa.core.limits import KIB
 from rmpa.web.monitor import limits
 from rmpa.web.values.codec import codec_for
 
