@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 import rmpa
-from rmpa.config.sources import Loaded
+from rmpa.config.read import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.graph_changes import GraphRevision, TopicRow

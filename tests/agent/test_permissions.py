@@ -19,7 +19,7 @@ from rmpa.bridge.io.node_requests import INFO, LIST, PING
 from rmpa.bridge.io.proxy_kills import KILL
 from rmpa.bridge.params import transfer
 from rmpa.bridge.session.peer_session import PeerSession
-from rmpa.config.permission_rules import Effect, PermissionRule
+from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused

@@ -17,9 +17,9 @@ import pytest
 
 from rmpa.agent import reload
 from rmpa.agent.reload import Reloader, SighupHandler
-from rmpa.config.permission_rules import ModuleGroup, PermissionRule
+from rmpa.config.peer_rules import ModuleGroup, PermissionRule
+from rmpa.config.read import Loaded, load_settings
 from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings, TrustSettings
-from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
 

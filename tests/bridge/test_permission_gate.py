@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from rmpa.bridge import limits
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.cli.trust import check
-from rmpa.config.permission_rules import Access, PermissionRule
+from rmpa.config.peer_rules import Access, PermissionRule
+from rmpa.config.read import load_settings
 from rmpa.config.settings import TrustSettings
-from rmpa.config.sources import load_settings
 from rmpa.core.counters import Counters
 from rmpa.trust.permissions import Permissions
 

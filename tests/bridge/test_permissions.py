@@ -28,7 +28,7 @@ from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
-from rmpa.config.permission_rules import Access, Effect, PermissionRule
+from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
 from rmpa.core.counters import Counters

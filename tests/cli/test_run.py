@@ -13,7 +13,7 @@ import pytest
 
 from lab.bed.processes import Process, eventually
 from rmpa.cli.run import _module_name, prepared
-from rmpa.config.state_dir import keep_name
+from rmpa.config.module_name import keep_name
 from rmpa.core.errors import ConfigError
 from tests.interop.ros import free_port
 

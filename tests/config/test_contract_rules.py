@@ -13,11 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.file import LISTS
-from rmpa.config.quantities import read_duration, read_rate
+from rmpa.config.read import LISTS, Loaded, line_of, load_settings
+from rmpa.config.schema import read_duration, read_rate
 from rmpa.config.settings import Settings
-from rmpa.config.sources import Loaded, load_settings
-from rmpa.config.toml_lines import line_of
 from rmpa.config.values import BadValue
 from rmpa.core.contract import (
     KEYS,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
-from rmpa.config.sources import load_settings
+from rmpa.config.read import load_settings
+from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

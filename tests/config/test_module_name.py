@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.module_name import ModuleName, NameFacts, NameSource, choose_name
-from rmpa.config.sources import load_settings
-from rmpa.config.state_dir import (
+from rmpa.config.module_name import (
     NAME_FILE,
+    ModuleName,
+    NameFacts,
+    NameSource,
+    choose_name,
     keep_name,
     kept_name,
     note_state_dir,
     other_state_dirs,
     usual_state_dirs,
 )
+from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config import limits
-from rmpa.config.param_rules import overlap, untouchable
+from rmpa.config.read import Loaded, load_settings
+from rmpa.config.rules import overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
-from rmpa.config.sources import Loaded, load_settings
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

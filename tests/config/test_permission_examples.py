@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa.cli.trust import check
-from rmpa.config.permission_rules import NAME_KEYS, Access
-from rmpa.config.sources import load_settings
+from rmpa.config.peer_rules import NAME_KEYS, Access
+from rmpa.config.read import load_settings
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "permissions.md").read_text("utf-8")
 EXAMPLES = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)

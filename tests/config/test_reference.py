@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
 from rmpa.cli.up import up
-from rmpa.config.reference import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
+from rmpa.config.module_name import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
+from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, TABLES, Multicast
-from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
 

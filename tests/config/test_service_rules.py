@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config.read import load_settings
 from rmpa.config.settings import ServiceRule, ServiceSettings
-from rmpa.config.sources import load_settings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
 

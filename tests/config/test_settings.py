@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.file import LISTS, SCHEMAS, parse_config
+from rmpa.config.read import LISTS, SCHEMAS, Loaded, find_config_file, line_of, load_settings, parse_config
 from rmpa.config.settings import (
     SETTINGS,
     GatewaySettings,
@@ -27,8 +27,6 @@ from rmpa.config.settings import (
     TrustSettings,
     WebSettings,
 )
-from rmpa.config.sources import Loaded, find_config_file, load_settings
-from rmpa.config.toml_lines import line_of
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError

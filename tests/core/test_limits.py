@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import pytest
 
 import rmpa
-from rmpa.config.file import SCHEMAS
+from rmpa.config.read import SCHEMAS
 from rmpa.core import limits as sizes
 from rmpa.core.limits import KIB, MIB
 from rmpa.web.monitor import limits as monitor_limits

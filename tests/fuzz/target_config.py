@@ -8,12 +8,10 @@ from pathlib import Path
 from rmpa.bridge.messages import OpenRoute, decode, encode
 from rmpa.bridge.naming import PeerNames
 from rmpa.config import limits
-from rmpa.config.contract_rules import CONTRACT_RULES
-from rmpa.config.file import SCHEMAS, parse_config
-from rmpa.config.gateway_rules import GATEWAY_RULES
-from rmpa.config.param_rules import PARAM_RULES, overlap, untouchable
 from rmpa.config.peer_rules import PEER_RULES
-from rmpa.config.quantities import read_bytes_a_second, read_duration, read_rate
+from rmpa.config.read import SCHEMAS, parse_config
+from rmpa.config.rules import CONTRACT_RULES, GATEWAY_RULES, PARAM_RULES, overlap, untouchable
+from rmpa.config.schema import read_bytes_a_second, read_duration, read_rate
 from rmpa.config.settings import SETTINGS
 from rmpa.config.values import BadValue
 from rmpa.core.contract import Contracts

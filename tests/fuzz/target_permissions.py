@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rmpa.config.file import parse_config
-from rmpa.config.permission_rules import MODULE_GROUPS, PERMISSION_RULES, Access, Effect, permission_problems
+from rmpa.config.peer_rules import MODULE_GROUPS, PERMISSION_RULES, Access, Effect, permission_problems
+from rmpa.config.read import parse_config
 from rmpa.config.settings import TrustSettings
 from rmpa.config.values import BadValue
 from rmpa.core.errors import ConfigError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
+from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits

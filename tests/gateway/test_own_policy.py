@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.config.policy import PolicySettings
-from rmpa.config.service_rules import ServiceRule
+from rmpa.config.peer_rules import PolicySettings, ServiceRule
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.own_policy import OwnPolicy

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.config.permission_rules import Access, Effect, PermissionRule
+from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.gateway.site_permissions import SitePermissions

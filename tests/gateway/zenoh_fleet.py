@@ -6,8 +6,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rmpa.config.gateway_rules import GatewaySettings
-from rmpa.config.permission_rules import Effect, PermissionRule
+from rmpa.config.peer_rules import Effect, PermissionRule
+from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.gateway.zenoh.trust import open_trusted_session
 from tests.gateway.zenoh_bed import free_port

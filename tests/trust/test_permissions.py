@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.permission_rules import Access, Effect, ModuleGroup, PermissionRule
+from rmpa.config.peer_rules import Access, Effect, ModuleGroup, PermissionRule
+from rmpa.config.read import load_settings
 from rmpa.config.settings import TrustSettings
-from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError
 from rmpa.trust import limits
 from rmpa.trust.permissions import PermissionDecision, Permissions

@@ -52,8 +52,8 @@ from rmpa.trust.permissions import Permissions
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Loaded
     from rmpa.core.identity import Identity
     from rmpa.observe.io.control_server import Handler
     from rmpa.ros.core.api import Core

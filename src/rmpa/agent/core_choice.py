@@ -10,7 +10,7 @@ import os
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.policy import OWN_NODE, is_own
-from rmpa.config.state_dir import core_file
+from rmpa.config.module_name import core_file
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.ros.core.embedded import RosCore

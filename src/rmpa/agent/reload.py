@@ -18,9 +18,9 @@ from rmpa.runtime.service_manager import notify_service_manager
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.config.read import Loaded
     from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Loaded
 
 _log = logging.getLogger(__name__)
 

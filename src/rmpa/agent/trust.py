@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.session.part import Part
-from rmpa.config.state_dir import state_dir
+from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.trust import limits

@@ -15,8 +15,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
+from rmpa.config.rules import CLOCK
 from rmpa.core.identity import matches
 
 if TYPE_CHECKING:

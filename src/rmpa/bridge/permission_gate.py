@@ -14,7 +14,7 @@ from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.config.permission_rules import Access
+    from rmpa.config.peer_rules import Access
     from rmpa.config.settings import TrustSettings
     from rmpa.trust.permissions import Permissions
 

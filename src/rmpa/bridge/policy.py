@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
+from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.core.identity import NEVER_CROSSING, matches
 

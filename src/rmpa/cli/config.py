@@ -10,9 +10,9 @@ import click
 
 from rmpa.cli.options import json_option
 from rmpa.cli.output import Column, print_json, print_table, printable, warn
-from rmpa.config.reference import json_value, schema_text, toml_value
+from rmpa.config.module_name import json_value, schema_text, toml_value
+from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS
-from rmpa.config.sources import load_settings
 
 if TYPE_CHECKING:
     from rmpa.config.schema import Setting

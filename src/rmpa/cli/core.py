@@ -58,7 +58,7 @@ def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, 
 
 async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
     from rmpa import __version__
-    from rmpa.config.state_dir import core_file
+    from rmpa.config.module_name import core_file
     from rmpa.ros.core.embedded import ROS_VERSION, RosCore
 
     ended = asyncio.Event()

@@ -17,8 +17,8 @@ from rmpa.cli.lazy_group import LazyGroup
 from rmpa.cli.module import find_name
 from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.module_name import GATEWAY_SUFFIX
+from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
-from rmpa.config.sources import load_settings
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
@@ -29,8 +29,8 @@ from rmpa.trust.status import TrustStatus
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.config.read import Given, Loaded
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Given, Loaded
 
 _log = logging.getLogger("rmpa.gateway")
 _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.config.module_name import GATEWAY_SUFFIX, choose_name
-from rmpa.config.sources import load_settings
-from rmpa.config.state_dir import keep_name, state_dir
+from rmpa.config.module_name import GATEWAY_SUFFIX, choose_name, keep_name, state_dir
+from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe.io.control_client import ControlClient, find_agents, with_running
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.config.module_name import ModuleName, NameFacts
+    from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Loaded
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.cli.graph import GraphName, read_graph, read_name
 from rmpa.cli.output import printable
 from rmpa.cli.stream import with_node
-from rmpa.config.gateway_rules import ROS2
+from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.run.descriptor import TOPIC, Descriptor

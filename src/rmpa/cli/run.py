@@ -109,7 +109,7 @@ def run(
 def _module_name(options: Sequence[str]) -> str:
     """The module's name as ``rmpa up`` would have it, but for the host's; empty: the first resource names it."""
     from rmpa.config.module_name import NameSource, choose_name
-    from rmpa.config.sources import load_settings
+    from rmpa.config.read import load_settings
 
     file = next((after for before, after in pairwise(options) if before == "--config"), None)
     chosen = choose_name(load_settings({"config": file}, os.environ, host_name="").name_facts)
@@ -318,7 +318,7 @@ def _core_of(name: str) -> str | None:
 
 def _state_dir(module: str, state: str | None) -> Path | None:
     """The directory in which the resources of a module store their state; ``None`` without a home directory."""
-    from rmpa.config.state_dir import module_dir, state_dir
+    from rmpa.config.module_name import module_dir, state_dir
 
     directory = state_dir(os.environ, state)
     if directory is None:

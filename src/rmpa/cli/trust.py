@@ -10,8 +10,8 @@ import click
 
 from rmpa.cli.options import completes, json_option
 from rmpa.cli.output import print_json, printable, warn
-from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access
-from rmpa.config.sources import load_settings
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
+from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.trust.permissions import Permissions, action_topics

@@ -14,9 +14,8 @@ import click
 
 from rmpa.cli.module import find_module
 from rmpa.cli.output import warn
-from rmpa.config.module_name import GATEWAY_SUFFIX
-from rmpa.config.sources import load_settings
-from rmpa.config.state_dir import keep_name, kept_name, note_state_dir
+from rmpa.config.module_name import GATEWAY_SUFFIX, keep_name, kept_name, note_state_dir
+from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.trust.io.store import TrustStore

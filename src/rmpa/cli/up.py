@@ -14,7 +14,7 @@ import click
 from rmpa.cli.module import keep_first_name
 from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.module_name import NameSource, choose_name
-from rmpa.config.sources import load_settings
+from rmpa.config.read import load_settings
 from rmpa.core.counters import configure_logging
 from rmpa.runtime.log_writer import LogWriter
 

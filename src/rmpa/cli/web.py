@@ -15,8 +15,8 @@ import click
 
 from rmpa.cli.module import find_module
 from rmpa.cli.options import agent_option, json_option
+from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
-from rmpa.config.sources import load_settings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError

@@ -10,21 +10,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
-from rmpa.config.contract_rules import CONTRACT_RULES
-from rmpa.config.gateway_rules import CrossingRule, GatewaySettings, Ros2Settings
-from rmpa.config.param_rules import PARAM_RULES, FollowRule
-from rmpa.config.peer_rules import PEER, PEER_RULES, PeerRule
-from rmpa.config.permission_rules import (
+from rmpa.config.peer_rules import (
     MODULE_GROUPS,
+    PEER,
+    PEER_RULES,
     PERMISSION_DEFAULT,
     PERMISSION_RULES,
+    SERVICE_RULES,
     ModuleGroup,
+    PeerRule,
     PermissionRule,
+    PolicySettings,
+    ServiceRule,
 )
-from rmpa.config.policy import PolicySettings
-from rmpa.config.quantities import TIMEOUT
-from rmpa.config.schema import setting, settings_of, table
-from rmpa.config.service_rules import SERVICE_RULES, ServiceRule
+from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, CrossingRule, FollowRule, GatewaySettings, Ros2Settings
+from rmpa.config.schema import TIMEOUT, setting, settings_of, table
 from rmpa.config.values import (
     BOOL,
     BOUND,

@@ -21,8 +21,8 @@ from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Mapping
 
+    from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
-    from rmpa.config.sources import Loaded
     from rmpa.gateway.neighbour import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
 

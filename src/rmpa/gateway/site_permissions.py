@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.bridge.permission_gate import PermissionGate
-    from rmpa.config.permission_rules import Access
+    from rmpa.config.peer_rules import Access
     from rmpa.trust.permissions import PermissionDecision
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.peer_rules import PEER
-from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect, PermissionRule
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect, PermissionRule
 from rmpa.core.identity import matches
 from rmpa.trust import limits
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.permission_rules import PermissionRule
+from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule, Priority, Reliability

@@ -21,7 +21,7 @@ from tests.gateway.zenoh_bed import ZenohBed, bed, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.config.gateway_rules import CrossingRule
+    from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import ContractRule
     from rmpa.gateway.zenoh.session import OpenSession
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.exports import SiteExports

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.bridge.policy import Policy, PolicyDecision
-from rmpa.config.gateway_rules import Crossing, CrossingRule
-from rmpa.config.permission_rules import Access, PermissionRule
-from rmpa.config.policy import PolicySettings
+from rmpa.config.peer_rules import Access, PermissionRule, PolicySettings
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import SourceKind

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway.zenoh_api import ZenohQos
 from tests.gateway.sites.site_bed import SiteBed, described
 from tests.gateway.zenoh_bed import ZenohBed, until

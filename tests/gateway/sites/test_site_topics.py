@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.contract import ContractRule
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import token_keys

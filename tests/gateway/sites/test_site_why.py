@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.config.gateway_rules import Crossing, CrossingRule
-from rmpa.config.permission_rules import Access, PermissionRule
+from rmpa.config.peer_rules import Access, PermissionRule
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.permission_rules import Effect, ModuleGroup, PermissionRule
+from rmpa.config.peer_rules import Effect, ModuleGroup, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.identity import matches
 from rmpa.gateway.zenoh.access import AccessTable, access_table, key_expressions

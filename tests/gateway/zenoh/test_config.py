@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.config.rules import GatewaySettings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import limits
 from rmpa.gateway.zenoh.config import MeshCertificates, ZenohMode, gateway_config, zenohd_entries

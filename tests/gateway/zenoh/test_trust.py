@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import trust
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.config.permission_rules import PermissionRule
+    from rmpa.config.peer_rules import PermissionRule
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
 

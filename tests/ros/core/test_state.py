@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.state_dir import core_file
+from rmpa.config.module_name import core_file
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import state

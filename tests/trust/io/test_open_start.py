@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.state_dir import note_state_dir
+from rmpa.config.module_name import note_state_dir
 from rmpa.core.errors import StartError
 from rmpa.trust.io.open_start import check_open_start
 from rmpa.trust.io.store import TrustStore

@@ -12,7 +12,7 @@ import aiohttp
 import msgspec
 import pytest
 
-from rmpa.config.permission_rules import Access, Effect, PermissionRule
+from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused
 from rmpa.resource import Resource

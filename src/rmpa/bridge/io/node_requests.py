@@ -13,7 +13,7 @@ from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config import limits as config_limits
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_global_name, matches

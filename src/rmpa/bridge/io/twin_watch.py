@@ -10,7 +10,7 @@ from rmpa.bridge.permission_gate import Needs
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.session.part import Part
 from rmpa.bridge.twins import OFFERED_MIN, telling, twin_names, twin_text
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.counters import RefusalLog
 from rmpa.core.identity import is_global_name, matches
 from rmpa.runtime.event_loop import yield_to_data

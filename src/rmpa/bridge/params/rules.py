@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits as config_limits
-from rmpa.config.param_rules import SIM_TIME, overlap, untouchable
+from rmpa.config.rules import SIM_TIME, overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 from rmpa.core.identity import matches
 from rmpa.ros import limits as ros_limits

@@ -36,7 +36,7 @@ from rmpa.bridge.services.actions import (
     ServeRoute,
     ServiceAbout,
 )
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
 

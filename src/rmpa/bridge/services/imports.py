@@ -48,7 +48,7 @@ from rmpa.bridge.services.actions import (
     Withdraw,
 )
 from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, ServiceRouteState
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import Guid

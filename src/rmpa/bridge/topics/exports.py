@@ -43,7 +43,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import may_have
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 from rmpa.core.identity import is_later, serial_add

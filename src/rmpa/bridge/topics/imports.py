@@ -35,8 +35,8 @@ from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
 from rmpa.bridge.topics.import_routes import ImportRoutes
 from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
-from rmpa.config.param_rules import CLOCK
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
+from rmpa.config.rules import CLOCK
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contracts
 

@@ -10,7 +10,7 @@ from rmpa.gateway.sites.rules import CrossingDecision, CrossingRules
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.config.gateway_rules import CrossingRule
+    from rmpa.config.rules import CrossingRule
 
 SITE: Final = "ros2"
 """The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.gateway_rules import ROS2, Crossing
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
+from rmpa.config.rules import ROS2, Crossing
 from rmpa.core.identity import is_global_name, matches
 from rmpa.gateway.neighbour import SourceKind
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.bridge.policy import PolicyDecision
-    from rmpa.config.gateway_rules import CrossingRule
+    from rmpa.config.rules import CrossingRule
     from rmpa.gateway.site_permissions import SitePermissions
 
     Judge = Callable[[SourceKind, str, str, str], PolicyDecision]

@@ -18,15 +18,14 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.peer_rules import PEER
-from rmpa.config.permission_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect
 from rmpa.core.identity import matches
 from rmpa.trust.permissions import action_topics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from rmpa.config.permission_rules import PermissionRule
+    from rmpa.config.peer_rules import PermissionRule
     from rmpa.config.settings import TrustSettings
 
 _MODULE: Final = "rmpa/1/*/*"

@@ -12,7 +12,7 @@ from rmpa.gateway.zenoh import limits
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.config.gateway_rules import GatewaySettings
+    from rmpa.config.rules import GatewaySettings
 
 _ENCRYPTED: Final = ("tls", "quic")
 """Protocols of endpoints that are encrypted, and that certificates are checked at."""

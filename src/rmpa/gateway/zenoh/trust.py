@@ -17,7 +17,7 @@ from rmpa.trust.io.store import CA, CERTIFICATE, DENY, KEY
 from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
 
 if TYPE_CHECKING:
-    from rmpa.config.gateway_rules import GatewaySettings
+    from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.gateway.zenoh.session import OpenSession

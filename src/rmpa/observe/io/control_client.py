@@ -176,7 +176,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     if not wanted:
         facts = NameFacts()
         if len(agents) > 1:
-            from rmpa.config.sources import load_settings  # noqa: PLC0415 - most commands need no settings
+            from rmpa.config.read import load_settings  # noqa: PLC0415 - most commands need no settings
 
             with contextlib.suppress(ConfigError):  # a broken rmpa.toml is no reason not to ask
                 facts = load_settings({}, environ, host_name=socket.gethostname()).name_facts

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rmpa.bridge import limits
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 
 if TYPE_CHECKING:

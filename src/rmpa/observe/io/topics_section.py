@@ -13,7 +13,7 @@ from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, PolicyDecision, is_own
 from rmpa.bridge.topics.remote_topic import RouteState
-from rmpa.config.param_rules import CLOCK
+from rmpa.config.rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
 from rmpa.observe.contract_term import ContractTerm

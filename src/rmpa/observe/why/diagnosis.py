@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.observe.check import FAIL, OK, Check
 from rmpa.trust.permissions import prohibition, refusal
 

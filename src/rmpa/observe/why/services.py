@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import PERMISSION_THERE, Diagnosis, permission_here, permission_there, until_failure
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.relay import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel

@@ -5,8 +5,8 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Any
 
-from rmpa.config.contract_rules import CONTRACT_RULES
-from rmpa.config.file import LISTS
+from rmpa.config.read import LISTS
+from rmpa.config.rules import CONTRACT_RULES
 from rmpa.config.values import BadValue, did_you_mean
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.config.module_name import GATEWAY_SUFFIX
-from rmpa.config.state_dir import other_state_dirs
+from rmpa.config.module_name import GATEWAY_SUFFIX, other_state_dirs
 from rmpa.core.errors import StartError
 from rmpa.trust.io.store import TrustStore, modules_with_keys
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.config.state_dir import module_dir
+from rmpa.config.module_name import module_dir
 from rmpa.core.errors import StartError
 from rmpa.trust import limits
 from rmpa.trust.tokens import Invitation, TokenBook

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.web import limits

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.master.resolution import canonical

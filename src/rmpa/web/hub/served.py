@@ -8,7 +8,7 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.config.permission_rules import Effect
-from rmpa.config.state_dir import module_dir, state_dir
+from rmpa.config.module_name import module_dir, state_dir
+from rmpa.config.peer_rules import Effect
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.trust.page_names import server_names
 from rmpa.trust.permissions import Permissions

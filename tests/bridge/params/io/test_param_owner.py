@@ -10,7 +10,7 @@ import pytest
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
 from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.config.permission_rules import Effect, PermissionRule
+from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import ParamSettings, TrustSettings
 from rmpa.core.errors import PeerRefused
 from rmpa.trust.permissions import Permissions

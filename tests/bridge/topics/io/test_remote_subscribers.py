@@ -30,7 +30,7 @@ from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.io import remote_subscribers as module
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
-from rmpa.config.permission_rules import PermissionRule
+from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
 from rmpa.core.identity import Guid
 from rmpa.trust.permissions import Permissions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.config.gateway_rules import GatewaySettings, Ros2Settings
+from rmpa.config.rules import GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.gateway.ros2.io.own_nodes import gid_of
@@ -20,7 +20,7 @@ from tests.gateway.memory_zenoh import MemoryZenoh
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.config.gateway_rules import CrossingRule
+    from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import Contracts
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.zenoh_api import ZenohSample

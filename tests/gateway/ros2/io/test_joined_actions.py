@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.config.rules import GatewaySettings
 from rmpa.gateway.ros2.action_messages import parse_outcome
 from rmpa.gateway.ros2.action_pair import ActionPair
 from rmpa.gateway.ros2.attachment import Ros2Attachment

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.config.gateway_rules import GatewaySettings
+from rmpa.config.rules import GatewaySettings
 from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph

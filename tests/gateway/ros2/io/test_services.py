@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings
+from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.attachment import Ros2Attachment

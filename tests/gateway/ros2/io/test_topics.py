@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.config.gateway_rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
+from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.attachment import Ros2Attachment

@@ -11,7 +11,7 @@ from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import ParamCore, read_text
 from rmpa.bridge.params.rules import Following, learn
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.param_rules import SIM_TIME
+from rmpa.config.rules import SIM_TIME
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 

@@ -14,8 +14,8 @@ from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
 from rmpa.bridge.params.rules import key_problem, replaced
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.config import limits as config_limits
-from rmpa.config.param_rules import overlap
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
+from rmpa.config.rules import overlap
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.ros.master.parameters import leaves

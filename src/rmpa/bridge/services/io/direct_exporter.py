@@ -8,7 +8,7 @@ from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.direct.grants import Grants
 from rmpa.bridge.direct.io.endpoints import LocalEndpoints
 from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Transport
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.topics.audience import compares_names
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.contract import combine
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.effects import GraphChange, RegistrationKind

@@ -15,7 +15,7 @@ from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxy_names import proxied_node, proxy_name
 from rmpa.bridge.topics.audience import audience, is_watched
 from rmpa.bridge.topics.remote_topic import RouteState
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:

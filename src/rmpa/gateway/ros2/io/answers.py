@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.crossing import SITE

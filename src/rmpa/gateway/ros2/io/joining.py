@@ -11,7 +11,7 @@ from rmpa.gateway.ros2.io.services import Ros2Services
 from rmpa.gateway.ros2.io.topics import Ros2Topics
 
 if TYPE_CHECKING:
-    from rmpa.config.permission_rules import Access
+    from rmpa.config.peer_rules import Access
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.zenoh.session import OpenSession

@@ -23,7 +23,7 @@ from rmpa.gateway.ros2.why import topic_ways
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rmpa.config.gateway_rules import GatewaySettings
+    from rmpa.config.rules import GatewaySettings
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.io.part import Ros2Part

@@ -11,7 +11,7 @@ from rmpa.ros.types.definitions import known_types
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from rmpa.config.gateway_rules import GatewaySettings
+    from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
     from rmpa.gateway.graph.own_graph import AgentGraph
     from rmpa.gateway.neighbour import MeshSource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from typing import TYPE_CHECKING, Any
 
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.graph.own_graph import AgentGraph

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.params import transfer
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.attachment import SiteAttachment

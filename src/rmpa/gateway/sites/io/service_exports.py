@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind

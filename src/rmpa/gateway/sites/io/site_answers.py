@@ -16,7 +16,7 @@ from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesRe
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.config.permission_rules import Access
+    from rmpa.config.peer_rules import Access
     from rmpa.gateway.sites.history import SiteHistory
     from rmpa.gateway.sites.io.neighbour import SiteNeighbour
     from rmpa.gateway.sites.io.site_why import SiteWhy

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits

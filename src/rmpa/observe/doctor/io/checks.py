@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import rmpa
+from rmpa.config.read import load_settings
 from rmpa.config.settings import Settings
-from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.mesh.io.sockets import may_use_bbr, repeats_quickly

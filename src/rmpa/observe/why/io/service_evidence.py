@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.services.rules import ServiceRules
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits as observe_limits

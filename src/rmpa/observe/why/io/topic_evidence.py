@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.config import limits as config_limits
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError

@@ -10,7 +10,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.permission_gate import Needs
-from rmpa.config.permission_rules import Access
+from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
