@@ -22,7 +22,7 @@ from lab.usage import Meter
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.http.client import call
 from rmpa.ros.master.survey import one_call
-from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

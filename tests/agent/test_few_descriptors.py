@@ -34,9 +34,9 @@ from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import serialize_call
-from rmpa.runtime import descriptors
+from rmpa.runtime import accept as descriptors
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.descriptors import DESCRIPTORS, Use
+from rmpa.runtime.accept import DESCRIPTORS, Use
 from tests.agent.test_agent import node, running, settings, until
 from tests.runtime.descriptors_left import descriptors_left
 
@@ -244,7 +244,7 @@ def routes(agent: Agent) -> list[RouteInfo]:
 
 def test_the_soft_limit_is_raised_to_the_hard_one() -> None:
     program = (
-        "import resource\nfrom rmpa.runtime.descriptors import raise_file_limit\n"
+        "import resource\nfrom rmpa.runtime.accept import raise_file_limit\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (100, 200))\n"
         "print(raise_file_limit(), resource.getrlimit(resource.RLIMIT_NOFILE))"
     )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.runtime import event_loop
-from rmpa.runtime.event_loop import AgentLoop, DirectSelector
+from rmpa.runtime import loop as event_loop
+from rmpa.runtime.loop import AgentLoop, DirectSelector
 from tests.agent.test_agent import running
 from tests.agent.test_diagnostics import settings
 

@@ -36,8 +36,8 @@ from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
-from rmpa.runtime import event_loop as loop_module
-from rmpa.runtime.event_loop import AgentLoop, DirectSelector, yield_to_data
+from rmpa.runtime import loop as loop_module
+from rmpa.runtime.loop import AgentLoop, DirectSelector, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
@@ -108,7 +108,7 @@ def _where() -> str:
     names: list[str] = []
     while frame is not None and len(names) < 4:
         path = frame.f_code.co_filename
-        if "rmpa" in path and not path.endswith(("runtime/event_loop.py", "test_isolation.py")):
+        if "rmpa" in path and not path.endswith(("runtime/loop.py", "test_isolation.py")):
             names.append(f"{path.rpartition('rmpa/')[2]}:{frame.f_lineno} {frame.f_code.co_name}")
         frame = frame.f_back
     return " < ".join(names) or Watched.last

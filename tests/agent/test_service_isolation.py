@@ -14,7 +14,7 @@ from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.services import ServiceDescription, client_header
 from rmpa.ros.wire.tcpros import encode_header
-from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop
 from tests.agent.test_isolation import BOUND, DEADLINE, STRAYS, Watched, watched
 
 __all__ = ["watched"]  # a fixture, used by its name

@@ -24,7 +24,7 @@ from rmpa.gateway.ros2.io.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.mapping import ActionRule
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,7 +14,7 @@ from lab.bed.processes import Process
 from rmpa.config import limits as config_limits
 from rmpa.core.identity import Guid
 from rmpa.observe.io.control_client import ControlClient
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.io.authority import MeshAuthority, found_mesh

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives import serialization
 
-from rmpa.runtime.record_layer import DataSocket, SecureSocket, TlsHandshake
+from rmpa.runtime.tls import DataSocket, SecureSocket, TlsHandshake
 from tests.trust.authority import Authority, new_key
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Sequence
 
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 Contexts = tuple[ssl.SSLContext, ssl.SSLContext]
 """Of the client and of the server."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.runtime import acceptor, limits
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import Descriptors, Use
+from rmpa.runtime import accept as acceptor
+from rmpa.runtime import limits
+from rmpa.runtime.accept import Acceptor, Descriptors, Use
 from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.runtime.buffers import Buffer, unsent
+from rmpa.runtime.tls import Buffer, unsent
 
 PARTS: list[Buffer] = [b"ab", b"", memoryview(b"cde"), bytearray(b"f")]
 WHOLE = b"abcdef"

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.runtime.coarse_timer import call_at_tick, next_tick, sleep_to_tick
+from rmpa.runtime.loop import call_at_tick, next_tick, sleep_to_tick
 
 
 @given(st.floats(0, 1e6), st.sampled_from([0.5, 1.0, 5.0, 10.0]), st.floats(0, 60))

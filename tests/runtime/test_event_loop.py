@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.runtime.event_loop import AgentLoop, DirectSelector, sorted_yielding, yield_to_data, yielding_to_data
+from rmpa.runtime.loop import AgentLoop, DirectSelector, sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 
 class Machine:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.runtime import realtime
+from rmpa.runtime import process as realtime
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket, TlsHandshake
+from rmpa.runtime.tls import RecordIncomplete, SecureSocket, TlsHandshake
 from tests.runtime.secure_pairs import Slow, make_context, make_contexts, secure_pair
 from tests.trust.authority import Authority
 

@@ -19,7 +19,7 @@ from tests.runtime.secure_pairs import Contexts, Slow, make_contexts, secure_pai
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.runtime.record_layer import SecureSocket
+    from rmpa.runtime.tls import SecureSocket
 
 
 @pytest.fixture(scope="module")

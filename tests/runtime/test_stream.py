@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.runtime.corking import CollectedSends, after_read
 from rmpa.runtime.stream import Stream
+from rmpa.runtime.tls import CollectedSends, after_read
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -9,7 +9,7 @@ import socket
 from rmpa.core.outbox import Outbox
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime import limits
-from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.stream import Stream
 
 

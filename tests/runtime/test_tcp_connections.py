@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.runtime import tcp_connections
-from rmpa.runtime.descriptors import raise_file_limit
+from rmpa.runtime.accept import raise_file_limit
 from rmpa.runtime.sock_diag import SockDiag
 from rmpa.runtime.tcp_connections import (
     TcpConnection,

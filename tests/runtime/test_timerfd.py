@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from rmpa.runtime.timerfd import TimerFd
+from rmpa.runtime.loop import TimerFd
 
 
 def test_a_blocking_timer_sleeps_until_it_is_due() -> None:

@@ -59,7 +59,7 @@ class MeshScenario(Scenario):
         slower = _SLOWER if self.count > _MANY else 1
         with (
             mock.patch("rmpa.mesh.io.redials.unacknowledged", lambda sock: sock.in_flight),
-            mock.patch("rmpa.runtime.descriptors.Descriptors.has_room", return_value=True),
+            mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
                 limits,
                 EXPRESS_LEASE=slower * limits.EXPRESS_LEASE,

@@ -19,7 +19,7 @@ from typing import Final
 
 from rmpa.agent import process
 from rmpa.cli.main import main
-from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop
 
 _EVERY: Final = 0.25
 """Seconds between two looks at the loop."""

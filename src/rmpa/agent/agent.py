@@ -43,8 +43,8 @@ from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.peer_agent import INFO
 from rmpa.observe.why.io.why import WhyService
 from rmpa.ros.node.logger_services import LoggerServices
-from rmpa.runtime import garbage_collector
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime import process as garbage_collector
+from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections
 from rmpa.trust.page_names import host_names, page_hosts
 from rmpa.trust.permissions import Permissions

@@ -22,8 +22,8 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.peering_events import LinkDown, LinkDownCause
-from rmpa.runtime.sockets import open_mesh_port
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.accept import open_mesh_port
+from rmpa.runtime.loop import SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable

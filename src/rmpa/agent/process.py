@@ -12,10 +12,10 @@ from rmpa.agent.reload import SighupHandler
 from rmpa.core.counters import remedy
 from rmpa.core.errors import StartError
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime import realtime
-from rmpa.runtime.descriptors import is_shortage, raise_file_limit
-from rmpa.runtime.event_loop import AgentLoop
-from rmpa.runtime.service_manager import notify_service_manager
+from rmpa.runtime import process as realtime
+from rmpa.runtime.accept import is_shortage, raise_file_limit
+from rmpa.runtime.loop import AgentLoop
+from rmpa.runtime.process import notify_service_manager
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.settings import SETTINGS
 from rmpa.core.errors import ConfigError
 from rmpa.observe.reload_reply import ReloadReply
-from rmpa.runtime.service_manager import notify_service_manager
+from rmpa.runtime.process import notify_service_manager
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -48,7 +48,7 @@ def _default_port() -> int:
 @click.option("--debug", is_flag=True, help="Log every call.")
 def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
-    from rmpa.runtime.descriptors import raise_file_limit
+    from rmpa.runtime.accept import raise_file_limit
 
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")

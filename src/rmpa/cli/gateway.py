@@ -23,7 +23,7 @@ from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.io.control_client import ControlClient, find_agents
-from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.process import LogWriter
 from rmpa.trust.status import TrustStatus
 
 if TYPE_CHECKING:

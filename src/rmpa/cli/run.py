@@ -329,7 +329,7 @@ def _state_dir(module: str, state: str | None) -> Path | None:
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
     from rmpa.resource.run.resource_node import run_all
-    from rmpa.runtime.descriptors import raise_file_limit
+    from rmpa.runtime.accept import raise_file_limit
 
     raise_file_limit()
     sys.setswitchinterval(limits.THREAD_SWITCH)  # so that a due task interrupts the event loop's work

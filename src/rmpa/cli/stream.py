@@ -50,7 +50,7 @@ class StreamWatch:
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
     """Run a coroutine to its end; Ctrl-C and SIGTERM cancel it, and its own clean-up runs."""
-    from rmpa.runtime.descriptors import raise_file_limit
+    from rmpa.runtime.accept import raise_file_limit
 
     async def run() -> None:
         task = asyncio.current_task()

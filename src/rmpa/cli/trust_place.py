@@ -85,7 +85,7 @@ class TrustPlace:
         if not self.store.exists:
             remedy = "make a mesh: rmpa trust init; or join one: rmpa trust join TOKEN"
             raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy)
-        from rmpa.runtime.system_clock import SystemClock
+        from rmpa.runtime.loop import SystemClock
         from rmpa.trust.io.membership import Membership
 
         return Membership.load(self.store, SystemClock(), time.time)

@@ -16,7 +16,7 @@ from rmpa.cli.setting_options import config_option, setting_options
 from rmpa.config.module_name import NameSource, choose_name
 from rmpa.config.read import load_settings
 from rmpa.core.counters import configure_logging
-from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.process import LogWriter
 
 _log = logging.getLogger("rmpa.up")
 EPILOG = """\

@@ -22,9 +22,9 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
-from rmpa.runtime import corking, limits
-from rmpa.runtime.buffers import Buffer, unsent
-from rmpa.runtime.record_layer import RecordIncomplete, SecureSocket
+from rmpa.runtime import limits
+from rmpa.runtime import tls as corking
+from rmpa.runtime.tls import Buffer, RecordIncomplete, SecureSocket, unsent
 
 _log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from rmpa.gateway.sites.io.topic_part import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 from tests.gateway.memory_graph import MemoryGraph, MemoryTap, MemoryTopic
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 

@@ -14,7 +14,7 @@ from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.part import SiteImport
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.gateway.zenoh_api import ZenohQos
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryZenoh, eventually
 from tests.gateway.sites.site_bed import MD5

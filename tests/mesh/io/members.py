@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 from rmpa.trust.documents import DocumentKind, sign
 from rmpa.trust.io.membership import Membership
 from rmpa.trust.io.store import CERTIFICATE, KEY, MemberFiles, TrustStore

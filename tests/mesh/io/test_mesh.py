@@ -24,7 +24,7 @@ from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.sockets import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.descriptors import DESCRIPTORS
+from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
 
@@ -440,7 +440,7 @@ async def test_a_dial_without_file_descriptors_is_repeated(monkeypatch: pytest.M
                 raise OSError(errno.EMFILE, "Too many open files")
             return real(*args, **options)  # type: ignore[arg-type]
 
-        monkeypatch.setattr("rmpa.runtime.descriptors.socket.socket", none_left)
+        monkeypatch.setattr("rmpa.runtime.accept.socket.socket", none_left)
         one.mesh.peer_found(other.identity)
         other.mesh.peer_found(one.identity)
         await until(lambda: one.linked(other) and other.linked(one), "linked after all")

@@ -23,8 +23,8 @@ from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
-from rmpa.runtime.record_layer import TlsHandshake
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
+from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust.io.contexts import ALPN_LINK, join_context
 from rmpa.trust.reasons import TrustReason
 from tests.mesh.io.members import Member, meshes

@@ -23,7 +23,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.runtime.descriptors import Use
+    from rmpa.runtime.accept import Use
 
 DEADLINE: Final = 10.0
 STRING: Final = "std_msgs/String"

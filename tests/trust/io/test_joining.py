@@ -24,9 +24,8 @@ from rmpa.core.errors import (
 )
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.securing import Securing
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust.certificates import CertificateError, make_request
 from rmpa.trust.documents import DocumentKind

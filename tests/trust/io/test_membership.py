@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import StartError
-from rmpa.runtime.record_layer import TlsHandshake
+from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
 from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList, sign
 from rmpa.trust.io import store as files_of

@@ -23,8 +23,7 @@ from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.runtime.coarse_timer import call_at_tick
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
     import asyncio

@@ -19,7 +19,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_global_name, matches
 from rmpa.ros.core.node_calls import end_node, node_connections, ping_node
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping

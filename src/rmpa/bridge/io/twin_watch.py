@@ -13,8 +13,7 @@ from rmpa.bridge.twins import OFFERED_MIN, telling, twin_names, twin_text
 from rmpa.config.peer_rules import Access
 from rmpa.core.counters import RefusalLog
 from rmpa.core.identity import is_global_name, matches
-from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

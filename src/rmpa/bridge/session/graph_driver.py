@@ -14,8 +14,7 @@ from rmpa.bridge.catalogue.pacing import Pacing
 from rmpa.bridge.messages import decode, encode
 from rmpa.core.counters import logged_failure
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

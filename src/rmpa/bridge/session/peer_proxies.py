@@ -13,8 +13,8 @@ from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError
 from rmpa.ros.wire.xmlrpc import RosReply
-from rmpa.runtime.descriptors import is_shortage
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.accept import is_shortage
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterator

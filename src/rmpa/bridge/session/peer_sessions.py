@@ -12,8 +12,7 @@ from rmpa.bridge.session.peer_proxies import PeerProxies
 from rmpa.bridge.session.peer_session import PeerSession, PeerState
 from rmpa.bridge.session.proxy_namespaces import ProxyNamespaces
 from rmpa.mesh import limits as mesh_limits
-from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Sequence

@@ -10,7 +10,7 @@ from rmpa.core.errors import StartError
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.node.shared_listener import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.runtime.descriptors import DESCRIPTORS, Use
+from rmpa.runtime.accept import DESCRIPTORS, Use
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -24,9 +24,7 @@ from rmpa.discovery.io.interfaces import (
 from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.machine_timer import MachineTimer
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import MachineTimer, SystemClock, yield_to_data
 from rmpa.trust.keyring import KeyPurpose
 
 if TYPE_CHECKING:

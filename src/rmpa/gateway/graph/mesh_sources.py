@@ -13,7 +13,7 @@ from rmpa.bridge.topics.io.local_sources import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.effects import RegistrationKind
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -31,7 +31,7 @@ from rmpa.gateway.graph.taps import TopicTap
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

@@ -16,7 +16,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rmpa.gateway.zenoh import limits
-from rmpa.runtime.corking import CollectedSends
+from rmpa.runtime.tls import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio

@@ -22,7 +22,7 @@ from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
 from rmpa.gateway.zenoh.socket_tuning import SocketTuning
 from rmpa.gateway.zenoh.worker import SerialWorker
 from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable

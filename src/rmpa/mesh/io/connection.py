@@ -27,7 +27,7 @@ from rmpa.mesh.connection_events import (
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.io.securing import tls_failure
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.io.sockets import limit_segments, tune_bulk, tune_express
-from rmpa.runtime.descriptors import DESCRIPTORS, Use
+from rmpa.runtime.accept import DESCRIPTORS, Use
 
 if TYPE_CHECKING:
     import socket

@@ -17,8 +17,8 @@ from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_h
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.runtime.buffers import Buffer
     from rmpa.runtime.stream import Stream
+    from rmpa.runtime.tls import Buffer
 
 
 class LaneSender:

@@ -35,10 +35,8 @@ from rmpa.mesh.peering_events import (
     PeerStatus,
 )
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.machine_timer import MachineTimer
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.loop import MachineTimer, SystemClock
 from rmpa.trust.reasons import TrustReason
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refusal, Refuse
-from rmpa.runtime.record_layer import SecureSocket, TlsHandshake
+from rmpa.runtime.tls import SecureSocket, TlsHandshake
 from rmpa.trust.io.contexts import ALPN_JOIN, ALPN_LINK
 from rmpa.trust.reasons import TrustError, TrustReason
 

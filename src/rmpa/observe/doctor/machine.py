@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.core.limits import KIB
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.runtime.realtime import REMEDY
+from rmpa.runtime.process import REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -20,9 +20,8 @@ from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.io.peer_credentials import ControlAccess, peer_credentials
 from rmpa.observe.io.runtime_dir import NameLock
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,9 +13,7 @@ from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.runtime.coarse_timer import call_at_tick
-from rmpa.runtime.event_loop import yield_to_data
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
     import asyncio

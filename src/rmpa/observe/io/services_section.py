@@ -6,7 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from rmpa.observe.snapshot import SampleSpread, ServiceInfo
-from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
+from rmpa.runtime.loop import sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator

@@ -21,8 +21,8 @@ from rmpa.observe.peer_agent import PeerAgent
 from rmpa.observe.peer_info import FOREIGN
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.descriptors import DESCRIPTORS
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.accept import DESCRIPTORS
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator

@@ -19,8 +19,7 @@ from rmpa.core.contract import KEYS, Contract
 from rmpa.observe.contract_term import ContractTerm
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator

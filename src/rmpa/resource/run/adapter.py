@@ -37,7 +37,7 @@ from rmpa.resource.run.status_publisher import StatusPublisher
 from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.resource.run.runtime import CALLER
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,7 +19,7 @@ from rmpa.resource.run.descriptor import topic_of
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine

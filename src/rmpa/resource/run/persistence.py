@@ -15,7 +15,7 @@ import msgspec
 from rmpa.resource import limits
 from rmpa.resource.decide.saved_state import SavedCoolDown, SavedState
 from rmpa.resource.run.runtime import RuntimePart
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from pathlib import Path

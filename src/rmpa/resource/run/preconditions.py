@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.resource import limits
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -19,7 +19,7 @@ from rmpa.resource.run.runtime import Runtime, RuntimePart
 from rmpa.resource.run.tasks import Tasks
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence

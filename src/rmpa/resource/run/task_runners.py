@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from rmpa.resource import limits
 from rmpa.resource.run.run_gate import ENTER_SLICE
 from rmpa.resource.run.schedule import Schedule, TaskFigures, restart_delay, stuck_after
-from rmpa.runtime.timerfd import TimerFd
+from rmpa.runtime.loop import TimerFd
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

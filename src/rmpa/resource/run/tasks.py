@@ -18,7 +18,7 @@ from rmpa.resource.run.run_gate import RunGate
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.schedule import too_slow
 from rmpa.resource.run.task_runners import AsyncTaskRunner, TaskProblem, ThreadTaskRunner
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

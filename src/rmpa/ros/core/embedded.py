@@ -20,8 +20,8 @@ from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.master_api import MasterApi
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.accept import Use
+from rmpa.runtime.loop import yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -23,8 +23,8 @@ from rmpa.ros.http.client import call, call_api, exchange, read_response
 from rmpa.ros.master.mirror import REGISTRATIONS, Mirror
 from rmpa.ros.master.survey import Survey, lookup_calls, one_call, read_lookups, read_survey, survey_calls
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.accept import Use
+from rmpa.runtime.loop import yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -12,7 +12,7 @@ from rmpa.ros.http.client import call_api, connect
 from rmpa.ros.node.probe import exchange_headers
 from rmpa.ros.wire.tcpros import subscriber_header
 from rmpa.ros.wire.xmlrpc import RosFault
-from rmpa.runtime.descriptors import Use
+from rmpa.runtime.accept import Use
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,9 +23,8 @@ from rmpa.ros import limits
 from rmpa.ros.http.client import connect, is_own_name, split_uri
 from rmpa.ros.master.reachability import Reachability
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.coarse_timer import sleep_to_tick
-from rmpa.runtime.descriptors import Use, is_shortage
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.accept import Use, is_shortage
+from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:

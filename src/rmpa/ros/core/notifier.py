@@ -19,7 +19,7 @@ from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call
 from rmpa.ros.master.effects import Effect, ParamUpdate, PublisherUpdate, Shutdown
 from rmpa.ros.wire.xmlrpc import RosFault
-from rmpa.runtime.descriptors import Use
+from rmpa.runtime.accept import Use
 
 if TYPE_CHECKING:
     from collections.abc import Callable

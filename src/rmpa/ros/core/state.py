@@ -27,8 +27,8 @@ from rmpa.ros.http.client import call_api
 from rmpa.ros.master.registrations import NodeRecord  # noqa: TC001 - msgspec reads the annotations
 from rmpa.ros.wire.xmlrpc import RosFault, brief
 from rmpa.ros.wire.xmlrpc_writer import legal_text
-from rmpa.runtime.event_loop import yielding_to_data
-from rmpa.runtime.threads import in_thread
+from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

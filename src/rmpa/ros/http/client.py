@@ -21,8 +21,8 @@ from rmpa.ros import limits
 from rmpa.ros.http.documents import read_large, slices
 from rmpa.ros.wire.http import ResponseParser, post_request
 from rmpa.ros.wire.xmlrpc import ResponseReader, RosFault, RosReply, XmlRpcValue, brief, call_pieces
-from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.accept import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
+from rmpa.runtime.loop import yielding_to_data
 
 __all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
 

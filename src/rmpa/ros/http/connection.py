@@ -13,7 +13,7 @@ from rmpa.ros import limits
 from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
 from rmpa.ros.wire.xmlrpc import serialize_fault
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable

@@ -10,7 +10,7 @@ import asyncio
 from typing import TYPE_CHECKING, TypeVar, overload
 
 from rmpa.ros import limits
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

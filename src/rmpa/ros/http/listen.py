@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 from rmpa.core.counters import remedy
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.runtime.descriptors import DESCRIPTORS
+from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.tcp_connections import program_at
 
 if TYPE_CHECKING:
-    from rmpa.runtime.descriptors import Use
+    from rmpa.runtime.accept import Use
 
 
 async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:

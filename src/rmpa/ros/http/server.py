@@ -19,9 +19,8 @@ from rmpa.ros.http.connection import HttpConnection
 from rmpa.ros.http.documents import read_large, read_small, slices
 from rmpa.ros.wire.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import Use
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.accept import Acceptor, Use
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     import socket

@@ -17,7 +17,7 @@ from rmpa.core.limits import KIB
 from rmpa.ros.http.client import connect
 from rmpa.ros.wire.services import client_header
 from rmpa.ros.wire.tcpros import encode_header, parse_header, printable
-from rmpa.runtime.descriptors import is_shortage
+from rmpa.runtime.accept import is_shortage
 
 if TYPE_CHECKING:
     import socket

@@ -33,7 +33,7 @@ from rmpa.ros.wire.services import (
     parse_service_uri,
 )
 from rmpa.ros.wire.tcpros import ANY, LENGTH, encode_header, parse_header, printable
-from rmpa.runtime.descriptors import OUT_OF_DESCRIPTORS
+from rmpa.runtime.accept import OUT_OF_DESCRIPTORS
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:

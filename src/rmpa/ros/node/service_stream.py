@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.limits import KIB
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer

@@ -18,8 +18,7 @@ from rmpa.ros import limits
 from rmpa.ros.http.connection import RESET
 from rmpa.ros.http.server import ResetConnection, XmlRpcServer
 from rmpa.ros.node.loopback_addresses import LoopbackAddresses
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import DESCRIPTORS, Use
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use
 
 if TYPE_CHECKING:
     from collections.abc import Callable

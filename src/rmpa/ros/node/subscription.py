@@ -25,7 +25,7 @@ from rmpa.ros.wire.tcpros import (
     split_messages,
     subscriber_header,
 )
-from rmpa.runtime.descriptors import is_shortage
+from rmpa.runtime.accept import is_shortage
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:

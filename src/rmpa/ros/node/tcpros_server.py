@@ -13,9 +13,8 @@ from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
-from rmpa.runtime.acceptor import Acceptor
-from rmpa.runtime.descriptors import DESCRIPTORS, Use, is_shortage
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage
+from rmpa.runtime.loop import SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

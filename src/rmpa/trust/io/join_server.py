@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.counters import Clock, Counters
-    from rmpa.runtime.record_layer import TlsHandshake
+    from rmpa.runtime.tls import TlsHandshake
     from rmpa.trust.io.authority import MeshAuthority
     from rmpa.trust.io.membership import Membership
     from rmpa.trust.join import JoinMessage

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import WSCloseCode, web
 
-from rmpa.runtime.buffers import unsent
+from rmpa.runtime.tls import unsent
 from rmpa.web import limits
 from rmpa.web.gateways.websocket_frames import Opcode, frame_header
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 DESCRIPTION = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
 SMALL = b"x" * 100

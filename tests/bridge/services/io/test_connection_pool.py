@@ -18,7 +18,7 @@ from rmpa.ros.wire.services import ServiceDescription
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 

@@ -23,7 +23,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableReceiver
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 
 class RouteSender:

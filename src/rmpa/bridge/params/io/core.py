@@ -12,7 +12,7 @@ from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolErro
 from rmpa.ros.http.documents import read_large, slices
 from rmpa.ros.master.parameters import holds_nil
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from rmpa.ros.core.api import Core

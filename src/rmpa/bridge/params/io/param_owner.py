@@ -19,7 +19,7 @@ from rmpa.config.rules import overlap
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.ros.master.parameters import leaves
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:

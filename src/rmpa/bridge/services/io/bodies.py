@@ -18,12 +18,12 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 _LENGTH: Final = 4
 _HEAD_MAX: Final = 1

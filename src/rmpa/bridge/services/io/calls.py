@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.connection_pool import ServicePool
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.runtime.buffers import Buffer
+    from rmpa.runtime.tls import Buffer
 
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"

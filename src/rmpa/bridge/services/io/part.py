@@ -55,7 +55,7 @@ from rmpa.core.counters import RefusalLog
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

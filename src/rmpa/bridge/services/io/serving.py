@@ -24,8 +24,7 @@ from rmpa.ros.core.liveness import listening_ports
 from rmpa.ros.http.client import is_own_name
 from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.wire.services import parse_service_uri
-from rmpa.runtime.coarse_timer import sleep_to_tick
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping

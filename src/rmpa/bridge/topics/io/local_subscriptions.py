@@ -17,8 +17,8 @@ from rmpa.mesh.resume_table import ResumeTable
 from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
-from rmpa.runtime.descriptors import DESCRIPTORS
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.accept import DESCRIPTORS
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

@@ -48,7 +48,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
-from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

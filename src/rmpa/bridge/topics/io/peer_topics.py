@@ -14,8 +14,7 @@ from rmpa.core.identity import serial_add
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import TopicDescription, printable
-from rmpa.runtime.event_loop import yielding_to_data
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer, yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

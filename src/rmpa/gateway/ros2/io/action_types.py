@@ -17,8 +17,7 @@ from rmpa.gateway.ros2.tokens import EntityKind
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.machine_timer import MachineTimer
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import MachineTimer, SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

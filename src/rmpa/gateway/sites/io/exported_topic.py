@@ -12,7 +12,7 @@ from rmpa.gateway.sites.topic_header import TopicHeader
 from rmpa.gateway.sites.topic_limits import TopicLimits
 from rmpa.gateway.sites.topic_qos import qos_of
 from rmpa.gateway.sites.traffic import SiteTraffic
-from rmpa.runtime.corking import after_read
+from rmpa.runtime.tls import after_read
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract

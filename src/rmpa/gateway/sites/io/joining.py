@@ -23,7 +23,7 @@ from rmpa.gateway.sites.io.site_why import SiteWhy
 from rmpa.gateway.sites.io.topic_part import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
-from rmpa.runtime.system_clock import SystemClock
+from rmpa.runtime.loop import SystemClock
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from rmpa.gateway.sites.imports import SiteImports
 from rmpa.gateway.sites.keys import GATEWAY, SiteGateway, SiteModule, SiteSource, parse_token, token_keys
 from rmpa.gateway.sites.leader import Leader
 from rmpa.gateway.sites.report import refusals_report, site_counts, sites_report
-from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -17,7 +17,7 @@ from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.io.topic_evidence import name_in
 from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge

@@ -22,7 +22,7 @@ from rmpa.observe.why.diagnosis import (
     TopicAtSubscriber,
 )
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.event_loop import yielding_to_data
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge

@@ -1,25 +1,87 @@
-"""TLS below a ``Stream``: a socket whose ``sendmsg`` and ``recv_into`` encrypt and decrypt, by OpenSSL's memory BIOs.
-
-asyncio's own TLS copies each message several times and takes 100 µs more a round trip, and ``ssl.SSLSocket`` has no
-``sendmsg``. Here a small message is one record, one ``send`` and one ``recv``, as without TLS.
-
-Ciphertext belongs to one connection, so it never comes into an outbox: what the socket does not take waits here, and
-while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
-"""
+"""What a partial write leaves of its buffers."""
 
 from __future__ import annotations
 
 import contextlib
 import ssl
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias, cast
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.limits import KIB
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from rmpa.runtime.buffers import Buffer
+Buffer = bytes | bytearray | memoryview
+
+
+def unsent(parts: Sequence[Buffer], sent: int) -> list[Buffer]:
+    """The parts without their first ``sent`` bytes; nothing is copied."""
+    left: list[Buffer] = []
+    for part in parts:
+        size = len(part)
+        if sent >= size:
+            sent -= size
+        else:
+            left.append(memoryview(part)[sent:] if sent else part)
+            sent = 0
+    return left
+
+
+# Corking: what is collected while one read is handled is passed on once, at its end, as TCP_CORK does.
+#
+# One loop and one thread handle reads, one after the other; a read may be handled within another one.
+
+
+_Ends: TypeAlias = list[Callable[[], None]]
+
+collected: _Ends | None = None
+"""Called in order at the end of the read that is handled now; ``None``: nothing is collected."""
+
+
+class CollectedSends:
+    """A context that collects the messages that are sent within, whose parts must not change until its end.
+
+    At its end each stream sends them by one system call.
+    """
+
+    __slots__ = ("_outer",)
+
+    def __enter__(self) -> None:
+        """Begin to collect."""
+        global collected  # noqa: PLW0603 - one loop, one thread
+        self._outer = collected
+        collected = []
+
+    def __exit__(self, *_: object) -> None:
+        """Send what was collected."""
+        global collected  # noqa: PLW0603 - as above
+        try:
+            for end in collected or ():
+                end()
+        finally:
+            collected = self._outer
+
+
+def after_read(call: Callable[[], None]) -> None:
+    """Call ``call`` once the present read is handled; at once if none is, or if it is of a few bytes."""
+    if collected is not None:
+        collected.append(call)
+    else:
+        call()
+
+
+# TLS below a ``Stream``: a socket whose ``sendmsg`` and ``recv_into`` encrypt and decrypt, by OpenSSL's memory
+# BIOs.
+#
+# asyncio's own TLS copies each message several times and takes 100 µs more a round trip, and ``ssl.SSLSocket`` has
+# no
+# ``sendmsg``. Here a small message is one record, one ``send`` and one ``recv``, as without TLS.
+#
+# Ciphertext belongs to one connection, so it never comes into an outbox: what the socket does not take waits here,
+# and
+# while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
 
 
 _RECORD: Final = 16 * KIB

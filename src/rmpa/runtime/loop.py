@@ -1,34 +1,272 @@
-"""The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
+"""Periodic work that need not be exact, on one grid of wake-ups for the whole process.
 
-asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in its
-context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector itself
-calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and writers), and
-returns all other events to asyncio as usual.
+A wake-up of an idle process costs more than most of the work that it does then: two switches of the processor, the
+interpreter's cold caches, a round of the event loop. So periodic work with a period of seconds runs at common times
+(*coalesced timers*, as the kernel's timer slack does it): at whole multiples of its period from one moment of the
+process. Work of every second, of every 5 s and of every 10 s wakes the process once a second together.
 
-Data also interrupts control work: the loop polls the data path's sockets before each ordinary callback, and long work
-calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond. Therefore a direct reader, and
-the code that it calls, may run in the middle of any code that yields, whose data must be consistent at each yield.
-docs/design/isolation.md has the measurements.
+The moment is random in each process: agents of one machine that all worked at the same time would delay its data.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import heapq
 import logging
 import math
+import os
+import random
 import select
 import selectors
+import struct
+import sys
 import time
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, TypeVarTuple, cast
 
 if TYPE_CHECKING:
+    import ctypes
     from collections.abc import Callable, Iterable, Iterator, Mapping
+    from types import TracebackType
 
     from _typeshed import FileDescriptorLike
+
+_ORIGIN_SPAN: Final = 60.0
+"""Seconds over which the processes of a machine spread; a multiple of the usual periods."""
+_origin: Final = random.uniform(0.0, _ORIGIN_SPAN)  # noqa: S311 - spreads load, protects nothing
+
+
+def next_tick(period: float, now: float, origin: float = _origin) -> float:
+    """The time of the grid that is nearest to ``period`` seconds after ``now``, and at least half a period after it.
+
+    All in monotonic seconds; ``origin`` is one time of all grids.
+    """
+    return origin + round((now - origin) / period + 1) * period
+
+
+def call_at_tick(period: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
+    """Call ``callback`` once in the running loop, after some ``period`` seconds, with all others that are due then.
+
+    Called again from the callback, it makes a period: the delay is half a period to one and a half only at first.
+    """
+    loop = asyncio.get_running_loop()
+    return loop.call_at(next_tick(period, loop.time()), callback)
+
+
+async def sleep_to_tick(period: float) -> None:
+    """Like ``asyncio.sleep``, until the time that ``call_at_tick`` would call at."""
+    loop = asyncio.get_running_loop()
+    ticked = loop.create_future()
+    handle = loop.call_at(next_tick(period, loop.time()), _resolve, ticked)
+    try:
+        await ticked
+    finally:
+        handle.cancel()
+
+
+def _resolve(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
+
+
+# The machine's own clocks.
+
+
+class SystemClock:
+    """The monotonic and the wall clock of this machine."""
+
+    def now(self) -> float:
+        """Monotonic seconds; the same clock as asyncio's ``loop.time()``."""
+        return time.monotonic()
+
+    def wall_ns(self) -> int:
+        """Wall clock, in nanoseconds since the epoch."""
+        return time.time_ns()
+
+
+# Runs the timer of a protocol machine in the event loop.
+#
+# A machine has no clock: its ``next_timer()`` returns when it must be called next, and the call passes the time.
+
+
+class MachineTimer:
+    """One pending timer for one machine, moved whenever the machine's ``next_timer()`` has changed.
+
+    Args:
+        next_timer: Returns when the machine must be called, in seconds of ``now``; ``None``: not at all.
+        on_due: Called with the time, which is never before the requested time, although the event loop may call early
+            by its clock's resolution. Afterwards the timer is armed again.
+        now: The clock of the machine; by default the event loop's ``time()``.
+    """
+
+    def __init__(
+        self,
+        next_timer: Callable[[], float | None],
+        on_due: Callable[[float], object],
+        *,
+        now: Callable[[], float] | None = None,
+    ) -> None:
+        self._next_timer = next_timer
+        self._on_due = on_due
+        self._now = now
+        self._handle: asyncio.TimerHandle | None = None
+        self._due: float | None = None
+        self._closed = False
+
+    def arm(self) -> None:
+        """Read ``next_timer()``, and move the pending timer to that time."""
+        due = None if self._closed else self._next_timer()
+        if due == self._due:
+            return
+        self._cancel()
+        if due is not None:
+            loop = asyncio.get_running_loop()
+            self._due = due
+            if self._now is None:
+                self._handle = loop.call_at(due, self._fire)
+            else:
+                self._handle = loop.call_later(max(0.0, due - self._now()), self._fire)
+
+    def close(self) -> None:
+        """Cancel the timer, and drop the references to the machine, whose owner may hold this timer (a cycle)."""
+        self._closed = True
+        self._cancel()
+        self._next_timer, self._on_due = _never, _nothing
+
+    def _cancel(self) -> None:
+        self._due = None
+        if self._handle is not None:
+            self._handle.cancel()
+            self._handle = None
+
+    def _fire(self) -> None:
+        due, self._due, self._handle = self._due, None, None
+        now = asyncio.get_running_loop().time() if self._now is None else self._now()
+        self._on_due(now if due is None else max(due, now))
+        self.arm()
+
+
+def _never() -> float | None:
+    """The ``next_timer()`` of a timer that is closed."""
+    return None
+
+
+def _nothing(_now: float) -> None:
+    """The ``on_due`` of a timer that is closed."""
+
+
+# A timer as a file descriptor (timerfd_create(2)): due at an absolute time, to the microsecond.
+#
+# The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of
+# 50 µs. A timerfd has neither fault. Python supports it since 3.13; with older versions the C library is called.
+
+
+_CLOCK_MONOTONIC: Final = 1
+_CLOEXEC: Final = 0o2000000
+_NONBLOCK: Final = 0o4000
+_ABSTIME: Final = 1
+_ITIMERSPEC: Final = struct.Struct("@qqqq")
+_NANO: Final = 1_000_000_000
+
+
+class TimerFd:
+    """One timer.
+
+    Args:
+        blocking: Whether ``wait`` sleeps until the timer is due, for a thread; else ``fileno`` is for a loop.
+
+    Raises:
+        OSError: No file descriptor is left.
+    """
+
+    def __init__(self, *, blocking: bool) -> None:
+        flags = _CLOEXEC | (0 if blocking else _NONBLOCK)
+        if sys.version_info >= (3, 13):
+            self._fd = os.timerfd_create(_CLOCK_MONOTONIC, flags=flags)
+        else:
+            self._fd = _check(_libc().timerfd_create(_CLOCK_MONOTONIC, flags))
+
+    def fileno(self) -> int:
+        """The descriptor, which is readable from the due time until ``wait`` or ``set``; -1 once closed."""
+        return self._fd
+
+    def set(self, due: float) -> None:
+        """Set the due time, in seconds of the monotonic clock; a time in the past is due at once.
+
+        Raises:
+            OSError: The timer is closed.
+        """
+        nanoseconds = max(1, round(due * _NANO))
+        if sys.version_info >= (3, 13):
+            os.timerfd_settime_ns(self._fd, flags=os.TFD_TIMER_ABSTIME, initial=nanoseconds)
+        else:
+            spec = _ITIMERSPEC.pack(0, 0, *divmod(nanoseconds, _NANO))
+            _check(_libc().timerfd_settime(self._fd, _ABSTIME, spec, None))
+
+    def wait(self) -> bool:
+        """Reset a timer that is due; a blocking timer first sleeps until its due time.
+
+        Returns:
+            Whether the timer was due; always true for a blocking one.
+        """
+        try:
+            os.read(self._fd, 8)
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the descriptor; may be called twice. No thread may be in ``wait`` at that time."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    import ctypes  # noqa: PLC0415 - only programs with timers load it
+
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _check(result: int) -> int:
+    if result < 0:
+        import ctypes  # noqa: PLC0415 - likewise
+
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result
+
+
+# The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
+#
+# asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in
+# its
+# context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector
+# itself
+# calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and writers),
+# and
+# returns all other events to asyncio as usual.
+#
+# Data also interrupts control work: the loop polls the data path's sockets before each ordinary callback, and long
+# work
+# calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond. Therefore a direct reader,
+# and
+# the code that it calls, may run in the middle of any code that yields, whose data must be consistent at each
+# yield.
+# docs/design/isolation.md has the measurements.
+
 
 _log = logging.getLogger(__name__)
 
