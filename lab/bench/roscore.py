@@ -20,8 +20,8 @@ from lab.results import finish
 from lab.tables import table_of
 from lab.usage import Meter
 from rmpa.ros.core.external import ExternalCore
-from rmpa.ros.http.client import call
-from rmpa.ros.master.survey import one_call
+from rmpa.ros.http.rpc import call
+from rmpa.ros.master.mirror import one_call
 from rmpa.runtime.loop import AgentLoop
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     import asyncio
 
+    from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.topics import Received
 
 
 def main() -> None:

@@ -21,8 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import Multicast, ServiceSettings, Settings
-from rmpa.ros.wire.services import parse_service_uri
-from rmpa.ros.wire.tcpros import encode_header
+from rmpa.ros.wire.tcpros import encode_header, parse_service_uri
 from rmpa.runtime.loop import AgentLoop
 from tests.agent.test_agent import running
 from tests.agent.test_services import MD5, come_back, fall_silent, serving

@@ -20,7 +20,7 @@ from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.slave_node import SlaveNode
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.node.topics import Publisher, Received, Subscriber
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
 
 DEADLINE = 20.0
 

@@ -17,9 +17,8 @@ from rmpa.observe.graph_changes import GraphRevision, TopicRow
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_operations import REPLIES
 from rmpa.observe.peer_agent import PeerAgent
-from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.environment import NodeFacts, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node
-from rmpa.ros.node_info import NodeFacts, PeerNodes
 from rmpa.ros.types.messages import MessageType
 from tests.agent.test_agent import running, settings, until
 from tests.ros.node.peers import DEADLINE

@@ -11,14 +11,14 @@ from rmpa.core.contract import ContractRule
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.diagnostics import TOPIC
 from rmpa.observe.snapshot import Snapshot
-from rmpa.ros.types.diagnostic_array import ARRAY_MD5, ARRAY_TYPE
+from rmpa.ros.types.definitions import ARRAY_MD5, ARRAY_TYPE
 from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.observe.snapshot import RouteInfo
-    from rmpa.ros.node.topics import Publisher, Received
+    from rmpa.ros.node.endpoints import Publisher, Received
 
 
 def settings(name: str, place: Path, contracts: tuple[ContractRule, ...] = ()) -> Settings:

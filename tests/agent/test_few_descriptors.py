@@ -27,11 +27,10 @@ from rmpa.observe.io.control_server import ControlServer
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.listeners import SharedListener, TcprosServer
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.shared_listener import SharedListener
 from rmpa.ros.node.subscription import PublisherConnection
-from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import accept as descriptors

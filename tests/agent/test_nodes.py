@@ -14,10 +14,10 @@ from rmpa.bridge.io.node_presence import NODES, NodePresence
 from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.http.client import call_api
+from rmpa.ros.environment import NodeEnd, NodeFacts, NodePing, PeerNodes
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node_info import NodeEnd, NodeFacts, NodePing, PeerNodes
 from tests.agent.test_agent import node, running, settings, until
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from rmpa.agent.agent import Agent
 from rmpa.config.settings import Multicast, Settings
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.runtime import limits as runtime_limits
 

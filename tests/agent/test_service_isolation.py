@@ -12,8 +12,7 @@ import pytest
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.services import ServiceDescription, client_header
-from rmpa.ros.wire.tcpros import encode_header
+from rmpa.ros.wire.tcpros import ServiceDescription, client_header, encode_header
 from rmpa.runtime.loop import AgentLoop
 from tests.agent.test_isolation import BOUND, DEADLINE, STRAYS, Watched, watched
 

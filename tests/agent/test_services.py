@@ -15,7 +15,7 @@ from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.test_agent import running, settings, until
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 __all__ = ["settings"]  # the fixture
 

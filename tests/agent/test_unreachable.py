@@ -10,7 +10,7 @@ import pytest
 from rmpa.bridge import limits as bridge_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.http import client
+from rmpa.ros.http import rpc as client
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import TopicDescription

@@ -15,9 +15,8 @@ from rmpa.cli.main import main
 from rmpa.cli.node_names import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.observe.snapshot import UnreachableInfo
-from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node
-from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes
 from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.observe.snapshot import SampleSpread, ServiceInfo
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
-from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.types.installed import ServiceType
 from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 TWIST = "{linear: {x: 0.5}, angular: {z: -1}}"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.wire.bus import read_bus_info
+from rmpa.ros.wire.slave_api import read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, parse_response, serialize_response
 
 _INFO = "TCPROS connection on port 34738 to [127.0.0.1:52309 on socket 13]"

@@ -7,7 +7,7 @@ import contextlib
 import msgspec
 
 from rmpa.ros.core.state import parse, serialize
-from rmpa.ros.master.master_api import MasterApi
+from rmpa.ros.master.api import MasterApi
 from rmpa.ros.wire.xmlrpc import response_pieces
 
 _NODE = {

@@ -6,7 +6,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.ros2.attachment import Ros2Attachment
 from rmpa.gateway.sites.attachment import SiteAttachment
 from rmpa.gateway.sites.services import read_description, write_description
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 _MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 SEEDS: list[bytes] = [

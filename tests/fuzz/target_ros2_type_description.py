@@ -15,8 +15,8 @@ from rmpa.gateway.ros2.service_pair import ServicePair
 from rmpa.gateway.ros2.type_description import parse_type_response
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.definitions import known_text
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 from tests.gateway.ros2.type_descriptions import respond, response
 
 

@@ -5,22 +5,23 @@ from __future__ import annotations
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.ros import limits
 from rmpa.ros.types.definitions import DefinitionError
-from rmpa.ros.types.service_types import ServiceType
-from rmpa.ros.wire.services import (
+from rmpa.ros.types.installed import ServiceType
+from rmpa.ros.wire.tcpros import (
     BodyBuffer,
     ServiceDescription,
     check_client,
     check_server,
     client_header,
+    encode_header,
     frame_reply,
     is_persistent,
     is_probe,
+    parse_header,
     parse_reply_head,
     parse_request_length,
     parse_service_uri,
     server_header,
 )
-from rmpa.ros.wire.tcpros import encode_header, parse_header
 
 _ADD = ServiceDescription("rospy_tutorials/AddTwoInts", "6a2e34150c00229791cc89ff309fff21")
 

@@ -11,10 +11,9 @@ from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.types.service_types import ServiceType
-    from rmpa.ros.wire.services import ServiceDescription
-    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
 Key = tuple[SourceKind, str, str]
 

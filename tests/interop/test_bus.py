@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.client import call
-from rmpa.ros.wire.bus import read_bus_info
+from rmpa.ros.http.rpc import call
+from rmpa.ros.wire.slave_api import read_bus_info
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.ros.wire.bus import BusLink
+    from rmpa.ros.wire.slave_api import BusLink
     from tests.interop.conftest import ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]

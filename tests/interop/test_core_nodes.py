@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.identify import name_at
+from rmpa.ros.core.liveness import name_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable

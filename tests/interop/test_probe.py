@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.ros.http.client import call_api
-from rmpa.ros.node.probe import probe
-from rmpa.ros.wire.services import parse_service_uri
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.service_client import probe
+from rmpa.ros.wire.tcpros import parse_service_uri
 from tests.interop.test_service_nodes import core, ros
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.service_client import ServiceFailed
-from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.types.installed import ServiceType
 from tests.interop.nodes.payload import Pattern
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from lab.bed.agents import Agent
 from lab.bed.processes import DEADLINE, eventually, run
 from rmpa.core.counters import Counters
 from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.shared_listener import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import frame_message

@@ -14,7 +14,7 @@ import pytest
 
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.publication import Publication, PublicationEvents

@@ -24,7 +24,7 @@ from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header

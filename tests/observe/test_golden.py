@@ -37,7 +37,7 @@ from rmpa.observe.doctor.network import (
 from rmpa.observe.doctor.ros_environment import judge_shell
 from rmpa.observe.health import Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, ServiceInfo, Snapshot, UnreachableInfo
-from rmpa.ros.types.diagnostic_array import frame_array
+from rmpa.ros.types.definitions import frame_array
 from tests.observe.doctor.test_firewall import IPTABLES_UFW, NFT_AGAINST, NFT_CLOSED, NFT_OPEN, NFT_OURS, PORTS
 from tests.observe.doctor.test_ros_environment import SHELL
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER

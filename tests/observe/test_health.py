@@ -10,7 +10,7 @@ import pytest
 from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
+from rmpa.ros.types.definitions import DiagnosticLevel, DiagnosticStatus
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
 
 if TYPE_CHECKING:

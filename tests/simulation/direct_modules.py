@@ -21,7 +21,7 @@ from rmpa.bridge.topics.io.direct_importer import DirectImporter
 from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import UnreachableError
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterator

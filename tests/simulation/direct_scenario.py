@@ -15,7 +15,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
 from rmpa.bridge.direct.requests import Want
 from rmpa.bridge.messages import Source
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from tests.bridge.io.virtual import VirtualLoop, run
 from tests.simulation.direct_modules import Channel, Network, PublisherModule, SubscriberModule, Talker, World
 from tests.simulation.scenario import Disagreement, Outcome

@@ -42,7 +42,7 @@ from rmpa.observe.io.site_requests import SiteRequests
 from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
 from rmpa.observe.peer_agent import INFO
 from rmpa.observe.why.io.why import WhyService
-from rmpa.ros.node.logger_services import LoggerServices
+from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections

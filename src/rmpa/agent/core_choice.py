@@ -16,8 +16,8 @@ from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
-from rmpa.ros.http.client import call_api, is_own_name
-from rmpa.ros.node.local_addresses import local_addresses
+from rmpa.ros.http.rpc import call_api, is_own_name
+from rmpa.ros.node.listeners import local_addresses
 
 if TYPE_CHECKING:
     from rmpa.config.settings import Settings

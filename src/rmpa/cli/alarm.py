@@ -18,14 +18,14 @@ from rmpa.cli.resource_graph import run_with_resources, with_resources
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import RmpaError
 from rmpa.resource.run.descriptor import TOPIC
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master
     from rmpa.cli.resource_graph import ResourceGraph, SeenResource
+    from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.topics import Received
 
 _COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "magenta"}
 _LOOK: Final = 1.0

@@ -16,7 +16,7 @@ from rmpa.core.errors import UnreachableError
 def _default_port() -> int:
     """The port of ``ROS_MASTER_URI`` if its host is this machine, as for roscore; else 11311."""
     from rmpa.ros.core.embedded import DEFAULT_PORT
-    from rmpa.ros.http.client import is_own_name, split_uri
+    from rmpa.ros.http.rpc import is_own_name, split_uri
 
     try:
         host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))

@@ -239,7 +239,7 @@ async def read_graph(master: Master) -> Graph:
         UnreachableError: It does not answer.
         RmpaError: It answers with something else.
     """
-    from rmpa.ros.http.client import call_api
+    from rmpa.ros.http.rpc import call_api
 
     try:
         state = (await call_api(master.uri, "getSystemState", "/rmpa_topic")).value

@@ -17,8 +17,8 @@ from rmpa.cli.options import FiniteRange, GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, print_line, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.ros import limits
-from rmpa.ros.core.node_calls import end_node, ping_node
-from rmpa.ros.node_info import NodeEnd, NodePing
+from rmpa.ros.core.liveness import end_node, ping_node
+from rmpa.ros.environment import NodeEnd, NodePing
 
 if TYPE_CHECKING:
     from rmpa.cli.graph import GraphName

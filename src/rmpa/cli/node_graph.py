@@ -14,8 +14,8 @@ from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.selection import Selection, selection_options, summary
 from rmpa.core.errors import RmpaError
-from rmpa.ros.core.node_calls import ping_node
-from rmpa.ros.node_info import NodeFacts, NodeLine, describe_node, list_nodes
+from rmpa.ros.core.liveness import ping_node
+from rmpa.ros.environment import NodeFacts, NodeLine, describe_node, list_nodes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,9 +10,9 @@ from rmpa.cli.output import warn
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient
-from rmpa.ros.http.client import call, call_api
-from rmpa.ros.master.survey import lookup_calls, read_lookups
-from rmpa.ros.node_info import NodeLine, PeerNodes
+from rmpa.ros.environment import NodeLine, PeerNodes
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.master.mirror import lookup_calls, read_lookups
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -171,7 +171,7 @@ class _MasterStore:
             raise absent(key, self.names(), self.title)
 
     def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
-        from rmpa.ros.http.client import call_api
+        from rmpa.ros.http.rpc import call_api
 
         try:
             return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))

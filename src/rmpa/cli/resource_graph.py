@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from rmpa.cli.graph import Graph
     from rmpa.cli.master import Master
     from rmpa.cli.options import GraphOptions
+    from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.topics import Received
 
 TEXT: Final = "std_msgs/String"
 _ANSWER: Final = 3.0
@@ -132,7 +132,7 @@ class ResourceGraph:
             RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
         from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
-        from rmpa.ros.types.service_types import ServiceType
+        from rmpa.ros.types.installed import ServiceType
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)
         server = self.graph.require_service(service)

@@ -12,7 +12,7 @@ from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.profile import offers, shown
 from rmpa.cli.resource_graph import run_with_resources
 from rmpa.resource.declare.attributes import MEASURED
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

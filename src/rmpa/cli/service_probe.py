@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.cli.master import Master
-    from rmpa.ros.types.service_types import ServiceType
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.types.installed import ServiceType
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 CALLER_ID: Final = "/rmpa_service"
 _AT_ONCE: Final = 16
@@ -60,7 +60,7 @@ async def probe(master: Master, name: str) -> Probed:
     Raises:
         UnreachableError: The master does not answer.
     """
-    from rmpa.ros.node.services import probe as ask
+    from rmpa.ros.node.endpoints import probe as ask
 
     uri = ""
     try:

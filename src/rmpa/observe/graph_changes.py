@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.observe import limits
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.ros.master.effects import GraphChange, GraphState
+    from rmpa.ros.master.parameters import GraphChange, GraphState
 
 _Nodes = tuple[str, ...]
 

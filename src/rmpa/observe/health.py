@@ -13,7 +13,7 @@ from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values
 from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
+from rmpa.ros.types.definitions import DiagnosticLevel, DiagnosticStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

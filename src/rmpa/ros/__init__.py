@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from rmpa.ros.environment import RosEnvironment
     from rmpa.ros.node.node import Node, Publisher, Received, Service, ServiceClient, Subscriber
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.types.service_types import ServiceType
 
 __all__ = [
     "MessageType",
@@ -30,7 +30,7 @@ __all__ = [
 _MODULES: Final = {
     "MessageType": "rmpa.ros.types.messages",
     "RosEnvironment": "rmpa.ros.environment",
-    "ServiceType": "rmpa.ros.types.service_types",
+    "ServiceType": "rmpa.ros.types.installed",
 }
 
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, cast
 from rmpa.core import limits as core_limits
 from rmpa.core.outbox import QueuedMessage
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.ros.master.reachability import Unreachable
+    from rmpa.ros.master.registrations import Unreachable
     from rmpa.ros.node.publication import Publication
 
 MD5: Final = "5a9ea5f83505693b71e785041e67a8bb"

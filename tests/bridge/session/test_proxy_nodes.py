@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, cast
 import psutil
 
 from rmpa.bridge.session.proxy_nodes import ProxyNodes
-from rmpa.ros.http.client import call_api
-from rmpa.ros.node import shared_listener
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node import listeners as shared_listener
 
 if TYPE_CHECKING:
     import pytest

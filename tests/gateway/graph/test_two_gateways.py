@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.relay import OUTSIDE_GUID, is_outside
 from rmpa.gateway.graph.origins import foreign_origin, site_instance
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.test_agent import Sink, node, settings, until
 from tests.agent.test_services import connect, provider, serving
 from tests.gateway.graph.gateways import (

@@ -6,8 +6,8 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.gateway.ros2.types import NO_HASH, Ros2Types, ros2_name, snake_case
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from rmpa.gateway.sites.io.service_imports import SiteServiceImports
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.part import SiteExport, SiteImport
 from rmpa.gateway.sites.services import asked_type, read_description, write_description
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.gateway.sites.loopback_session import LoopbackSession
 
 if TYPE_CHECKING:

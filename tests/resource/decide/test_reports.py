@@ -7,7 +7,7 @@ from rmpa.resource.decide.reports import alarm_values, answer_to, decision_repor
 from rmpa.resource.declare.attributes import LATENCY, RATE
 from rmpa.resource.declare.profiles import Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}
 FAST = Profile("fast", {"rate": 40.0})

@@ -17,13 +17,13 @@ from rmpa.resource.run.runtime import Runtime
 from rmpa.resource.run.tasks import Tasks
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.ros.node.topics import Subscriber
+    from rmpa.ros.node.endpoints import Subscriber
 
 ARRAY = "diagnostic_msgs/DiagnosticArray"
 OK, WARN, ERROR = 0, 1, 2

@@ -16,13 +16,13 @@ from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE,
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.ros.node.topics import Subscriber
+    from rmpa.ros.node.endpoints import Subscriber
 
 DEADLINE = 30.0
 TEXT = "std_msgs/String"

@@ -12,7 +12,7 @@ from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -13,8 +13,8 @@ from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError
+from rmpa.ros.types.installed import packages_below
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.packages import packages_below
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.ros.types.workspaces import package
 

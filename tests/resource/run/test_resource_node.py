@@ -12,13 +12,13 @@ from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.resource_node import ResourceNode, run_all
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.ros.node.topics import Subscriber
+    from rmpa.ros.node.endpoints import Subscriber
 
 OK, WARN, ERROR, STALE = range(4)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.resource.declare.connections import Input, Output
-    from rmpa.ros.node.topics import Received
+    from rmpa.ros.node.endpoints import Received
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.tasks import Tasks
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

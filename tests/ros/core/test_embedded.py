@@ -8,12 +8,11 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.core import identify, liveness
-from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.rosout import AGGREGATED, LOG_MD5, LOG_TYPE
-from rmpa.ros.http.client import call, call_api
-from rmpa.ros.http.server import XmlRpcServer
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.core import liveness
+from rmpa.ros.core import liveness as identify
+from rmpa.ros.core.embedded import AGGREGATED, LOG_MD5, LOG_TYPE, RosCore
+from rmpa.ros.http.rpc import XmlRpcServer, call, call_api
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
@@ -160,7 +159,7 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
 
 
 async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rmpa.ros.core.notifier.call", _with_timeout(0.05))
+    monkeypatch.setattr("rmpa.ros.core.liveness.call", _with_timeout(0.05))
     async with Slave() as slave:
         slave.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)

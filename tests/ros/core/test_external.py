@@ -14,13 +14,13 @@ from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
-from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.http.rpc import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
 
 DEADLINE: Final = 20.0
 STRING: Final = "std_msgs/String"

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.http.client import call, call_api, connect, split_uri
+from rmpa.ros.http.rpc import call, call_api, connect, split_uri
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_fault, serialize_response
 
 if TYPE_CHECKING:
@@ -161,6 +161,6 @@ async def test_a_socket_that_is_hung_up_on_at_once_is_closed(monkeypatch: pytest
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
-        monkeypatch.setattr("rmpa.ros.http.client.socket.socket", HungUp)
+        monkeypatch.setattr("rmpa.ros.http.rpc.socket.socket", HungUp)
         with pytest.raises(OSError, match="not connected"):
             await connect(*address)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.master.effects import (
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.parameters import (
     Effect,
     GraphChange,
     GraphState,
@@ -15,7 +16,6 @@ from rmpa.ros.master.effects import (
     RegistrationKind,
     Shutdown,
 )
-from rmpa.ros.master.master_api import MasterApi
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
 if TYPE_CHECKING:

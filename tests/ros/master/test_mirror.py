@@ -9,13 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
-from rmpa.ros.master.master_api import MasterApi
-from rmpa.ros.master.mirror import Call, Mirror
-from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.mirror import Call, Mirror, lookup_calls, read_lookups, read_survey, survey_calls
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 
 if TYPE_CHECKING:
-    from rmpa.ros.master.survey import Survey
+    from rmpa.ros.master.mirror import Survey
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 OURS: Final = "http://127.0.0.1:1/"

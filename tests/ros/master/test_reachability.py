@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.ros import limits
-from rmpa.ros.master.reachability import Reachability, Unreachable
+from rmpa.ros.master.registrations import Reachability, Unreachable
 
 AT = "http://10.9.9.9:1234/"
 AFTER = limits.NODE_UNREACHABLE_AFTER

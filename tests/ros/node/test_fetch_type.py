@@ -13,9 +13,8 @@ from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
 from rmpa.ros.node.node import Node
 from rmpa.ros.types import installed
 from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
+from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.packages import packages_below
-from rmpa.ros.types.service_types import ServiceType
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.ros.node.peers import until
 from tests.ros.types.workspaces import package
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
-    from rmpa.ros.node.topics import Received
+    from rmpa.ros.node.endpoints import Received
 
 NAME: Final = "my_msgs/Foo"
 FOO: Final = MessageType.learn(NAME, "int32 a\n")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros import limits
-from rmpa.ros.node.loopback_addresses import LoopbackAddresses
+from rmpa.ros.node.listeners import LoopbackAddresses
 
 if TYPE_CHECKING:
     import pytest

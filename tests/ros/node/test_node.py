@@ -10,11 +10,11 @@ from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.http.client import call
+from rmpa.ros.http.rpc import call
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import DefinitionError
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageError, MessageType
-from rmpa.ros.types.service_types import ServiceType
 from tests.ros.node.peers import DEADLINE, STRING, until
 
 if TYPE_CHECKING:

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.ros.node import probe as module
-from rmpa.ros.node.probe import probe
+from rmpa.ros.node import service_client as module
+from rmpa.ros.node.service_client import probe
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.services import ServiceDescription, server_header
-from rmpa.ros.wire.tcpros import encode_header, error_header
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
 from rmpa.runtime import limits
 from tests.ros.node.peers import DEADLINE, RawSubscriber
 from tests.runtime.descriptors_left import descriptors_left

@@ -8,8 +8,7 @@ import pytest
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
-from rmpa.ros.wire.services import ServiceDescription, server_header
-from rmpa.ros.wire.tcpros import encode_header
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
 
 if TYPE_CHECKING:

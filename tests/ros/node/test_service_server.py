@@ -12,8 +12,7 @@ from rmpa.ros import limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.services import ServiceDescription
-from rmpa.ros.wire.tcpros import encode_header
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ import pytest
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.core.identify import name_at
-from rmpa.ros.http.client import call_api
-from rmpa.ros.node import shared_listener
+from rmpa.ros.core.liveness import name_at
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node import listeners as shared_listener
+from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.shared_listener import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
 from tests.ros.node.peers import STRING, RawSubscriber, until
 

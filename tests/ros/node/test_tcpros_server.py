@@ -9,8 +9,8 @@ import pytest
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
+from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import encode_header, frame_message
 from tests.ros.node.peers import STRING, RawSubscriber, until
 

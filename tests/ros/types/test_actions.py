@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from rmpa.ros.types.actions import action_message, actions_of
+from rmpa.ros.types.installed import action_message, actions_of
 
 GENACTION: Final = Path("/usr/lib/actionlib_msgs/genaction.py")
 TEXT: Final = "# how far\nfloat64 metres\nuint8 FAST=1\n---\nbool done\n---\nfloat64 left  # m"

@@ -7,14 +7,15 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.types.definitions import md5sum, parse_definition
-from rmpa.ros.types.diagnostic_array import (
+from rmpa.ros.types.definitions import (
     ARRAY_DEFINITION,
     ARRAY_MD5,
     ARRAY_TYPE,
     DiagnosticLevel,
     DiagnosticStatus,
     frame_array,
+    md5sum,
+    parse_definition,
 )
 from rmpa.ros.types.messages import MessageType
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.types import header_types, installed, packages
+from rmpa.ros.types import find as header_types
+from rmpa.ros.types import installed
+from rmpa.ros.types import installed as packages
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError
-from rmpa.ros.types.find import find_message_type, find_service_type
-from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
+from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.packages import packages_below
-from rmpa.ros.types.service_types import ServiceType
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:

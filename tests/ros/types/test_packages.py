@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.types.packages import package_folders, packages_below, read_text
+from rmpa.ros.types.installed import package_folders, packages_below, read_text
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:

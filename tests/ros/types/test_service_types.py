@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.ros.types.definitions import DefinitionError
-from rmpa.ros.types.service_types import ServiceType, known_services
+from rmpa.ros.types.installed import ServiceType, known_services
 from tests.ros.types.genmsg_cases import SERVICES
 
 

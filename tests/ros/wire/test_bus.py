@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.wire.bus import BusLink, read_bus_info
-from rmpa.ros.wire.slave_api import BusConnection, SlaveApi
+from rmpa.ros.wire.slave_api import BusConnection, BusLink, SlaveApi, read_bus_info
 from rmpa.ros.wire.xmlrpc import parse_response
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.call_body import CallBody, call_name, too_large, too_many
-from rmpa.ros.wire.xmlrpc import serialize_call
+from rmpa.ros.wire.xmlrpc import CallBody, call_name, serialize_call, too_large, too_many
 
 
 @pytest.mark.parametrize(

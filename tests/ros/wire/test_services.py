@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError, LimitExceeded
 from rmpa.ros import limits
-from rmpa.ros.wire.services import (
+from rmpa.ros.wire.tcpros import (
     BodyBuffer,
     ServiceDescription,
     check_client,

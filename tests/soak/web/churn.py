@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import random
 
     from lab.bed.chromium import Chromium
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 VIEW_EVERY: Final = 1.0
 CLIENT_EVERY: Final = 0.5

@@ -6,8 +6,8 @@ from typing import Any
 
 import msgspec
 
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.session import FoxgloveClose, FoxgloveSession, Output
 from rmpa.web.hub import requests

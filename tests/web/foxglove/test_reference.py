@@ -17,8 +17,8 @@ websockets_client = pytest.importorskip("websockets.sync.client", reason="websoc
 
 from foxglove import Channel, Schema, websocket  # noqa: E402 - after the skip
 
+from rmpa.ros.types.installed import ServiceType  # noqa: E402
 from rmpa.ros.types.messages import MessageType  # noqa: E402
-from rmpa.ros.types.service_types import ServiceType  # noqa: E402
 from rmpa.web.foxglove import protocol  # noqa: E402
 from rmpa.web.hub import requests  # noqa: E402
 from tests.web.foxglove.client import SET_BOOL, Client  # noqa: E402

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.ros.core.embedded import RosCore
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 ONE, TWO = b"\x03\0\0\0one", b"\x03\0\0\0two"
 FOXGLOVE = "foxglove.websocket.v1"

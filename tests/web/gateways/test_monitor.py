@@ -17,9 +17,9 @@ import pytest
 from rmpa.core.errors import UnreachableError
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import describe
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.web.hub.rights import FULL, READ_ONLY
 from rmpa.web.monitor import limits

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.definitions import parse_definition
+from rmpa.ros.types.definitions import HEADER_PART, parse_definition
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
-from rmpa.ros.types.std_header import HEADER_PART
 from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,

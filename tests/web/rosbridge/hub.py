@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import cbor2
 import msgspec
 
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, HubRequest, ParamValue, ReceivedMessage
 from rmpa.web.rosbridge.encodings import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession

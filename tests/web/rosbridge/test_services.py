@@ -9,8 +9,8 @@ import cbor2
 import msgspec
 import pytest
 
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 from rmpa.web.hub.requests import (
     CallService,
     CancelCall,

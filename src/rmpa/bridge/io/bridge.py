@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.api import Core
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
 

@@ -18,8 +18,8 @@ from rmpa.bridge.session.part import Part
 from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.topics.io.direct_importer import MEASURING
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.node.logger_services import GET
 from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.node.slave_node import GET
 from rmpa.ros.wire.tcpros import LENGTH
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.io.part import Topics
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
 

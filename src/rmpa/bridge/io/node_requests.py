@@ -17,8 +17,8 @@ from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_global_name, matches
-from rmpa.ros.core.node_calls import end_node, node_connections, ping_node
-from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
+from rmpa.ros.core.liveness import end_node, node_connections, ping_node
+from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:

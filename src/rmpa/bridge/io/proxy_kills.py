@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.core.notifier import MASTER_ID
+from rmpa.ros.core.liveness import MASTER_ID
 from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:

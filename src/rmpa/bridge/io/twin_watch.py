@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import PeerRule, Settings
     from rmpa.ros.core.api import Core
-    from rmpa.ros.master.effects import GraphState
+    from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Message
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
 
 _log = logging.getLogger(__name__)
 

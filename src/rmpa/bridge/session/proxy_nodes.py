@@ -8,7 +8,7 @@ from weakref import WeakValueDictionary
 
 from rmpa.core.errors import StartError
 from rmpa.ros.environment import is_loopback
-from rmpa.ros.node.shared_listener import SharedListener
+from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.accept import DESCRIPTORS, Use
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits
 
 if TYPE_CHECKING:
-    from rmpa.ros.master.effects import GraphState
+    from rmpa.ros.master.parameters import GraphState
 
 
 class UnchangedGraph:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 _log = logging.getLogger(__name__)
 

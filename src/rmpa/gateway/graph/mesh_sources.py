@@ -12,7 +12,7 @@ from rmpa.bridge.relay import is_outside, service_place
 from rmpa.bridge.topics.io.local_sources import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.gateway.neighbour import MeshSource, SourceKind
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
 
 _log = logging.getLogger(__name__)
 

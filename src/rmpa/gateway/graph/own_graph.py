@@ -29,7 +29,7 @@ from rmpa.gateway.graph.mesh_sources import MeshSources
 from rmpa.gateway.graph.origins import foreign_node, foreign_origin, site_instance
 from rmpa.gateway.graph.taps import TopicTap
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import yielding_to_data
 
@@ -39,11 +39,10 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.gateway.graph.mesh_sources import SourceKey
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.in_process import InProcessConnection
     from rmpa.ros.node.subscription import PublisherConnection
-    from rmpa.ros.wire.services import ServiceDescription
-    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
 TAP_NODE: Final = f"{OWN_NODE}/gateway"
 """The node that subscribes to what neighbours want."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 from rosbags.interfaces import Nodetype
 
 from rmpa.ros.types.definitions import SEPARATOR, known_text
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,7 +14,7 @@ from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 if TYPE_CHECKING:
     from rmpa.gateway.ros2.mapping import TypePair
     from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.types.installed import ServiceType
 
 _LOGGERS: Final = "loggers of ROS 1 nodes have no counterpart in ROS 2"
 _ROS1_WITHOUT_USE: Final = {

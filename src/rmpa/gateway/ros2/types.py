@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from rmpa.ros.types.definitions import Field, Specification
-    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.types.installed import ServiceType
 
 DISTRIBUTIONS: Final = {
     name.removeprefix("ROS2_").lower(): store

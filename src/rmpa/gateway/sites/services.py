@@ -19,7 +19,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer

@@ -24,7 +24,7 @@ from rmpa.observe.reload_reply import ReloadReply
 from rmpa.observe.sites import read_site_module
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.ros.node_info import NodeLine, PeerNodes
+from rmpa.ros.environment import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.observe import limits
 from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
+from rmpa.ros.types.definitions import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 

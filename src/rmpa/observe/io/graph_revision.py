@@ -13,7 +13,7 @@ from rmpa.observe.graph_changes import GraphHistory, GraphRevision
 
 if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
-    from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.parameters import GraphChange
 
 _REVISION_BITS = 52
 """Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other."""

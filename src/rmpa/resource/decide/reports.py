@@ -8,7 +8,7 @@ import msgspec
 
 from rmpa.resource.decide.actions import AlarmKind
 from rmpa.resource.decide.decision import describe_bound
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

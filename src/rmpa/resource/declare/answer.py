@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+    from rmpa.ros.types.definitions import DiagnosticLevel
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ from rmpa.resource.run.applier import Applier, HungError
 from rmpa.resource.run.preconditions import Preconditions
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.status_publisher import StatusPublisher
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.requirements import Bound
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
-    from rmpa.ros.node.topics import Received, Subscriber
+    from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 _CLIENTS_INTERVAL: Final = 0.25

@@ -20,7 +20,7 @@ from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource import limits
 from rmpa.resource.declare.answer import RequirementAnswer
 from rmpa.resource.declare.requirement_text import EXPIRES, PRIORITY
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from rmpa.resource.declare.qos_request import QoSRequest
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.topics import Publisher, Received, Subscriber
 
 
 class ResourceClient:

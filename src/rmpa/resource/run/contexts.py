@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.resource.run.adapter import Adapter
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
-    from rmpa.ros.node.topics import Received, Subscriber
+    from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 TOPIC: Final = "context"

@@ -12,7 +12,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.descriptor import TOPIC, Descriptor
 from rmpa.resource.run.runtime import RuntimePart
-from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+from rmpa.ros.types.definitions import DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Value
     from rmpa.resource.declare.connections import Demand
     from rmpa.resource.run.runtime import Runtime
-    from rmpa.ros.node.topics import Received
+    from rmpa.ros.node.endpoints import Received
 
 _log = logging.getLogger(__name__)
 

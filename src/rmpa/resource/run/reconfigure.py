@@ -25,8 +25,8 @@ from rmpa.resource.run.dynamic_reconfigure import (
     read_config,
 )
 from rmpa.resource.run.runtime import RuntimePart
+from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.resource.run.contexts import Contexts
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 _HOLDER: Final = "configuration"
 _log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from rmpa.resource.run.persistence import Persistence
 from rmpa.resource.run.reconfigure import Reconfigure
 from rmpa.resource.run.runtime import Runtime, RuntimePart
 from rmpa.resource.run.tasks import Tasks
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.runtime.process import in_thread
 

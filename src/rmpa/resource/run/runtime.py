@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.connections import Input, Output
     from rmpa.resource.declare.parameters import Parameter
     from rmpa.resource.declare.resource import Resource
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.topics import Publisher, Received, Subscriber
-    from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+    from rmpa.ros.types.definitions import DiagnosticLevel
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.run.runtime import Runtime
-    from rmpa.ros.node.topics import Publisher
+    from rmpa.ros.node.endpoints import Publisher
 
 LEVEL_FOR: Final = "level_for"
 """The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ."""

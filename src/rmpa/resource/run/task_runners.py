@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.resource.declare.behaviour import Task
     from rmpa.resource.run.run_gate import RunGate
-    from rmpa.ros.node.topics import Received
+    from rmpa.ros.node.endpoints import Received
 
 _log = logging.getLogger(__name__)
 

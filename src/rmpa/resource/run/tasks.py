@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.schedule import TaskReport
     from rmpa.resource.run.task_runners import TaskRunner
-    from rmpa.ros.node.topics import Received
-    from rmpa.ros.types.diagnostic_array import DiagnosticLevel
+    from rmpa.ros.node.endpoints import Received
+    from rmpa.ros.types.definitions import DiagnosticLevel
 
 _log = logging.getLogger(__name__)
 _STUCK_CHECK: Final = 0.25

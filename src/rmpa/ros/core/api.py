@@ -6,16 +6,15 @@ import logging
 from typing import TYPE_CHECKING, Protocol
 
 from rmpa.core.counters import logged_failure
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.core.counters import Counters
-    from rmpa.ros.master.effects import GraphChange, GraphState
-    from rmpa.ros.master.reachability import Unreachable
-    from rmpa.ros.master.registrations import Registrations
+    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.ros.master.registrations import Registrations, Unreachable
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 

@@ -19,9 +19,17 @@ from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError,
 from rmpa.ros import limits
 from rmpa.ros.core.api import Core
 from rmpa.ros.core.liveness import Liveness, refuses
-from rmpa.ros.http.client import call, call_api, exchange, read_response
-from rmpa.ros.master.mirror import REGISTRATIONS, Mirror
-from rmpa.ros.master.survey import Survey, lookup_calls, one_call, read_lookups, read_survey, survey_calls
+from rmpa.ros.http.rpc import call, call_api, exchange, read_response
+from rmpa.ros.master.mirror import (
+    REGISTRATIONS,
+    Mirror,
+    Survey,
+    lookup_calls,
+    one_call,
+    read_lookups,
+    read_survey,
+    survey_calls,
+)
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
@@ -29,7 +37,7 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.ros.master.reachability import Unreachable
+    from rmpa.ros.master.registrations import Unreachable
 
 _log = logging.getLogger(__name__)
 

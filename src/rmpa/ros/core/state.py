@@ -22,18 +22,17 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
-from rmpa.ros.core.identify import name_at
-from rmpa.ros.http.client import call_api
+from rmpa.ros.core.liveness import name_at
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.registrations import NodeRecord  # noqa: TC001 - msgspec reads the annotations
-from rmpa.ros.wire.xmlrpc import RosFault, brief
-from rmpa.ros.wire.xmlrpc_writer import legal_text
+from rmpa.ros.wire.xmlrpc import RosFault, brief, legal_text
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.ros.master.master_api import MasterApi
+    from rmpa.ros.master.api import MasterApi
 
 _log = logging.getLogger(__name__)
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
+import ipaddress
 import socket
 import struct
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
+from rmpa.core.counters import remedy
+from rmpa.core.errors import StartError
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
 from rmpa.ros.wire.xmlrpc import serialize_fault
 from rmpa.runtime import limits as runtime_limits
+from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.tcp_connections import program_at
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import Awaitable, Iterable
+
+    from rmpa.runtime.accept import Use
 
 RESET: Final = struct.pack("ii", 1, 0)
 """SO_LINGER: closing resets the connection, like a port where nothing listens."""
@@ -291,3 +300,111 @@ class HttpConnection(asyncio.Protocol):
         self._closing = True
         if self._transport is not None:
             self._transport.abort()
+
+
+# Opens the listening socket of an XML-RPC server; errors have a remedy.
+
+
+async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
+    """Open a listening socket.
+
+    Args:
+        name: The server, for the text of errors.
+        host: Numeric address or name; empty: all addresses.
+        port: 0 lets the system choose.
+        use: The purpose of its connections.
+
+    Raises:
+        StartError: The address is in use, not of this machine, or not allowed.
+    """
+    try:
+        address = await _resolve(host, port)
+        sock = DESCRIPTORS.open_socket(use, what=name)
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            sock.listen(limits.HTTP_BACKLOG)
+        except BaseException:
+            sock.close()
+            raise
+    except OSError as error:
+        owner = await asyncio.to_thread(program_at, port) if error.errno == errno.EADDRINUSE else ""
+        raise _start_error(error, f"{name} at {host}:{port}", port, owner) from error
+    return sock
+
+
+async def _resolve(host: str, port: int) -> tuple[str, int]:
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.IPv4Address(host)), port
+    if not host:
+        return "", port
+    loop = asyncio.get_running_loop()
+    found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
+    return str(found[0][4][0]), port
+
+
+def _start_error(error: OSError, where: str, port: int, owner: str) -> StartError:
+    match error.errno:
+        case errno.EADDRINUSE:
+            return StartError(
+                where,
+                f"port {port} is already in use" + (f" by {owner}" if owner else ""),
+                "end that program (another core?) or choose another port",
+            )
+        case errno.EACCES | errno.EPERM:
+            return StartError(where, "this user may not use that port", "choose a port above 1023")
+        case errno.EADDRNOTAVAIL:
+            return StartError(where, "this machine does not have that address", "choose one that `ip addr` shows")
+        case errno.EMFILE:
+            return StartError(where, "no file descriptors left", remedy())
+    return StartError(where, error.strerror or str(error))
+
+
+# Chooses the connection of an XML-RPC server to close when there are too many, or too many bytes of calls.
+#
+# All clients are on this machine, so their addresses do not distinguish them. A well-behaved client is fast: it
+# sends
+# its call at once and reads the answer. A port scanner, or a stuck, stopped or hostile program, sends a byte now
+# and
+# then. The slowest is closed, so that ``rostopic list`` is answered beside any number of these.
+
+
+_MOMENT: Final = 1e-3
+"""Seconds; the least duration in the pace of a call."""
+
+
+def for_newcomer(connections: Iterable[HttpConnection], now: float) -> HttpConnection | None:
+    """Choose the connection to close for a new one; ``None`` if all are being answered.
+
+    It is the slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
+    reconnects by itself; else the slowest of all.
+
+    Args:
+        connections: In the order of their last use.
+        now: Monotonic seconds.
+    """
+    stalled, idle = [], None
+    for one in connections:
+        if one.idle:
+            idle = idle or one
+        elif not one.answering:
+            stalled.append(one)
+    slow = [one for one in stalled if _is_slow(one, now)]
+    if idle is not None and not slow:
+        return idle
+    return min(slow or stalled, key=lambda one: _pace(one, now), default=None)
+
+
+def for_call(connections: Iterable[HttpConnection], now: float) -> HttpConnection | None:
+    """Choose the connection to close for the bytes of another call; ``None`` if none is slow."""
+    slow = [one for one in connections if one.reserved and not one.answering and _is_slow(one, now)]
+    return min(slow, key=lambda one: _pace(one, now), default=None)
+
+
+def _is_slow(one: HttpConnection, now: float) -> bool:
+    return now - one.begun > limits.HTTP_SLOW_AFTER and _pace(one, now) < limits.HTTP_PACE_MIN
+
+
+def _pace(one: HttpConnection, now: float) -> float:
+    """Bytes a second; 0 for a client that does not read its answer."""
+    return one.received / max(now - one.begun, _MOMENT)

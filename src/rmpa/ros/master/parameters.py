@@ -1,22 +1,148 @@
-"""The parameter tree, and the notifications for its subscribers.
-
-The tree is never changed in place: a change copies the dicts along its path, so values that callers hold stay as they
-are. Keys are resolved names; a value that is a dict is a namespace.
-"""
+"""Calls to slave APIs that follow from a change in the master's tables, and reports of changes."""
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
-
-from rmpa.ros.master.effects import ParamUpdate
-from rmpa.ros.master.resolution import join, with_slash
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.core.counters import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherUpdate:
+    """``publisherUpdate`` for the slave API at ``api``: the publishers of ``topic``, in order of registration."""
+
+    api: str
+    topic: str
+    publishers: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ParamUpdate:
+    """``paramUpdate`` for the slave API at ``api``: ``key``, which ends in ``/``, is ``value``; ``{}`` if deleted."""
+
+    api: str
+    key: str
+    value: XmlRpcValue
+
+
+@dataclass(frozen=True, slots=True)
+class Shutdown:
+    """``shutdown`` for ``node`` at the slave API ``api``, because another node has taken its name.
+
+    ``topics`` are those that it published: the header of one shows whether that node is still at the address.
+    """
+
+    api: str
+    node: str
+    topics: tuple[str, ...]
+
+
+Effect: TypeAlias = PublisherUpdate | ParamUpdate | Shutdown
+
+
+class RegistrationKind(enum.Enum):
+    """The kinds of registration at a master."""
+
+    PUBLISHER = "publisher"
+    SUBSCRIBER = "subscriber"
+    SERVICE = "service"
+    PARAM = "param"
+
+
+@dataclass(frozen=True, slots=True)
+class GraphChange:
+    """One registration that was added or removed, or changed its type.
+
+    Args:
+        kind: Its kind; subscriptions to parameters are not reported.
+        added: Whether it was added (or changed its type) or removed.
+        name: The topic or service.
+        node: The node that registered it.
+        api: The node's XML-RPC URI.
+        type: The topic's type as far as known: ``pkg/Name``, ``*`` or empty; empty for services.
+    """
+
+    kind: RegistrationKind
+    added: bool
+    name: str
+    node: str
+    api: str
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class GraphState:
+    """All registrations at one moment; never changed afterwards.
+
+    Args:
+        publishers: By topic, in order of registration: node to XML-RPC URI.
+        subscribers: By topic: node to XML-RPC URI.
+        services: By service: node to ``rosrpc://`` URI.
+        types: By topic, also of topics without registrations.
+        nodes: Node to XML-RPC URI.
+    """
+
+    publishers: dict[str, dict[str, str]]
+    subscribers: dict[str, dict[str, str]]
+    services: dict[str, dict[str, str]]
+    types: dict[str, str]
+    nodes: dict[str, str]
+
+
+# Names as rosmaster resolves them: any characters, relative to the caller.
+#
+# Stricter rules (``core.names``) hold for names that RMPA makes; a master accepts what rosmaster accepts.
+
+
+def canonical(name: str) -> str:
+    """Return a name without doubled or trailing slashes; ``/`` and the empty name stay."""
+    joined = "/".join(part for part in name.split("/") if part)
+    return f"/{joined}" if name.startswith("/") else joined
+
+
+def namespace_of(caller_id: str) -> str:
+    """The caller's namespace with its trailing slash; ``/`` for callers without one."""
+    name = caller_id.removesuffix("/")
+    return name[: name.rfind("/") + 1] or "/"
+
+
+def resolve(name: str, caller_id: str) -> str:
+    """Resolve ``/global``, ``relative`` and ``~private`` names for a caller; the empty name is its namespace."""
+    if not name:
+        return namespace_of(caller_id)
+    name = canonical(name)
+    if name.startswith("~"):
+        return canonical(f"{caller_id}/{name[1:]}")
+    if name.startswith("/"):
+        return name
+    return namespace_of(caller_id) + name
+
+
+def join(namespace: str, name: str) -> str:
+    """``namespace/name``; a global or private name stays as it is."""
+    if name.startswith(("/", "~")) or not namespace:
+        return name
+    return namespace + name if namespace.endswith("/") else f"{namespace}/{name}"
+
+
+def with_slash(key: str) -> str:
+    """A parameter's key as subscriptions and updates carry it: with one trailing slash."""
+    return key if key == "/" else canonical(key) + "/"
+
+
+# The parameter tree, and the notifications for its subscribers.
+#
+# The tree is never changed in place: a change copies the dicts along its path, so values that callers hold stay as
+# they
+# are. Keys are resolved names; a value that is a dict is a namespace.
+
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"
 _V = TypeVar("_V")

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.types.definitions import UnknownTypeError
-from rmpa.ros.types.find import find_message_type
-from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:

@@ -24,13 +24,12 @@ from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.endpoints import Handler, Publisher, Received, Service, ServiceClient, Subscriber, probe
 from rmpa.ros.node.fetch_type import find_or_fetch
-from rmpa.ros.node.local_addresses import local_addresses
+from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node.services import Handler, Service, ServiceClient, probe
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.topics import Publisher, Received, Subscriber
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type, find_service_type
 from rmpa.ros.types.messages import MessageType
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from types import TracebackType
 
-    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]

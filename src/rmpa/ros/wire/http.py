@@ -12,7 +12,7 @@ from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser, Htt
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros import limits
-from rmpa.ros.wire.call_body import CallBody
+from rmpa.ros.wire.xmlrpc import CallBody
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,26 +1,274 @@
-"""XML-RPC calls and responses as bytes (xmlrpc.com/spec, and ROS's use of it).
+"""Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
 
-The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and allows
-only the types that ROS has. Long documents are read and written piece by piece.
+A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client hides
+the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer before
+it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
-from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar, Union, cast
+from itertools import chain
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, Union, cast
 from xml.parsers.expat import ExpatError
 from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
 from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.limits import INT32_MAX, INT32_MIN
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError, RmpaError
+from rmpa.core.limits import INT32_MAX, INT32_MIN, KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
+_TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
+_BEGIN: Final = 4 * KIB
+"""Bytes of a refused call that are kept, to name the call in the fault."""
+
+
+class CallBody:
+    """Collects one body after the other.
+
+    Args:
+        reserve: ``(bytes) -> whether there is room``: called once for each large call.
+    """
+
+    __slots__ = ("_data", "_left_out", "_reserve", "_why", "reserved")
+
+    def __init__(self, reserve: Callable[[int], bool]) -> None:
+        self._reserve = reserve
+        self._data = bytearray()
+        self._left_out = 0
+        self._why: Callable[[bytes | bytearray, int], str] | None = None
+        self.reserved = 0
+        """Bytes reserved for the present call, until ``answered``."""
+
+    def __len__(self) -> int:
+        """Bytes received."""
+        return len(self._data) + self._left_out
+
+    @property
+    def refused(self) -> bool:
+        """Whether the call is too large: its bytes are dropped."""
+        return self._why is not None
+
+    def expect(self, size: int) -> bool:
+        """Announce the size of a body that has a Content-length; return whether it is accepted."""
+        if size > limits.HTTP_BODY_MAX:
+            self._why = too_large
+        elif size > limits.HTTP_BODY_INLINE and not self.reserved:
+            if self._reserve(size):
+                self.reserved = size
+            else:
+                self._why = too_many
+        return self._why is None
+
+    def add(self, data: bytes | bytearray) -> None:
+        """Add a part."""
+        size = len(self) + len(data)
+        if self._why is None and size > limits.HTTP_BODY_INLINE:
+            # A body in chunks has no announced size.
+            self.expect(max(size, limits.HTTP_BODY_MAX))
+        if self._why is None:
+            self._data += data
+        else:
+            del self._data[_BEGIN:]
+            self._data += data[: _BEGIN - len(self._data)]
+            self._left_out = size - len(self._data)
+
+    def end(self) -> tuple[memoryview, str]:
+        """Return the whole body and an empty text; for a refused one its beginning and the text of the fault."""
+        data, size, why = self._data, len(self), self._why
+        self._data, self._left_out, self._why = bytearray(), 0, None
+        return memoryview(data), why(data, size) if why is not None else ""
+
+    def answered(self) -> None:
+        """Release the reserved bytes, because the call is answered."""
+        self.reserved = 0
+
+
+def call_name(begin: bytes | bytearray) -> str:
+    """A call's method, with the key if it is about a parameter: ``setParam /map``; ``a call`` if it is unknown.
+
+    Args:
+        begin: The first bytes of the call.
+    """
+    method = _METHOD.search(begin)
+    if method is None:
+        return "a call"
+    name = method[1].decode("ascii")
+    texts = _TEXTS.findall(begin, method.end())
+    if "Param" in name and len(texts) > 1:
+        name += " " + texts[1].decode("utf-8", "replace")
+    return name
+
+
+def too_large(begin: bytes | bytearray, size: int, limit: int = 0) -> str:
+    """The text of the fault for a call of ``size`` bytes, with the limit and a remedy."""
+    limit = limit or limits.HTTP_BODY_MAX
+    return (
+        f"{call_name(begin)}: {size} bytes, above the {limit} ({limit >> 20} MiB) of one call; set its parts one by "
+        "one, keep large data in a file and its path in the parameter, or publish it on a latched topic"
+    )
+
+
+def too_many(begin: bytes | bytearray, size: int) -> str:
+    """The text of the fault for a call that does not fit beside those under way."""
+    return (
+        f"{call_name(begin)}: {size} bytes beside other large calls, above the {limits.HTTP_BODIES_MAX >> 20} MiB of "
+        "all that are under way; try again in a moment"
+    )
+
+
+# Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces.
+#
+# The text is exactly that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser
+# compares strings, and stops without an error at ``<string/>`` or ``<i8>``.
+
+
+# XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
+_ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_PIECE: Final = 128
+"""Scalars in one piece: some 50 microseconds."""
+_SLICE: Final = 57 * 128
+"""Characters of a long string, or bytes of binary data, in one piece; base64 has 57 bytes in a line."""
+
+
+def legal_text(text: str) -> str:
+    """Replace characters that XML cannot hold by ``?``."""
+    return _ILLEGAL.sub("?", text)
+
+
+def pieces(what: str, value: object) -> Iterator[bytes]:
+    """Yield ``<value>…</value>`` in pieces of some KiB; the value must not change meanwhile.
+
+    Args:
+        what: The document, for the text of errors, such as ``the response``.
+        value: Of the types that ROS has; lists and tuples alike, dicts with strings as keys.
+
+    Raises:
+        LocalProtocolError: A value cannot be written: ``None``, an integer beyond 32 bits, a control character.
+    """
+    try:
+        yield from _pieces(value)
+    except _NotXmlRpcError as error:
+        raise LocalProtocolError(f"{what} {error}") from None
+
+
+class _NotXmlRpcError(Exception):
+    """A value cannot be written; the text has the reason, without a subject."""
+
+
+def _pieces(value: object) -> Iterator[bytes]:
+    out: list[str] = []
+    rest: Iterator[object] = iter((value,))
+    members, end = False, ""
+    above: list[tuple[Iterator[object], bool, str]] = []
+    while True:
+        for item in rest:
+            if members:
+                key, item = cast("tuple[object, object]", item)  # noqa: PLW2901 - of the pair, the value
+                out.append(f"<member>\n<name>{_name(key)}</name>\n")
+            write = _SCALARS.get(type(item))
+            if write is None:
+                if len(above) > limits.XMLRPC_DEPTH_MAX:
+                    raise _NotXmlRpcError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
+                above.append((rest, members, end))
+                rest, begin, end = _open(item, end="</member>\n" if members else "")
+                members = type(item) is dict
+                out.append(begin)
+                break
+            for text in write(item):
+                out.append(text)
+                if len(text) >= _SLICE:
+                    yield _flush(out)
+            if members:
+                out.append("</member>\n")
+            if len(out) >= _PIECE:
+                yield _flush(out)
+        else:
+            out.append(end)
+            if not above:
+                break
+            rest, members, end = above.pop()
+    yield _flush(out)
+
+
+def _flush(out: list[str]) -> bytes:
+    piece = "".join(out).encode()
+    out.clear()
+    return piece
+
+
+def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
+    """Return the elements of a list or dict, the text before them and the text after them, which ends in ``end``."""
+    if type(item) is dict:
+        return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
+    if type(item) in {list, tuple}:
+        return iter(cast("list[object]", item)), "<value><array><data>\n", f"</data></array></value>\n{end}"
+    raise _NotXmlRpcError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
+
+
+def _escaped(text: str) -> str:
+    if not text.isprintable() and (illegal := _ILLEGAL.search(text)) is not None:
+        raise _NotXmlRpcError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _name(key: object) -> str:
+    if type(key) is not str:
+        raise _NotXmlRpcError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
+    return _escaped(key)
+
+
+def _string(value: str) -> Iterable[str]:
+    if len(value) <= _SLICE:
+        return (f"<value><string>{_escaped(value)}</string></value>\n",)
+    slices = (_escaped(value[begin : begin + _SLICE]) for begin in range(0, len(value), _SLICE))
+    return chain(("<value><string>",), slices, ("</string></value>\n",))
+
+
+def _base64(value: bytes) -> Iterable[str]:
+    slices = (base64.encodebytes(value[at : at + _SLICE]).decode("ascii") for at in range(0, len(value), _SLICE))
+    return chain(("<value><base64>\n",), slices, ("</base64></value>\n",))
+
+
+def _int(value: int) -> Iterable[str]:
+    if not INT32_MIN <= value <= INT32_MAX:
+        raise _NotXmlRpcError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
+    return (f"<value><int>{value}</int></value>\n",)
+
+
+def _datetime(value: datetime) -> Iterable[str]:
+    return (f"<value><dateTime.iso8601>{value.year:04d}{value:%m%dT%H:%M:%S}</dateTime.iso8601></value>\n",)
+
+
+_SCALARS: Final[dict[type, Callable[..., Iterable[str]]]] = {
+    bool: lambda value: (f"<value><boolean>{value:d}</boolean></value>\n",),
+    int: _int,
+    float: lambda value: (f"<value><double>{value!r}</double></value>\n",),
+    str: _string,
+    bytes: _base64,
+    bytearray: _base64,
+    datetime: _datetime,
+}
+"""Writers of the types other than list and dict."""
+
+
+# XML-RPC calls and responses as bytes (xmlrpc.com/spec, and ROS's use of it).
+#
+# The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and
+# allows
+# only the types that ROS has. Long documents are read and written piece by piece.
+
 
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.http.client import exchange, read_response
+from rmpa.ros.http.rpc import exchange, read_response
 from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
 from rmpa.web import limits
 from rmpa.web.hub.graph_table import GraphTable, rows_of

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused
-from rmpa.ros.master.parameters import leaves
-from rmpa.ros.master.resolution import canonical
+from rmpa.ros.master.parameters import canonical, leaves
 
 if TYPE_CHECKING:
     from rmpa.trust.permissions import Permissions

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.ros.node.node import Node, Service
-    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink
     from rmpa.web.hub.requests import Payload

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros import limits as ros_limits
+from rmpa.ros.node.endpoints import probe
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
-from rmpa.ros.node.services import probe
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.web.hub.node_link import NodeLink
     from rmpa.web.hub.requests import Payload
 

@@ -12,10 +12,9 @@ from rmpa.core.errors import RmpaError
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.types.definitions import UnknownTypeError, known_text
-from rmpa.ros.types.find import find_message_type, find_service_type
-from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
+from rmpa.ros.types.installed import ServiceType, known_services
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.types.service_types import ServiceType, known_services
 from rmpa.web import limits
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.types.installed import ServiceType
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 from rmpa.web.rosbridge.typedefs import typedefs_of

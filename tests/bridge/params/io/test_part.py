@@ -21,8 +21,8 @@ from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
-from rmpa.ros.master.effects import ParamUpdate
-from rmpa.ros.master.master_api import MasterApi
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.parameters import ParamUpdate
 from tests.bridge.services.io.test_calls import Wire
 
 if TYPE_CHECKING:

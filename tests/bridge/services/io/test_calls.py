@@ -20,7 +20,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,7 @@ from rmpa.bridge.services.io.connection_pool import ServicePool
 from rmpa.core.errors import RmpaError
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -19,7 +19,7 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
 from tests.ros.node.peers import until
 

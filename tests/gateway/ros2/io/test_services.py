@@ -19,7 +19,7 @@ from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_t
 from rmpa.gateway.ros2.type_description import SERVICE_TYPE
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.definitions import known_text
-from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.types.installed import ServiceType
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, MemoryZenoh, eventually
 from tests.gateway.ros2.type_descriptions import response

@@ -13,7 +13,7 @@ import pytest
 
 from rmpa.observe.doctor.io.exposed_nodes import exposed_nodes
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -11,9 +11,9 @@ from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
 from rmpa.ros.environment import is_loopback
-from rmpa.ros.http.client import call_api
-from rmpa.ros.wire.services import parse_service_uri
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.wire.slave_api import TCPROS
+from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import listening_addresses
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RmpaError
-from rmpa.ros.http.client import call, call_api
-from rmpa.ros.wire.bus import read_bus_info
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.wire.slave_api import read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tcp_connections import connections, end_connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from rmpa.ros.wire.bus import BusLink
+    from rmpa.ros.wire.slave_api import BusLink
     from rmpa.runtime.tcp_connections import TcpConnection
 
 MASTER: Final = "/master"

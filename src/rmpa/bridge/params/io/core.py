@@ -9,7 +9,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.params.transfer import too_large
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError
-from rmpa.ros.http.documents import read_large, slices
+from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
 from rmpa.runtime.loop import yielding_to_data

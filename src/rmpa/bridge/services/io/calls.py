@@ -13,7 +13,7 @@ from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
 from rmpa.core.counters import SampleRing
 from rmpa.core.identity import SERIAL_MASK
 from rmpa.mesh import limits as mesh_limits
-from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from rmpa.bridge.data.io.link_time import LinkTime

@@ -17,7 +17,7 @@ from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.actions import LocalService
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.runtime.tls import Buffer
 
 _log = logging.getLogger(__name__)

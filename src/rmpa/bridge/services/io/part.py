@@ -52,7 +52,7 @@ from rmpa.bridge.session.peer_proxies import ProxyCallbacks
 from rmpa.bridge.session.peer_session import PeerState
 from rmpa.bridge.session.unchanged_graph import UnchangedGraph
 from rmpa.core.counters import RefusalLog
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import yielding_to_data
@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 _log = logging.getLogger(__name__)
 

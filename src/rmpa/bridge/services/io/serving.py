@@ -21,9 +21,9 @@ from rmpa.bridge.services.io.connection_pool import ServicePool
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.ros.core.liveness import listening_ports
-from rmpa.ros.http.client import is_own_name
-from rmpa.ros.node.local_addresses import local_addresses
-from rmpa.ros.wire.services import parse_service_uri
+from rmpa.ros.http.rpc import is_own_name
+from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 
 if TYPE_CHECKING:

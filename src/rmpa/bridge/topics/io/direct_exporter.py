@@ -21,7 +21,7 @@ from rmpa.bridge.topics.audience import compares_names
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import combine
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.tcpros import ANY
 
 if TYPE_CHECKING:

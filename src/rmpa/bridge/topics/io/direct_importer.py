@@ -31,10 +31,10 @@ from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.audience import compares_names
 from rmpa.core.contract import Transport
 from rmpa.ros.environment import host_of, is_loopback
-from rmpa.ros.http.client import is_own_name
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
-from rmpa.ros.node.local_addresses import local_addresses
-from rmpa.ros.node.probe import probe
+from rmpa.ros.http.rpc import is_own_name
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.node.service_client import probe
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.xmlrpc import RosReply
 

@@ -8,15 +8,15 @@ from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import is_own
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.core.identity import is_type_name
-from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.bridge.relay import Relay
     from rmpa.ros.core.api import Core
-    from rmpa.ros.master.effects import GraphChange
-    from rmpa.ros.master.reachability import Unreachable
+    from rmpa.ros.master.parameters import GraphChange
+    from rmpa.ros.master.registrations import Unreachable
 
 
 class LocalSources:

@@ -47,7 +47,7 @@ from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
-from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:

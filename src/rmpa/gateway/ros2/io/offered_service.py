@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 _log: Final = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.io.own_nodes import OwnEndpoint
     from rmpa.gateway.ros2.io.part import Ros2Context
     from rmpa.gateway.ros2.tokens import Ros2Endpoint
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 
 class ShownRos2Service:

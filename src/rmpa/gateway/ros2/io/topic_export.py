@@ -14,7 +14,7 @@ from rmpa.gateway.ros2.contract_qos import ros2_qos, zenoh_qos
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.tokens import EntityKind
 from rmpa.gateway.sites.topic_limits import TopicLimits
-from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.types.find import type_of_header
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.part import SiteExport
     from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 _NEEDS = Needs((Access.CALL,), "the service, of the site", key="rmpa/1/<site>/<module>/s/**")
 _log = logging.getLogger(__name__)

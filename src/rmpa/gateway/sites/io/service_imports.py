@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.part import SiteImport
     from rmpa.gateway.zenoh.session import OpenSession
-    from rmpa.ros.wire.services import ServiceDescription
+    from rmpa.ros.wire.tcpros import ServiceDescription
 
 
 @dataclass(slots=True, eq=False)

@@ -12,7 +12,7 @@ from rmpa.bridge.proxy_names import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.exposed_nodes import is_beyond_loopback
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.tcp_connections import listening_sockets
 
 if TYPE_CHECKING:

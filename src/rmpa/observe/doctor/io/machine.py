@@ -14,7 +14,7 @@ from typing import Final
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import KernelRights, WallClock
-from rmpa.ros.http.client import call_api
+from rmpa.ros.http.rpc import call_api
 from rmpa.runtime import limits as runtime_limits
 
 _CALLER: Final = "/rmpa_doctor"

@@ -29,7 +29,7 @@ from rmpa.web.values.codec import codec_for
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import ParamValue

@@ -15,7 +15,7 @@ from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE
 from rmpa.resource.run.status_publisher import LEVEL_FOR
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web.hub.clients import OWN_CLIENT
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.resources import ResourceFacts

@@ -7,23 +7,95 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import functools
+import ipaddress
 import logging
+import os
+import socket
 from collections.abc import Awaitable, Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, TypeVar, overload
+from urllib.parse import urlsplit
 
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.http import eviction, listen
+from rmpa.ros.http import connection as eviction
+from rmpa.ros.http import connection as listen
 from rmpa.ros.http.connection import HttpConnection
-from rmpa.ros.http.documents import read_large, read_small, slices
-from rmpa.ros.wire.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
+from rmpa.ros.wire.http import ResponseParser, post_request
+from rmpa.ros.wire.xmlrpc import (
+    CallReader,
+    ResponseReader,
+    RosFault,
+    RosReply,
+    XmlRpcValue,
+    brief,
+    call_pieces,
+    response_pieces,
+    serialize_fault,
+)
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.accept import Acceptor, Use
-from rmpa.runtime.loop import yield_to_data
+from rmpa.runtime.accept import DESCRIPTORS, OUT_OF_DESCRIPTORS, Acceptor, Use
+from rmpa.runtime.loop import yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
-    import socket
+    from collections.abc import Iterable
+
+    from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.ros.wire.xmlrpc import DocumentReader
+
+
+# Reads XML-RPC documents in slices of ``limits.XMLRPC_SLICE``; other pending data is served between two slices.
+#
+# A document of some MiB takes seconds to parse. It is not parsed in a thread, because a thread that computes takes
+# the
+# interpreter from the event loop for milliseconds at a time.
+
+
+_T = TypeVar("_T")
+
+
+@overload
+def slices(document: Buffer) -> Iterator[Buffer]: ...
+@overload
+def slices(document: str) -> Iterator[str]: ...
+def slices(document: Buffer | str) -> Iterator[Buffer | str]:
+    """A document in slices."""
+    for begin in range(0, len(document), limits.XMLRPC_SLICE):
+        yield document[begin : begin + limits.XMLRPC_SLICE]
+
+
+def read_small(reader: DocumentReader[_T], document: Buffer) -> _T:
+    """Read a document of at most ``limits.HTTP_BODY_INLINE`` bytes; the errors are those of ``reader``."""
+    for piece in slices(document):
+        reader.feed(piece)
+        yield_to_data()
+    return reader.close()
+
+
+async def read_large(reader: DocumentReader[_T], pieces: Iterable[Buffer]) -> _T:
+    """Read a document of any size; after ``limits.HTTP_BODY_INLINE`` bytes other callbacks run between slices.
+
+    Args:
+        reader: Its errors are raised.
+        pieces: Slices of the document.
+    """
+    size = 0
+    try:
+        for piece in pieces:
+            reader.feed(piece)
+            size += len(piece)
+            if size > limits.HTTP_BODY_INLINE:
+                await asyncio.sleep(0)
+            else:
+                yield_to_data()
+    except BaseException:
+        reader.abandon()
+        raise
+    return reader.close()
+
 
 _log = logging.getLogger(__name__)
 
@@ -258,3 +330,195 @@ class XmlRpcServer:
         self.counters.add("xmlrpc.failed")
         _log.error("! %s: %s failed", self._name, method, exc_info=error)
         return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
+
+
+# XML-RPC calls to nodes and masters, each on a connection of its own.
+#
+# No connection is kept alive: each costs a Python node a thread, and opening one on loopback takes 50 microseconds.
+
+
+__all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
+
+
+_CHUNK: Final = 64 * KIB
+_LOOPBACK: Final = "127.0.0.1"
+
+
+@functools.lru_cache(maxsize=1024)
+def split_uri(uri: str) -> tuple[str, int, str]:
+    """Split ``http://host:port/path`` into ``(host, port, path)``; the path is at least ``/``.
+
+    Raises:
+        UnreachableError: The text is not such a URI; ROS requires the port.
+    """
+    try:
+        parts = urlsplit(uri)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port, parts = None, None, None
+    if parts is None or parts.scheme != "http" or not host or not port:
+        raise UnreachableError("XML-RPC server", repr(uri), "a ROS URI looks like http://host:11311/")
+    return host, port, parts.path or "/"
+
+
+def is_own_name(host: str) -> bool:
+    """Whether a host name is this machine's, which is reached by loopback."""
+    return host in {"localhost", socket.gethostname()}
+
+
+async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
+    """Addresses of a host, best first; numbers and names of this machine do not go to the resolver."""
+    if is_own_name(host):
+        return [(_LOOPBACK, port)]
+    try:
+        return [(str(ipaddress.IPv4Address(host)), port)]
+    except ValueError:
+        return await _resolve(host, port)
+
+
+async def _resolve(host: str, port: int) -> list[tuple[str, int]]:
+    loop = asyncio.get_running_loop()
+    try:
+        found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise UnreachableError(
+            "machine", host, f"the name does not resolve here ({error}); set ROS_IP where that node runs"
+        ) from error
+    return [(address[0], port) for *_, address in found if isinstance(address[0], str)]
+
+
+async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
+    sock = DESCRIPTORS.open_socket(use, what=f"a connection to {address[0]}:{address[1]}")
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.get_running_loop().sock_connect(sock, address)
+        # getpeername() raises as well if the other side closed at once.
+        if sock.getsockname() == sock.getpeername():
+            # A connect to a port of the ephemeral range where nothing listens can connect to itself.
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
+    """Connect by TCP, non-blocking and with TCP_NODELAY.
+
+    Args:
+        host: An address, a name of this machine (connected on loopback, without the resolver) or any other name.
+        port: The port.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
+
+    Raises:
+        UnreachableError: The name does not resolve.
+        OSError: The connection is refused (``ConnectionRefusedError``), the network fails, or no file descriptor is
+            left (``EMFILE``).
+    """
+    error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
+    addresses = await _addresses(host, port)
+    for address in addresses:
+        try:
+            return await _connect_one(address, use)
+        except OSError as refused:
+            error = refused
+    if is_own_name(host) and host != "localhost":
+        # A node may listen only at this machine's address in the network.
+        for address in await _resolve(host, port):
+            if address not in addresses:
+                try:
+                    return await _connect_one(address, use)
+                except OSError as refused:
+                    error = refused
+    raise error
+
+
+async def call(
+    uri: str,
+    method: str,
+    *params: XmlRpcValue,
+    timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
+) -> XmlRpcValue:
+    """Call a method of the server at ``uri``.
+
+    Args:
+        uri: ``http://host:port/``.
+        method: The method's name.
+        params: The parameters.
+        timeout: Seconds for everything: the connection, the call and its response.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
+
+    Raises:
+        UnreachableError: The server does not answer, or not in time.
+        OutOfDescriptors: No file descriptor is left for the call.
+        RosFault: The response is a fault.
+        RemoteProtocolError: The response is not XML-RPC, or too large.
+        LocalProtocolError: A parameter cannot be written in XML-RPC.
+    """
+    if _log.isEnabledFor(logging.DEBUG):
+        _log.debug("> %s %s%s", uri, method, brief(params))
+    document = b"".join(yielding_to_data(call_pieces(method, params), every=1))
+    return await read_response(await exchange(uri, method, document, timeout=timeout, use=use))
+
+
+async def exchange(
+    uri: str,
+    method: str,
+    document: bytes,
+    *,
+    timeout: float,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
+) -> bytes:
+    """Send a ``methodCall`` document and return the document of the response, unparsed.
+
+    A caller that polls compares the bytes with those of the last response, and need not parse the same one twice.
+    Arguments and errors are those of ``call``; ``read_response`` parses the document.
+    """
+    host, port, path = split_uri(uri)
+    loop = asyncio.get_running_loop()
+    response = ResponseParser(uri)
+    try:
+        async with asyncio.timeout(timeout):
+            sock = await connect(host, port, use)
+            try:
+                await loop.sock_sendall(sock, post_request(host, port, path, document))
+                while (body := response.feed(await loop.sock_recv(sock, _CHUNK))) is None:
+                    pass
+                return body
+            finally:
+                sock.close()
+    except TimeoutError as error:
+        raise UnreachableError(
+            "XML-RPC server", uri, f"no answer to {method} in {timeout:g} s; is that program stopped?"
+        ) from error
+    except OSError as error:
+        if error.errno in OUT_OF_DESCRIPTORS:
+            raise OutOfDescriptors("XML-RPC server", uri, "`rmpa doctor` says what to do") from error
+        problem = os.strerror(error.errno) if error.errno else str(error)
+        raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
+
+
+async def read_response(body: bytes) -> XmlRpcValue:
+    """Parse the document of a response; other callbacks run between the slices of a large one.
+
+    Raises:
+        RosFault, RemoteProtocolError: As for ``call``.
+    """
+    return await read_large(ResponseReader(), slices(body))
+
+
+async def call_api(
+    uri: str,
+    method: str,
+    *params: XmlRpcValue,
+    timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - handed to ``call``
+    use: Use = Use.DATA,
+) -> RosReply:
+    """Call a method of a ROS API, which answers ``[code, status, value]``.
+
+    Raises:
+        RemoteProtocolError: The answer is not such a triple (that of roscpp's ``getBusStats`` is not).
+        UnreachableError, RosFault, LocalProtocolError: As for ``call``.
+    """
+    return RosReply.of(await call(uri, method, *params, timeout=timeout, use=use))

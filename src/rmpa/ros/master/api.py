@@ -7,20 +7,91 @@ status texts differ.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
+from rmpa.ros import limits
 from rmpa.ros.master import parameters as params
-from rmpa.ros.master import validators as v
-from rmpa.ros.master.effects import Effect, GraphChange, GraphState, RegistrationKind
-from rmpa.ros.master.registrations import Registrations
-from rmpa.ros.master.resolution import with_slash
+from rmpa.ros.master.parameters import Effect, GraphChange, GraphState, RegistrationKind, resolve, with_slash
+from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from rmpa.core.counters import Yielder
+
+
+# Checks of the Master API's parameters: they refuse what rosmaster answers with code -1.
+#
+# They are stricter in one point: ``limits.PARAM_DEPTH_MAX`` bounds the namespaces in a parameter's name.
+
+
+class InvalidParameterError(Exception):
+    """A parameter that the caller has to correct; the text names it and the fault. ``MasterApi.call`` catches it."""
+
+
+Validator: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
+"""``(value, the parameter's name, caller id) -> the value to use``; raises ``InvalidParameterError``."""
+
+
+def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
+    """Accept every value."""
+    return value
+
+
+def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """A string that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise InvalidParameterError(f"{name} must be a non-empty string, not {brief(value)}")
+    return value
+
+
+def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A parameter's name, resolved."""
+    resolved = resolve(text(value, name, caller_id), caller_id)
+    if resolved.count("/") > limits.PARAM_DEPTH_MAX:
+        raise InvalidParameterError(f"{name} has more than {limits.PARAM_DEPTH_MAX} namespaces")
+    return resolved
+
+
+def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A graph name, resolved; one with a colon or a space is refused."""
+    given = text(value, name, caller_id)
+    if ":" in given or " " in given:
+        raise InvalidParameterError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
+    return resolve(given, caller_id)
+
+
+def resource(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """The name of a topic or service, resolved; not the root."""
+    resolved = node_name(value, name, caller_id)
+    if value == "/":
+        raise InvalidParameterError(f"{name} cannot be the root namespace")
+    return resolved
+
+
+def subgraph(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A namespace, resolved, or the empty string for all."""
+    if not isinstance(value, str):
+        raise InvalidParameterError(f"{name} must be a string, not {brief(value)}")
+    return resolve(value, caller_id) if value else ""
+
+
+def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """A URI of a slave API or service, kept unchanged: roscpp recognises itself by the exact text."""
+    if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
+        raise InvalidParameterError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
+    return value
+
+
+def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """``package/Name``, or ``*`` for any type."""
+    if not isinstance(value, str) or (value != ANY_TYPE and value.count("/") != 1):
+        raise InvalidParameterError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
+    return value
+
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +105,7 @@ class _Method:
     """One method of the API: its parameters after ``caller_id``, and the value in the reply of an error."""
 
     function: Callable[..., RosReply]
-    parameters: tuple[tuple[str, v.Validator], ...]
+    parameters: tuple[tuple[str, Validator], ...]
     error_value: XmlRpcValue
 
 
@@ -92,7 +163,7 @@ class MasterApi:
             checked = [
                 check(value, name, caller_id) for (name, check), value in zip(found.parameters, rest, strict=True)
             ]
-        except v.InvalidParameterError as error:
+        except InvalidParameterError as error:
             _log.info("! %s: %s: %s", caller_id, method, error)
             return RosReply(ERROR, str(error), found.error_value)
         return found.function(caller_id, *checked)
@@ -271,36 +342,34 @@ class MasterApi:
         return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 
     def _table(self) -> dict[str, _Method]:
-        def method(function: Callable[..., RosReply], error_value: XmlRpcValue, **parameters: v.Validator) -> _Method:
+        def method(function: Callable[..., RosReply], error_value: XmlRpcValue, **parameters: Validator) -> _Method:
             return _Method(function, tuple(parameters.items()), error_value)
 
         return {
-            "shutdown": method(self._shutdown, 0, msg=v.anything),
+            "shutdown": method(self._shutdown, 0, msg=anything),
             "getUri": method(self._get_uri, ""),
             "getPid": method(self._get_pid, -1),
-            "deleteParam": method(self._delete_param, 0, key=v.key),
-            "setParam": method(self._set_param, 0, key=v.key, value=v.anything),
-            "getParam": method(self._get_param, 0, key=v.key),
-            "searchParam": method(self._search_param, 0, key=v.text),
-            "subscribeParam": method(self._subscribe_param, 0, caller_api=v.uri, key=v.key),
-            "unsubscribeParam": method(self._unsubscribe_param, 0, caller_api=v.uri, key=v.key),
-            "hasParam": method(self._has_param, False, key=v.key),
+            "deleteParam": method(self._delete_param, 0, key=key),
+            "setParam": method(self._set_param, 0, key=key, value=anything),
+            "getParam": method(self._get_param, 0, key=key),
+            "searchParam": method(self._search_param, 0, key=text),
+            "subscribeParam": method(self._subscribe_param, 0, caller_api=uri, key=key),
+            "unsubscribeParam": method(self._unsubscribe_param, 0, caller_api=uri, key=key),
+            "hasParam": method(self._has_param, False, key=key),
             "getParamNames": method(self._get_param_names, []),
-            "registerService": method(
-                self._register_service, 0, service=v.resource, service_api=v.uri, caller_api=v.uri
-            ),
-            "unregisterService": method(self._unregister_service, 0, service=v.resource, service_api=v.uri),
-            "lookupService": method(self._lookup_service, "", service=v.resource),
+            "registerService": method(self._register_service, 0, service=resource, service_api=uri, caller_api=uri),
+            "unregisterService": method(self._unregister_service, 0, service=resource, service_api=uri),
+            "lookupService": method(self._lookup_service, "", service=resource),
             "registerSubscriber": method(
-                self._register_subscriber, [], topic=v.resource, topic_type=v.type_name, caller_api=v.uri
+                self._register_subscriber, [], topic=resource, topic_type=type_name, caller_api=uri
             ),
-            "unregisterSubscriber": method(self._unregister_subscriber, 0, topic=v.resource, caller_api=v.uri),
+            "unregisterSubscriber": method(self._unregister_subscriber, 0, topic=resource, caller_api=uri),
             "registerPublisher": method(
-                self._register_publisher, [], topic=v.resource, topic_type=v.type_name, caller_api=v.uri
+                self._register_publisher, [], topic=resource, topic_type=type_name, caller_api=uri
             ),
-            "unregisterPublisher": method(self._unregister_publisher, 0, topic=v.resource, caller_api=v.uri),
-            "lookupNode": method(self._lookup_node, "", node=v.node_name),
-            "getPublishedTopics": method(self._get_published_topics, 0, subgraph=v.subgraph),
+            "unregisterPublisher": method(self._unregister_publisher, 0, topic=resource, caller_api=uri),
+            "lookupNode": method(self._lookup_node, "", node=node_name),
+            "getPublishedTopics": method(self._get_published_topics, 0, subgraph=subgraph),
             "getTopicTypes": method(self._get_topic_types, []),
             "getSystemState": method(self._get_system_state, [[], [], []]),
         }

@@ -1,0 +1,459 @@
+"""The addresses of this machine, from which a node chooses the one to register."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import itertools
+import logging
+import socket
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final
+
+import psutil
+
+from rmpa.core.counters import Counters, RefusalLog, remedy
+from rmpa.core.errors import StartError
+from rmpa.ros import limits
+from rmpa.ros.http.connection import RESET
+from rmpa.ros.http.rpc import ResetConnection, XmlRpcServer
+from rmpa.ros.node.accepted_connection import AcceptedConnection
+from rmpa.ros.wire.tcpros import check_request, printable
+from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage
+from rmpa.runtime.loop import SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.core.counters import Clock
+    from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.service_server import ServiceEndpoint
+    from rmpa.ros.wire.tcpros import Header
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+    Adopt = Callable[[socket.socket, tuple[str, int]], None]
+    """Takes ownership of an accepted, non-blocking socket; the second argument is the client's address."""
+
+
+def local_addresses() -> list[str]:
+    """IPv4 addresses of the interfaces that are up, in the system's order; those of loopback last."""
+    up = {name for name, state in psutil.net_if_stats().items() if state.isup}
+    found = [
+        address.address
+        for name, addresses in psutil.net_if_addrs().items()
+        if name in up
+        for address in addresses
+        if address.family == socket.AF_INET
+    ]
+    return sorted(found, key=lambda address: address.startswith("127."))
+
+
+# Assigns loopback addresses ``127.a.b.c`` to nodes that share one port: the dialled address identifies the node.
+
+
+_FIRST: Final = 254
+"""Values of ``a``, from 1 on: 127.0/16 has localhost, Debian's 127.0.1.1 and the resolvers; 127.255/16 broadcasts."""
+_SECOND: Final = 256
+_THIRD: Final = 254
+"""Values of ``c``, from 1 on: an address that ends in 0 or 255 looks like a network's own."""
+
+
+class LoopbackAddresses:
+    """The loopback addresses in use, and those freed a short while ago.
+
+    An address is a hash of the node's name: it is the same after a restart, and hardly ever another node's, so a
+    client with an old address is refused instead of reaching the wrong node. A freed address is not used again for
+    ``limits.LOOPBACK_REST``, even for the same node: rospy takes a URI that it has just lost for one that it still
+    has, and does not reconnect.
+
+    Args:
+        salt: Distinguishes nodes of one name in several graphs of this machine, such as the master's URI.
+    """
+
+    def __init__(self, salt: str) -> None:
+        self._salt = salt
+        self._used: set[str] = set()
+        self._resting: OrderedDict[str, float] = OrderedDict()
+
+    def __len__(self) -> int:
+        """Addresses in use."""
+        return len(self._used)
+
+    def take(self, name: str, now: float) -> str:
+        """Assign an address to a node.
+
+        Args:
+            name: The node's name.
+            now: Monotonic seconds.
+        """
+        self._release_rested(now)
+        # There are 16 million addresses, and far fewer nodes and resting ones (LOOPBACK_RESTING_MAX).
+        address = next(a for a in self._candidates(name) if a not in self._used and a not in self._resting)
+        self._used.add(address)
+        return address
+
+    def free(self, address: str, now: float) -> None:
+        """Free an address; nothing happens if it is not in use.
+
+        Args:
+            address: As ``take`` gave it.
+            now: Monotonic seconds.
+        """
+        if address in self._used:
+            self._used.remove(address)
+            self._resting[address] = now
+            self._release_rested(now)
+
+    def _release_rested(self, now: float) -> None:
+        """Release addresses that rested long enough, and the oldest of too many."""
+        while self._resting:
+            since = next(iter(self._resting.values()))
+            if now - since < limits.LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:
+                return
+            self._resting.popitem(last=False)
+
+    def _candidates(self, name: str) -> Iterator[str]:
+        for attempt in itertools.count():
+            text = f"{self._salt}\0{name}\0{attempt}"
+            number = int.from_bytes(hashlib.blake2s(text.encode(errors="backslashreplace"), digest_size=8).digest())
+            rest, third = divmod(number, _THIRD)
+            first, second = divmod(rest % (_FIRST * _SECOND), _SECOND)
+            yield f"127.{1 + first}.{second}.{1 + third}"
+
+
+# The listening TCPROS socket of one node: passes each connection to the publication or service of its header.
+
+
+_log = logging.getLogger(__name__)
+
+
+class TcprosServer:
+    """Accepts connections for the publications and services of one node.
+
+    Args:
+        name: The node's name, for the texts.
+        publications: By topic; read again at each header, so that the owner can change it.
+        counters: Count ``tcpros.refused.*``.
+        numbers: The numbers of connections, shared with the node's outgoing ones.
+        services: By name; read again at each header.
+        clock: For the rate limit of the log.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        publications: Mapping[str, Publication],
+        *,
+        services: Mapping[str, ServiceEndpoint] | None = None,
+        counters: Counters | None = None,
+        numbers: Iterator[int] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._name = name
+        self._publications = publications
+        self._services: Mapping[str, ServiceEndpoint] = services if services is not None else {}
+        self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
+        self._numbers = numbers if numbers is not None else itertools.count(1)
+        self._clock = clock if clock is not None else SystemClock()
+        self._acceptor: Acceptor | None = None
+        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
+        self._accepted: set[AcceptedConnection] = set()
+        self._forget_at = 16
+        self.address: tuple[str, int] = ("", 0)
+        """Where the socket listens."""
+
+    def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Listen; ``port`` 0 lets the system choose.
+
+        Raises:
+            StartError: The address cannot be used.
+        """
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        where = f"TCPROS server of {self._name} at {host}:{port}"
+        try:
+            sock = DESCRIPTORS.open_socket(Use.DATA, family, what=f"TCPROS server of {self._name}")
+        except OSError as error:
+            if is_shortage(error):
+                raise StartError(where, "no file descriptors left", remedy()) from error
+            raise StartError(where, str(error)) from error
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((host, port))
+            sock.listen(limits.TCPROS_BACKLOG)
+        except OSError as error:
+            sock.close()
+            raise StartError(where, str(error)) from error
+        self.address = sock.getsockname()[:2]
+        self._acceptor = Acceptor(sock, self.adopt, name=f"TCPROS server of {self._name}")
+        self._acceptor.start()
+
+    def close(self) -> None:
+        """Stop listening, and close the connections without a header; the owner closes the others."""
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
+        waiting, self._waiting = self._waiting, {}
+        for connection, timer in waiting.items():
+            timer.cancel()
+            connection.close()
+        self._accepted.clear()  # breaks a reference cycle
+
+    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
+
+        Args:
+            sock: Non-blocking; owned from here on.
+        """
+        try:
+            connection = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
+        except OSError:  # the client has disconnected already
+            sock.close()
+            return
+        if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
+            self._forget_closed()
+        if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
+            self._refuse(
+                "full",
+                connection.peer[0],
+                f"{self._name}: too many connections, one from {connection.peer[0]} closed",
+            )
+            connection.close()
+            return
+        self._accepted.add(connection)
+        self._waiting[connection] = asyncio.get_running_loop().call_later(
+            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
+        )
+
+    def _forget_closed(self) -> None:
+        """Drop closed connections, which publications do not report; called when they may be half of all."""
+        self._accepted = {connection for connection in self._accepted if not connection.stream.closed}
+        self._forget_at = 2 * len(self._accepted) + 16
+
+    def _header(self, connection: AcceptedConnection, fields: Header) -> None:
+        timer = self._waiting.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        problem = check_request(fields)
+        if problem is not None:
+            self._refuse(
+                "header", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {problem}"
+            )
+            connection.refuse(problem)
+            return
+        if "service" in fields:
+            endpoint = self._services.get(fields["service"])
+            if endpoint is not None:
+                endpoint.attach(connection)
+                return
+            # At debug level: a client may have looked up a service that is gone by now.
+            _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
+            connection.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
+            return
+        publication = self._publications.get(fields["topic"])
+        if publication is None:
+            # At debug level: a subscriber may have the address of a publisher that is gone by now.
+            _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
+            connection.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
+            return
+        publication.attach(connection)
+
+    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
+        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
+        timer = self._waiting.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        if error is not None and not isinstance(error, OSError):
+            self._refuse(
+                "malformed", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {error}"
+            )
+
+    def _timed_out(self, connection: AcceptedConnection) -> None:
+        del self._waiting[connection]
+        connection.close()
+        self._refuse(
+            "silent",
+            connection.peer[0],
+            f"{self._name}: {connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
+        )
+
+    def _refuse(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(self._clock.now(), f"tcpros.refused.{kind}", who, text)
+
+
+# Two listening sockets for any number of nodes: each node has a loopback address, all have the same two ports.
+#
+# A socket that listens at all addresses and is bound to the device ``lo`` accepts connections to any address
+# ``127.a.b.c`` (there are 16 million), and none from the network. The local address of the accepted socket
+# identifies
+# the node. A path in the URI could do so too, but roscpp drops it.
+
+
+_DEVICE: Final = b"lo"
+
+
+class SharedListener:
+    """The two sockets, and the nodes by address.
+
+    Args:
+        salt: Distinguishes nodes of one name in several graphs of this machine: the master's URI.
+        counters: ``address.unknown.xmlrpc``, ``address.unknown.tcpros``: connections to addresses without a node.
+    """
+
+    def __init__(self, salt: str, *, counters: Counters | None = None) -> None:
+        self._counters = counters if counters is not None else Counters()
+        self._salt = salt
+        self._addresses = LoopbackAddresses(salt)
+        self._http = _Port("XML-RPC of the proxies", self._answer_stray)
+        self._tcpros = _Port("TCPROS of the proxies", self._reset_stray)
+        self._strays = XmlRpcServer(_former_node, counters=self._counters, name="addresses of former nodes")
+
+    def __len__(self) -> int:
+        """Nodes with an address."""
+        return len(self._addresses)
+
+    @property
+    def ports(self) -> tuple[int, int]:
+        """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
+        return self._http.number, self._tcpros.number
+
+    async def start(self) -> None:
+        """Listen, and test whether the addresses work on this machine.
+
+        Raises:
+            StartError: The device cannot be bound, or its addresses are not 127.0.0.0/8.
+        """
+        try:
+            for port in (self._http, self._tcpros):
+                port.listen()
+            # Containers, sandboxes and firewalls differ, so one connection is tried.
+            await _test_address(LoopbackAddresses(self._salt).take("", 0.0), self._tcpros)
+        except BaseException as error:
+            await self.close()
+            if isinstance(error, OSError):
+                problem = error.strerror or str(error) or type(error).__name__
+                raise StartError("one listening socket for all proxies", problem) from error
+            raise
+        _log.info("= proxies listen at 127.x addresses of their own, ports %d (XML-RPC) and %d (TCPROS)", *self.ports)
+
+    async def close(self) -> None:
+        """Stop listening; the owner has closed the nodes before."""
+        self._http.close()
+        self._tcpros.close()
+        await self._strays.close()
+
+    def attach(self, name: str, http: Adopt, tcpros: Adopt) -> str:
+        """Assign an address to a node; only between ``start()`` and ``close()``.
+
+        Args:
+            name: The node's name.
+            http: Gets each connection to its XML-RPC port.
+            tcpros: Gets each connection to its TCPROS port.
+
+        Returns:
+            The address; the ports are ``ports``.
+        """
+        address = self._addresses.take(name, asyncio.get_running_loop().time())
+        self._http.nodes[address] = http
+        self._tcpros.nodes[address] = tcpros
+        return address
+
+    def detach(self, address: str) -> None:
+        """Free an address; the node closes its connections itself."""
+        self._http.nodes.pop(address, None)
+        self._tcpros.nodes.pop(address, None)
+        self._addresses.free(address, asyncio.get_running_loop().time())
+
+    def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
+        """Take a call to the address of a closed node: see ``_former_node``."""
+        self._counters.add("address.unknown.xmlrpc")
+        self._strays.adopt(sock, client)
+
+    def _reset_stray(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Reset a TCPROS connection to the address of a closed node, as a closed port would: roscpp backs off."""
+        self._counters.add("address.unknown.tcpros")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        sock.close()
+
+
+class _Port:
+    """One of the two sockets.
+
+    Args:
+        name: Its purpose, for messages.
+        stray: Gets the connections to addresses without a node.
+    """
+
+    def __init__(self, name: str, stray: Adopt) -> None:
+        self.nodes: dict[str, Adopt] = {}
+        """The takers of accepted connections, by the nodes' addresses."""
+        self.number = 0
+        self._name = name
+        self._stray = stray
+        self._acceptor: Acceptor | None = None
+
+    def listen(self) -> None:
+        """Bind and accept.
+
+        Raises:
+            OSError: This is not allowed, or there is no such device.
+        """
+        sock = DESCRIPTORS.open_socket(Use.DATA)
+        try:
+            # Before it is bound to all addresses, so that the network can never reach it.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
+            sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
+            sock.listen(limits.SHARED_BACKLOG)
+        except BaseException:
+            sock.close()
+            raise
+        self.number = sock.getsockname()[1]
+        self._acceptor = Acceptor(sock, self._accepted, name=self._name)
+        self._acceptor.start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._acceptor is not None:
+            self._acceptor.close()
+
+    def _accepted(self, sock: socket.socket, client: tuple[str, int]) -> None:
+        self.nodes.get(sock.getsockname()[0], self._stray)(sock, client)
+
+
+async def _test_address(address: str, port: _Port) -> None:
+    """Connect to an address, and wait until the connection is accepted with it.
+
+    Raises:
+        OSError: The connection fails, or is not accepted in ``limits.SHARED_PROBE_TIMEOUT``.
+    """
+    loop = asyncio.get_running_loop()
+    arrived: asyncio.Future[None] = loop.create_future()
+
+    def arrive(sock: socket.socket, _client: tuple[str, int]) -> None:
+        sock.close()
+        if not arrived.done():
+            arrived.set_result(None)
+
+    port.nodes[address] = arrive
+    try:
+        with DESCRIPTORS.open_socket(Use.DATA) as probe:
+            async with asyncio.timeout(limits.SHARED_PROBE_TIMEOUT):
+                await loop.sock_connect(probe, (address, port.number))
+                await arrived
+    except TimeoutError as error:
+        raise OSError(f"a connection to {address} on this machine does not arrive") from error
+    finally:
+        del port.nodes[address]
+
+
+def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    """Reset the connection, by which ``rosnode`` and others know a dead node; an error in the answer stops them.
+
+    Answered are ``requestTopic``, which rospy repeats twice a minute after a reset until its process ends,
+    and ``getName``, by which agents tell this listener from one that is stuck.
+
+    Raises:
+        ResetConnection: For all other methods.
+    """
+    if method not in ("requestTopic", "getName"):
+        raise ResetConnection
+    return [-1, "the node that had this address is gone", 0]
