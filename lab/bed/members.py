@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from rmpa.trust import limits
 from rmpa.trust.certificates import CURVE, issue, make_ca, make_request, read_request
 from rmpa.trust.documents import KeyList, sign
-from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.keyring import GroupKey
+from rmpa.trust.packets import GroupKey
+from rmpa.trust.store import MemberFiles, TrustStore
 
 if TYPE_CHECKING:
     from pathlib import Path

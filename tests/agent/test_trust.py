@@ -20,20 +20,19 @@ from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.trust import limits
-from rmpa.trust.documents import DocumentKind
-from rmpa.trust.io import store as files_of
-from rmpa.trust.io.authority import found_mesh
-from rmpa.trust.io.joining import join_mesh
-from rmpa.trust.page_names import page_hosts
-from rmpa.trust.spreading import Notice
+from rmpa.trust import store as files_of
+from rmpa.trust.authority import found_mesh
+from rmpa.trust.certificates import page_hosts
+from rmpa.trust.documents import DocumentKind, Notice
+from rmpa.trust.joining import join_mesh
 from rmpa.trust.tokens import Token
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from rmpa.trust.io.store import MemberFiles
-    from rmpa.trust.status import TrustStatus
+    from rmpa.trust.joining import TrustStatus
+    from rmpa.trust.store import MemberFiles
 
 DEADLINE = 30.0
 

@@ -9,7 +9,7 @@ from rmpa.core.errors import RemoteProtocolError
 try:
     from rmpa.trust.certificates import ca_public_key, make_request, read_request, verify
     from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
-    from rmpa.trust.keyring import GroupKey
+    from rmpa.trust.packets import GroupKey
     from tests.trust.authority import WALL, Authority, new_key
 except ImportError:  # the extra "trust" is not installed
     SEEDS: list[bytes] = [b""]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
-from rmpa.trust.packets import PacketSigner, PacketVerifier, Verdict
+from rmpa.trust.packets import GroupKey, KeyPurpose, KeyRing, PacketSigner, PacketVerifier, Verdict
 
 _RING = KeyRing([GroupKey(3, bytes(range(32)))], 0.0)
 _SIGNED = PacketSigner(_RING).sign(bytes(range(60)), KeyPurpose.BEACON, 1.0, 1_790_000_000.0)

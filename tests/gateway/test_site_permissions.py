@@ -7,7 +7,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.gateway.site_permissions import SitePermissions
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 
 
 def site_permissions(counters: Counters, *rules: PermissionRule) -> SitePermissions:

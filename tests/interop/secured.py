@@ -17,10 +17,10 @@ from rmpa.observe.io.control_client import ControlClient
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.io.authority import MeshAuthority, found_mesh
-from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.private_keys import new_key, private_key
-from rmpa.trust.io.store import MemberFiles, TrustStore
+from rmpa.trust.authority import MeshAuthority, found_mesh
+from rmpa.trust.certificates import new_key, private_key
+from rmpa.trust.membership import Membership
+from rmpa.trust.store import MemberFiles, TrustStore
 
 if TYPE_CHECKING:
     from lab.bed.agents import Agent

@@ -13,7 +13,7 @@ pytest.importorskip("cryptography")
 
 from lab.bed.processes import Process, eventually
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.io.store import CERTIFICATE, KEY
+from rmpa.trust.store import CERTIFICATE, KEY
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
 from tests.interop.secured import (
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Host, Lab
     from lab.bed.processes import Event
-    from rmpa.trust.io.store import TrustStore
+    from rmpa.trust.store import TrustStore
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]

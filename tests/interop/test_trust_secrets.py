@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from lab.bed.agents import RMPA
 from lab.bed.processes import Process
-from rmpa.trust.io import store as files_of
+from rmpa.trust import store as files_of
 from rmpa.trust.tokens import Token
 from tests.interop.secured import SecuredMesh, attack, control, place
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
-    from rmpa.trust.io.store import TrustStore
+    from rmpa.trust.store import TrustStore
     from tests.interop.conftest import AgentFactory
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(180)]

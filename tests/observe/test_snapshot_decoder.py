@@ -13,7 +13,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.observe.control import ControlReply
 from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
 from rmpa.observe.snapshot_decoder import SnapshotDecoder
-from rmpa.trust.status import TrustStatus
+from rmpa.trust.joining import TrustStatus
 from tests.web.snapshots import AGENT, peer
 
 if TYPE_CHECKING:

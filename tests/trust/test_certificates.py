@@ -21,6 +21,7 @@ from rmpa.trust import limits
 from rmpa.trust.certificates import (
     URN,
     CertificateError,
+    TrustReason,
     ca_public_key,
     check_ca,
     issue,
@@ -29,7 +30,6 @@ from rmpa.trust.certificates import (
     verify,
 )
 from rmpa.trust.documents import DenyList
-from rmpa.trust.reasons import TrustReason
 from rmpa.trust.tokens import fingerprint_of
 from tests.fuzz import target_certificate
 from tests.trust.authority import WALL, Authority, new_key

@@ -23,7 +23,7 @@ from rmpa.trust.documents import (
     read_key_list,
     sign,
 )
-from rmpa.trust.keyring import GroupKey
+from rmpa.trust.packets import GroupKey
 from tests.trust.authority import WALL, Authority, new_key
 
 LAB = Authority()

@@ -8,7 +8,7 @@ import hmac
 import pytest
 
 from rmpa.trust import limits
-from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
+from rmpa.trust.packets import GroupKey, KeyPurpose, KeyRing
 
 
 def key(number: int) -> GroupKey:

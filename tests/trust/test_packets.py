@@ -15,8 +15,16 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.trust import limits
-from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
-from rmpa.trust.packets import TRAILER_BYTES, PacketSigner, PacketVerifier, Verdict, Verification
+from rmpa.trust.packets import (
+    TRAILER_BYTES,
+    GroupKey,
+    KeyPurpose,
+    KeyRing,
+    PacketSigner,
+    PacketVerifier,
+    Verdict,
+    Verification,
+)
 from tests.fuzz import target_trailer
 
 KEY = GroupKey(3, bytes(range(32)))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.trust import limits
-from rmpa.trust.replay import Freshness, ReplayWindow
+from rmpa.trust.packets import Freshness, ReplayWindow
 
 RUN = (1, bytes(16))
 NOW = 5.0

@@ -46,8 +46,8 @@ from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections
-from rmpa.trust.page_names import host_names, page_hosts
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.certificates import host_names, page_hosts
+from rmpa.trust.documents import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

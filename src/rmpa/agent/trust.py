@@ -15,9 +15,8 @@ from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.trust import limits
-from rmpa.trust.io.open_start import check_open
-from rmpa.trust.io.store import AuthorityPlace, TrustStore
-from rmpa.trust.spreading import DocumentSpreading, Notice, have_args, read_document, read_have
+from rmpa.trust.documents import DocumentSpreading, Notice, have_args, read_document, read_have
+from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,11 +25,10 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Clock
+    from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.documents import DocumentKind
-    from rmpa.trust.io.authority import MeshAuthority
-    from rmpa.trust.io.join_server import JoinServer
-    from rmpa.trust.io.membership import Membership
-    from rmpa.trust.status import TrustStatus
+    from rmpa.trust.joining import JoinServer, TrustStatus
+    from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +55,7 @@ def open_membership(settings: Settings, clock: Clock) -> Membership | None:
         check_open(settings.trust, state_dir(os.environ, settings.state_dir), settings.name, os.environ)
         return None
     try:
-        from rmpa.trust.io.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
+        from rmpa.trust.membership import Membership  # noqa: PLC0415 - its library takes memory: only when needed
     except ModuleNotFoundError as error:
         missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
         raise StartError(str(store.folder), missing, "pip install 'rmpa[trust]'") from None
@@ -91,9 +89,9 @@ class AgentTrust(Part):
         rng: Callable[[], float],
         hosts: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:
+        from rmpa.trust.authority import MeshAuthority  # noqa: PLC0415
         from rmpa.trust.documents import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
-        from rmpa.trust.io.authority import MeshAuthority  # noqa: PLC0415
-        from rmpa.trust.io.join_server import JoinServer  # noqa: PLC0415
+        from rmpa.trust.joining import JoinServer  # noqa: PLC0415
 
         self.membership = membership
         self._bridge = bridge
@@ -140,14 +138,14 @@ class AgentTrust(Part):
 
     def notes(self) -> tuple[str, ...]:
         """What the user should do something about."""
-        from rmpa.trust.io.status import problems_of  # noqa: PLC0415
+        from rmpa.trust.joining import problems_of  # noqa: PLC0415
 
         found = problems_of(self.membership, self.authority_name())
         return (*found, self._problem) if found and self._problem else found
 
     def status(self) -> TrustStatus:
         """The state, as ``rmpa trust status`` and the snapshot show it."""
-        from rmpa.trust.io.status import status_of  # noqa: PLC0415
+        from rmpa.trust.joining import status_of  # noqa: PLC0415
 
         linked = {session.link.name for session in self._bridge.sessions.linked()}
         return status_of(
@@ -298,7 +296,7 @@ class AgentTrust(Part):
         self._hosts_asked = hosts
 
     async def _renew_by_dial(self) -> None:
-        from rmpa.trust.io.joining import renew_at_authority  # noqa: PLC0415
+        from rmpa.trust.joining import renew_at_authority  # noqa: PLC0415
 
         place = self.membership.store.load_authority()
         if place is None:

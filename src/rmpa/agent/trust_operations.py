@@ -15,7 +15,7 @@ import msgspec
 from rmpa.agent.trust import NOT_AUTHORITY, trust_store
 from rmpa.core.errors import ConfigError, PeerRefused, UnreachableError
 from rmpa.trust import limits
-from rmpa.trust.status import InviteReply, JoinStep, TrustReply, TrustStatus
+from rmpa.trust.joining import InviteReply, JoinStep, TrustReply, TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
-    from rmpa.trust.io.authority import MeshAuthority
+    from rmpa.trust.authority import MeshAuthority
 
 _log = logging.getLogger(__name__)
 _STEP_WAIT: Final = 5.0

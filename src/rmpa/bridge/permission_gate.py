@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.core.counters import Counters
-from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
+from rmpa.trust.documents import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.config.peer_rules import Access
     from rmpa.config.settings import TrustSettings
-    from rmpa.trust.permissions import Permissions
+    from rmpa.trust.documents import Permissions
 
 _log = logging.getLogger(__name__)
 

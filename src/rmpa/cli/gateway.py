@@ -24,7 +24,7 @@ from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter
-from rmpa.trust.status import TrustStatus
+from rmpa.trust.joining import TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

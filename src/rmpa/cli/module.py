@@ -14,7 +14,7 @@ from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe.io.control_client import ControlClient, find_agents, with_running
-from rmpa.trust.status import TrustStatus
+from rmpa.trust.joining import TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

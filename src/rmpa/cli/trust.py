@@ -14,10 +14,10 @@ from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_global_name, peer_name_problem
-from rmpa.trust.permissions import Permissions, action_topics
+from rmpa.trust.documents import Permissions, action_topics
 
 if TYPE_CHECKING:
-    from rmpa.trust.permissions import PermissionDecision
+    from rmpa.trust.documents import PermissionDecision
 
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
 

@@ -27,11 +27,11 @@ from rmpa.cli.trust_place import (
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.status import InviteReply, JoinStep, TrustReply
+from rmpa.trust.joining import InviteReply, JoinStep, TrustReply
 
 if TYPE_CHECKING:
     from rmpa.cli.trust_place import TrustPlace
-    from rmpa.trust.io.store import MemberFiles
+    from rmpa.trust.store import MemberFiles
 
 _LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")
 _UNITS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400}
@@ -151,7 +151,7 @@ def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool
     """Answer a join by files."""
     check_library()
     from rmpa.trust import certificates
-    from rmpa.trust.io.authority import request_der
+    from rmpa.trust.authority import request_der
 
     try:
         with request.open("rb") as stream:
@@ -307,8 +307,8 @@ def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
 def _join_by_token(place: TrustPlace, text: str) -> MemberFiles:
     import asyncio
 
-    from rmpa.trust.io.joining import join_mesh
-    from rmpa.trust.io.store import AuthorityPlace
+    from rmpa.trust.joining import join_mesh
+    from rmpa.trust.store import AuthorityPlace
     from rmpa.trust.tokens import Token, TokenError
 
     try:
@@ -323,9 +323,9 @@ def _join_by_token(place: TrustPlace, text: str) -> MemberFiles:
 
 def _write_request(place: TrustPlace, out: Path, *, as_json: bool) -> None:
     from rmpa.trust import certificates
-    from rmpa.trust.io import store as files_of
-    from rmpa.trust.io.authority import request_pem
-    from rmpa.trust.io.private_keys import new_key, private_key
+    from rmpa.trust import store as files_of
+    from rmpa.trust.authority import request_pem
+    from rmpa.trust.certificates import new_key, private_key
 
     pem = new_key()
     request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
@@ -351,11 +351,11 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
     import msgspec
 
     from rmpa.trust import certificates
-    from rmpa.trust.io import store as files_of
-    from rmpa.trust.io.joining import check_grant
-    from rmpa.trust.io.private_keys import private_key
-    from rmpa.trust.io.store import MemberFiles
-    from rmpa.trust.join import CertificateGrant
+    from rmpa.trust import store as files_of
+    from rmpa.trust.authority import CertificateGrant
+    from rmpa.trust.certificates import private_key
+    from rmpa.trust.joining import check_grant
+    from rmpa.trust.store import MemberFiles
 
     digits = re.sub(r"[\s:]", "", ca or "").lower()
     if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):

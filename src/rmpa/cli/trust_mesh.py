@@ -20,8 +20,8 @@ from rmpa.cli.trust_place import (
     name_option,
 )
 from rmpa.core.errors import ConfigError, StartError
-from rmpa.trust.io.store import modules_with_keys
-from rmpa.trust.status import TrustReply, TrustStatus
+from rmpa.trust.joining import TrustReply, TrustStatus
+from rmpa.trust.store import modules_with_keys
 
 if TYPE_CHECKING:
     from rmpa.cli.trust_place import TrustPlace
@@ -47,7 +47,7 @@ def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
     if place.store.exists:
         remedy = "rmpa trust status shows it; rmpa trust leave removes it"
         raise StartError(f"the module {place.name}", "is a member of a secured mesh already", remedy)
-    from rmpa.trust.io.authority import found_mesh
+    from rmpa.trust.authority import found_mesh
 
     found_mesh(place.store, place.name, label or place.name, time.time())
     status, start = _status(place), keep_member_name(place, file)
@@ -98,7 +98,7 @@ def _status(place: TrustPlace) -> TrustStatus:
             return shown
     if not place.store.exists:
         return TrustStatus(on=False, module=place.name, folder=str(place.store.folder), agent=place.agent)
-    from rmpa.trust.io.status import status_of
+    from rmpa.trust.joining import status_of
 
     membership = place.membership()
     authority = place.authority(membership) if place.store.is_authority else None
@@ -182,7 +182,7 @@ def _renew_files(place: TrustPlace) -> TrustReply:
         import asyncio
 
         from rmpa.trust.documents import DocumentKind
-        from rmpa.trust.io.joining import renew_at_authority
+        from rmpa.trust.joining import renew_at_authority
 
         known = place.store.load_authority()
         if known is None:

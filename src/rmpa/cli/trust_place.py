@@ -18,13 +18,13 @@ from rmpa.config.module_name import GATEWAY_SUFFIX, keep_name, kept_name, note_s
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
-from rmpa.trust.io.store import TrustStore
-from rmpa.trust.status import TrustStatus
+from rmpa.trust.joining import TrustStatus
+from rmpa.trust.store import TrustStore
 
 if TYPE_CHECKING:
     from rmpa.config.module_name import ModuleName
-    from rmpa.trust.io.authority import MeshAuthority
-    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.authority import MeshAuthority
+    from rmpa.trust.membership import Membership
 
 _T = TypeVar("_T")
 name_option = click.option(
@@ -86,7 +86,7 @@ class TrustPlace:
             remedy = "make a mesh: rmpa trust init; or join one: rmpa trust join TOKEN"
             raise StartError(f"the module {self.name}", "has joined no secured mesh", remedy)
         from rmpa.runtime.loop import SystemClock
-        from rmpa.trust.io.membership import Membership
+        from rmpa.trust.membership import Membership
 
         return Membership.load(self.store, SystemClock(), time.time)
 
@@ -96,7 +96,7 @@ class TrustPlace:
         Raises:
             StartError: This module is not it, or a file is broken.
         """
-        from rmpa.trust.io.authority import MeshAuthority
+        from rmpa.trust.authority import MeshAuthority
 
         if not self.store.is_authority:
             place = self.store.load_authority()

@@ -144,8 +144,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     Raises:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
-    from rmpa.trust.io.open_start import check_open
-    from rmpa.trust.io.store import TrustStore
+    from rmpa.trust.store import TrustStore, check_open
     from rmpa.web.server.process import WebSetup, access_of
     from rmpa.web.server.tls import certificate_files
 

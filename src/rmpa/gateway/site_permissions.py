@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.permission_gate import OPEN_GATE
-from rmpa.trust.permissions import refusal
+from rmpa.trust.documents import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.bridge.permission_gate import PermissionGate
     from rmpa.config.peer_rules import Access
-    from rmpa.trust.permissions import PermissionDecision
+    from rmpa.trust.documents import PermissionDecision
 
 
 class SitePermissions:

@@ -41,7 +41,7 @@ from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welco
 from rmpa.mesh.keepalive import Keepalive, RestPace
 from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.certificates import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity

@@ -15,7 +15,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity, peer_name_problem
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Buffer, parse_text, text_payload
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.certificates import TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -7,7 +7,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.mesh.handshake import Refusal, Refuse
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.certificates import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 import msgspec
 
 from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec needs it to decode
-from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec needs it to decode
+from rmpa.trust.joining import TrustStatus  # noqa: TC001 - msgspec needs it to decode
 
 if TYPE_CHECKING:
     from rmpa.core.counters import SampleSummary

@@ -9,7 +9,7 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec reads the annotation
 from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
-from rmpa.trust.status import TrustStatus  # noqa: TC001 - msgspec reads the annotation
+from rmpa.trust.joining import TrustStatus  # noqa: TC001 - msgspec reads the annotation
 
 _T = TypeVar("_T")
 

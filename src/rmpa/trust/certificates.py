@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import hashlib
 import ipaddress
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from cryptography import x509
@@ -24,15 +26,146 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.page_names import page_hosts, server_names
-from rmpa.trust.reasons import TrustError, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.trust.documents import DenyList
+
+
+# The names and addresses by which a module's page is opened: which of them its certificate may have (RFC 9525).
+#
+# Those that follow from the module's name are never another module's. Further ones are asked for. A browser that
+# trusts
+# the mesh's CA is to believe it about no host of the Internet, so these are private addresses, and names of the
+# local
+# network.
+
+
+_LABEL: Final = r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?"
+_LOCAL: Final = re.compile(rf"{_LABEL}|(?:{_LABEL}\.)+(?:local|lan|internal|home\.arpa)")
+"""A name without a dot, or below a domain that is no one's in the Internet (RFC 6762, RFC 8375, ICANN's internal)."""
+_SHARED: Final = ipaddress.IPv4Network("100.64.0.0/10")
+"""Of carriers, and of VPNs such as Tailscale's (RFC 6598)."""
+
+
+def server_names(name: str) -> tuple[str, ...]:
+    """The names that every module's certificate has, besides 127.0.0.1.
+
+    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
+    has ``-`` where the module's name, which is made of it, has ``_``.
+    """
+    host = name.replace("_", "-").lower()
+    return (host, f"{host}.local", "localhost")
+
+
+def page_hosts(wanted: Iterable[str]) -> tuple[str, ...]:
+    """Of names and addresses those that a certificate may have, in their normal form, at most so many."""
+    found = dict.fromkeys(host for text in wanted if (host := _page_host(text)))
+    return tuple(found)[: limits.PAGE_HOSTS_MAX]
+
+
+def host_names(host_name: str) -> tuple[str, ...]:
+    """The names of a machine in its network: its host's name, whole and short, and that of mDNS."""
+    name = host_name.lower().removesuffix(".")
+    short = name.partition(".")[0]
+    return (name, short, f"{short}.local")
+
+
+def _page_host(text: str) -> str:
+    """The normal form; empty: a certificate may not have it, or has it anyway."""
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        name = text.lower().removesuffix(".")
+        return name if name != "localhost" and _LOCAL.fullmatch(name) else ""
+    special = address.is_loopback or address.is_unspecified or address.is_multicast
+    shared = isinstance(address, ipaddress.IPv4Address) and address in _SHARED
+    return str(address) if (address.is_private or shared) and not special else ""
+
+
+# The reasons for which a secured mesh refuses a connection: one word each, for wire, counters, commands and logs.
+
+
+class TrustReason(IntEnum):
+    """Why a connection is refused; the numbers continue those of ``mesh.handshake.Refusal`` on the wire."""
+
+    PLAIN = 11
+    """The dialler does not use TLS, and this mesh does."""
+    UNSECURED = 12
+    """The acceptor has not joined a secured mesh, and the dialler has."""
+    KEY = 13
+    """The group key of its packets is unknown."""
+    CLOCK = 14
+    """A certificate begins in the future."""
+    FOREIGN = 15
+    """The certificate is of another CA."""
+    EXPIRED = 16
+    """The certificate's time is over."""
+    REVOKED = 17
+    """The certificate is on the deny list."""
+    NAME = 18
+    """The certificate is of another module than the hello says."""
+    DOWNGRADE = 19
+    """The connection does not use TLS 1.3 with this protocol."""
+
+    @property
+    def label(self) -> str:
+        """The word for people and counters: ``expired``."""
+        return self.name.lower()
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a sentence part."""
+        return _REMEDIES[self]
+
+
+_REMEDIES: Final = {
+    TrustReason.PLAIN: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.UNSECURED: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.KEY: "are both of one mesh? the one that was away for long: rmpa trust renew there",
+    TrustReason.CLOCK: "set both clocks: date, timedatectl",
+    TrustReason.FOREIGN: "they have joined different meshes: rmpa trust join on one, with a token of the other's",
+    TrustReason.EXPIRED: "rmpa trust renew on the module whose certificate it is, while the authority is reachable",
+    TrustReason.REVOKED: "it can come back by rmpa trust invite at the authority, and rmpa trust join there",
+    TrustReason.NAME: "start the module with the name that it joined with, or let it join again",
+    TrustReason.DOWNGRADE: "install the same release of rmpa on both",
+}
+
+
+NOT_OF_THIS_MESH: Final = {
+    TrustReason.PLAIN: "it has joined a secured mesh and this module has not; join it by rmpa trust join TOKEN here, "
+    "with a token of rmpa trust invite at the authority of that mesh",
+    TrustReason.UNSECURED: "it has not joined this secured mesh; let it join by rmpa trust invite at the authority "
+    "and rmpa trust join TOKEN there",
+    TrustReason.FOREIGN: "it has joined another secured mesh; to have both in one, rmpa trust leave and rmpa trust "
+    "join TOKEN there, with a token of the authority here",
+    TrustReason.KEY: "its group key is unknown here; if it has joined another mesh, rmpa trust leave and rmpa trust "
+    "join TOKEN there; if it is of this one, rmpa trust renew here",
+}
+"""Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``."""
+
+
+def not_of_this_mesh(reason: TrustReason) -> str:
+    """``not of this mesh: it has not joined this secured mesh; let it join by …``."""
+    return f"not of this mesh: {NOT_OF_THIS_MESH[reason]}"
+
+
+class TrustError(RemoteProtocolError):
+    """A secured mesh refuses a connection, a certificate or a request.
+
+    Args:
+        reason: The word for it.
+        text: What is wrong.
+    """
+
+    def __init__(self, reason: TrustReason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
 
 URN: Final = "urn:rmpa:"
 """What a module's name follows in the SAN."""
@@ -389,3 +522,36 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 def _time(wall: float) -> datetime:
     return datetime.fromtimestamp(int(wall), UTC)
+
+
+# Private keys of modules and of the CA, as PEM.
+
+
+def new_key() -> bytes:
+    """A private key (PKCS #8, PEM) for a module or a CA."""
+    return _key_pem(ec.generate_private_key(CURVE))
+
+
+def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
+    """Read a private key (PEM).
+
+    Args:
+        data: The PEM.
+        where: The file, for the error.
+
+    Raises:
+        StartError: It is none.
+    """
+    try:
+        key = serialization.load_pem_private_key(data, None)
+    except (ValueError, TypeError):
+        key = None
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise StartError(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
+    return key
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )

@@ -8,7 +8,7 @@ from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, r
 from rmpa.bridge.permission_gate import PermissionGate
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 
 GRANT = Grant(45225, "/talker", "/talker/get_loggers")
 

@@ -15,7 +15,7 @@ from rmpa.bridge.session.peer_sessions import PeerSessions
 from rmpa.config.settings import TrustSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
-from rmpa.trust.keyring import GroupKey, KeyRing
-from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.packets import GroupKey, KeyRing, PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

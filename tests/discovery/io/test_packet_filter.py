@@ -11,8 +11,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.keyring import GroupKey, KeyPurpose, KeyRing
-from rmpa.trust.packets import PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.packets import GroupKey, KeyPurpose, KeyRing, PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     import pytest

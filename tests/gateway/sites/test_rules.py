@@ -11,7 +11,7 @@ from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.site_permissions import SitePermissions
 from rmpa.gateway.sites.rules import CrossingDecision, CrossingRules
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 
 T = SourceKind.TOPIC
 

@@ -33,7 +33,7 @@ from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 

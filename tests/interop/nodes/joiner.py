@@ -8,7 +8,7 @@ import json
 import sys
 
 from rmpa.core.errors import RmpaError
-from rmpa.trust.io.joining import join_mesh
+from rmpa.trust.joining import join_mesh
 from rmpa.trust.tokens import Token
 
 

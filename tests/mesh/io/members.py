@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust.documents import DocumentKind, sign
-from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.store import CERTIFICATE, KEY, MemberFiles, TrustStore
+from rmpa.trust.membership import Membership
+from rmpa.trust.store import CERTIFICATE, KEY, MemberFiles, TrustStore
 from tests.mesh.io.meshes import Peer, introduce
 from tests.trust.authority import Authority, new_key
 from tests.trust.io.member_files import KEYS, pem_of

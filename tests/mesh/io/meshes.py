@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import LaneSettings
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.securing import OnJoin
-    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.membership import Membership
 
 DEADLINE = 20.0
 

@@ -25,8 +25,8 @@ from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tls import TlsHandshake
-from rmpa.trust.io.contexts import ALPN_LINK, join_context
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.certificates import TrustReason
+from rmpa.trust.membership import ALPN_LINK, join_context
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives import serialization
 
 from rmpa.trust.documents import DenyList, KeyList, sign
-from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.keyring import GroupKey
+from rmpa.trust.membership import Membership
+from rmpa.trust.packets import GroupKey
+from rmpa.trust.store import MemberFiles, TrustStore
 from tests.trust.authority import WALL, Authority, new_key
 
 if TYPE_CHECKING:

@@ -27,17 +27,24 @@ from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
-from rmpa.trust.certificates import CertificateError, make_request
+from rmpa.trust import store as files_of
+from rmpa.trust.authority import (
+    CertificateGrant,
+    Join,
+    JoinRefused,
+    MeshAuthority,
+    Renew,
+    encode_message,
+    found_mesh,
+    proof_of,
+    request_der,
+    request_pem,
+)
+from rmpa.trust.certificates import CertificateError, make_request, new_key, private_key
 from rmpa.trust.documents import DocumentKind
-from rmpa.trust.io import store as files_of
-from rmpa.trust.io.authority import MeshAuthority, found_mesh, request_der, request_pem
-from rmpa.trust.io.contexts import ALPN_JOIN, join_context, member_context
-from rmpa.trust.io.join_server import JoinServer
-from rmpa.trust.io.joining import join_mesh, renew_at_authority
-from rmpa.trust.io.membership import Membership
-from rmpa.trust.io.private_keys import new_key, private_key
-from rmpa.trust.io.store import MemberFiles, TrustStore
-from rmpa.trust.join import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
+from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
+from rmpa.trust.membership import ALPN_JOIN, Membership, join_context, member_context
+from rmpa.trust.store import MemberFiles, TrustStore
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 

@@ -12,12 +12,11 @@ pytest.importorskip("cryptography")
 from rmpa.core.errors import StartError
 from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
+from rmpa.trust import store as files_of
+from rmpa.trust.certificates import TrustError, TrustReason
 from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList, sign
-from rmpa.trust.io import store as files_of
-from rmpa.trust.io.membership import Membership
-from rmpa.trust.keyring import GroupKey, KeyPurpose
-from rmpa.trust.packets import Verdict
-from rmpa.trust.reasons import TrustError, TrustReason
+from rmpa.trust.membership import Membership
+from rmpa.trust.packets import GroupKey, KeyPurpose, Verdict
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 

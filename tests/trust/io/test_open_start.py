@@ -10,8 +10,7 @@ import pytest
 
 from rmpa.config.module_name import note_state_dir
 from rmpa.core.errors import StartError
-from rmpa.trust.io.open_start import check_open_start
-from rmpa.trust.io.store import TrustStore
+from rmpa.trust.store import TrustStore, check_open_start
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.trust import limits
-from rmpa.trust.io import store
-from rmpa.trust.io.store import MemberFiles, TrustStore
+from rmpa.trust import limits, store
+from rmpa.trust.store import MemberFiles, TrustStore
 from rmpa.trust.tokens import Token, TokenProblem
 
 if TYPE_CHECKING:

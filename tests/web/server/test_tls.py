@@ -12,7 +12,7 @@ import aiohttp
 import pytest
 
 from rmpa.core.errors import ConfigError, StartError
-from rmpa.trust.io.store import MemberFiles, TrustStore
+from rmpa.trust.store import MemberFiles, TrustStore
 from rmpa.web import limits
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.auth import AccessPolicy, own_names

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.permissions import Permissions
+    from rmpa.trust.documents import Permissions
 
 _log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from rmpa.discovery.io.packet_filter import PacketFilter
 from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.loop import MachineTimer, SystemClock, yield_to_data
-from rmpa.trust.keyring import KeyPurpose
+from rmpa.trust.packets import KeyPurpose
 
 if TYPE_CHECKING:
     import socket

@@ -14,9 +14,8 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import RUN_AT, Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 from rmpa.discovery.strangers import Strangers
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.keyring import KeyPurpose
-from rmpa.trust.packets import Verdict
-from rmpa.trust.reasons import TrustReason, not_of_this_mesh
+from rmpa.trust.certificates import TrustReason, not_of_this_mesh
+from rmpa.trust.packets import KeyPurpose, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect
 from rmpa.core.identity import matches
-from rmpa.trust.permissions import action_topics
+from rmpa.trust.documents import action_topics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

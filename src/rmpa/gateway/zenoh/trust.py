@@ -13,8 +13,8 @@ from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.gateway.zenoh.access import access_table
 from rmpa.gateway.zenoh.config import MeshCertificates, gateway_config, zenohd_entries
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.trust.io.store import CA, CERTIFICATE, DENY, KEY
 from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
+from rmpa.trust.store import CA, CERTIFICATE, DENY, KEY
 
 if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings

@@ -37,7 +37,7 @@ from rmpa.mesh.peering_events import (
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
-from rmpa.trust.reasons import TrustReason
+from rmpa.trust.certificates import TrustReason
 
 if TYPE_CHECKING:
     import socket
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.handshake import Hello
     from rmpa.mesh.io.securing import OnJoin, SecuredSocket
     from rmpa.mesh.peering_events import SocketAddress
-    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)
 

@@ -23,15 +23,15 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Refusal, Refuse
 from rmpa.runtime.tls import SecureSocket, TlsHandshake
-from rmpa.trust.io.contexts import ALPN_JOIN, ALPN_LINK
-from rmpa.trust.reasons import TrustError, TrustReason
+from rmpa.trust.certificates import TrustError, TrustReason
+from rmpa.trust.membership import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
     from rmpa.core.counters import Clock, RefusalLog
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello
     from rmpa.mesh.peering_events import SocketAddress
-    from rmpa.trust.io.membership import Membership
+    from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot, UnreachableInfo
-    from rmpa.trust.status import TrustStatus
+    from rmpa.trust.joining import TrustStatus
 
 
 _PERMISSION: Final = "permission."

@@ -10,7 +10,7 @@ from rmpa.observe.io.direct_section import direct_counts
 from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.runtime.loop import SystemClock, yield_to_data
-from rmpa.trust.reasons import not_of_this_mesh
+from rmpa.trust.certificates import not_of_this_mesh
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
-    from rmpa.trust.status import TrustStatus
+    from rmpa.trust.joining import TrustStatus
 
 
 @dataclass(frozen=True, slots=True)

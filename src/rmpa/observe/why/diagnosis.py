@@ -9,7 +9,7 @@ import msgspec
 
 from rmpa.config.peer_rules import Access
 from rmpa.observe.check import FAIL, OK, Check
-from rmpa.trust.permissions import prohibition, refusal
+from rmpa.trust.documents import prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

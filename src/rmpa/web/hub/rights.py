@@ -11,7 +11,7 @@ from rmpa.core.errors import PeerRefused
 from rmpa.ros.master.parameters import canonical, leaves
 
 if TYPE_CHECKING:
-    from rmpa.trust.permissions import Permissions
+    from rmpa.trust.documents import Permissions
     from rmpa.web.hub.requests import ParamValue
 
 _WHO: Final = "the web server"

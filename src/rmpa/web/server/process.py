@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Effect
 from rmpa.core.errors import RmpaError, StartError
-from rmpa.trust.page_names import server_names
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.certificates import server_names
+from rmpa.trust.documents import Permissions
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.rights import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.io.monitor import Monitor
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.config.settings import Settings, WebSettings
-    from rmpa.trust.status import TrustStatus
+    from rmpa.trust.joining import TrustStatus
 
 _log = logging.getLogger(__name__)
 

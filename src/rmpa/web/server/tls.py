@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import ConfigError, StartError
-from rmpa.trust.io.store import CERTIFICATE, KEY
+from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.trust.io.store import TrustStore
+    from rmpa.trust.store import TrustStore
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe.control import ControlRequest
 from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
-from rmpa.trust.status import TrustStatus
+from rmpa.trust.joining import TrustStatus
 from rmpa.web import limits
 from rmpa.web.server.graph_signal import ask, control_stream
 

@@ -14,7 +14,7 @@ from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.actions import LocalService

@@ -33,7 +33,7 @@ from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
 from rmpa.core.identity import Guid
-from rmpa.trust.permissions import Permissions
+from rmpa.trust.documents import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,7 +20,7 @@ from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.ros.master.parameters import leaves
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.trust.permissions import refusal
+from rmpa.trust.documents import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.permissions import PermissionDecision
+    from rmpa.trust.documents import PermissionDecision
 
 _log = logging.getLogger(__name__)
 

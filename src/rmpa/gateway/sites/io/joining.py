@@ -24,7 +24,7 @@ from rmpa.gateway.sites.io.topic_part import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.rules import CrossingRules
 from rmpa.runtime.loop import SystemClock
-from rmpa.trust.permissions import refusal
+from rmpa.trust.documents import refusal
 
 if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
