@@ -12,7 +12,7 @@ from rmpa.agent import network
 from rmpa.agent.network import Network, is_displaced
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
-from rmpa.discovery.io.interfaces import Interface
+from rmpa.discovery.network import Interface
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.virtual import VirtualLoop, run
 

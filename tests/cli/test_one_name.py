@@ -22,7 +22,7 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.discovery.io.interfaces import list_interfaces
+from rmpa.discovery.network import list_interfaces
 from rmpa.trust.certificates import host_names, page_hosts
 from tests.cli.conftest import DEADLINE, end, free_port, until
 

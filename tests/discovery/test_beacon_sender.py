@@ -5,11 +5,9 @@ from __future__ import annotations
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import BeaconKind
-from rmpa.discovery.beacon_sender import BeaconSender
-from rmpa.discovery.endpoint import Endpoint, PeerInstance
-from rmpa.discovery.endpoint_table import EndpointTable
-from rmpa.discovery.events import HeardBy, SendMulticast, SendUnicast
+from rmpa.discovery.announcing import BeaconSender
+from rmpa.discovery.beacon import BeaconKind, HeardBy, SendMulticast, SendUnicast
+from rmpa.discovery.endpoints import Endpoint, EndpointTable, PeerInstance
 
 OWN = Identity(Guid.of("10.0.0.1", 40_001, 7), bytes(16), "own")
 

@@ -8,8 +8,7 @@ from ipaddress import IPv4Address
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.events import Output, PeerLost, SendMulticast, SendUnicast
+from rmpa.discovery.beacon import Beacon, BeaconKind, Output, PeerLost, SendMulticast, SendUnicast
 from rmpa.discovery.membership import MembershipProtocol
 
 MEMBERS = 1000

@@ -11,8 +11,9 @@ import pytest
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.events import (
+from rmpa.discovery.beacon import (
+    Beacon,
+    BeaconKind,
     ConflictCleared,
     ConflictKind,
     HeardBy,

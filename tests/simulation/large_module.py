@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import earliest
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
+from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.handshake import Hello
@@ -21,8 +21,7 @@ from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkUp
 from tests.simulation.large_network import TCP_BYTES, Link
 
 if TYPE_CHECKING:
-    from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.events import Event, LossReason, Output
+    from rmpa.discovery.beacon import Address, Beacon, Event, LossReason, Output
     from rmpa.mesh.peering_events import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 

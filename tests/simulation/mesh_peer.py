@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters
-from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted
+from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted
 from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.discovery.events import Event as RosterEvent
+    from rmpa.discovery.beacon import Event as RosterEvent
     from rmpa.mesh.frames import FrameKind
     from rmpa.mesh.handshake import Lane
     from rmpa.mesh.io.link import PeerLink

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.beacon import Beacon
-from rmpa.discovery.events import Event, SendMulticast
+from rmpa.discovery.beacon import Beacon, Event, SendMulticast
 from rmpa.discovery.membership import MembershipProtocol
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
-from rmpa.discovery.io.discovery import Discovery
-from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
+from rmpa.discovery.beacon import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
+from rmpa.discovery.discovery import Discovery
+from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from rmpa.agent.trust import AgentTrust
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.config.settings import Settings
-    from rmpa.discovery.events import Event
-    from rmpa.discovery.io.interfaces import Interface
+    from rmpa.discovery.beacon import Event
+    from rmpa.discovery.network import Interface
     from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)

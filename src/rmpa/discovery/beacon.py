@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 from ipaddress import IPv4Address
 from typing import Final
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity, dialable
 from rmpa.core.limits import UINT32_MAX
@@ -242,3 +243,250 @@ def _take(data: bytes, offset: int, length: int, what: str) -> tuple[bytes, int]
     if end > len(data):
         raise BeaconMalformed(f"ends inside its {what}")
     return data[offset:end], end
+
+
+# Modules that are heard in the network and are not of this mesh, for the user: one of the two has not joined.
+
+
+@dataclass(slots=True)
+class Stranger:
+    """One module whose beacons are refused. Nothing that it says is proved.
+
+    Args:
+        identity: As its last beacon said.
+        problem: Why they are refused, and what to do.
+        since: When it was first heard, monotonic seconds.
+        heard: When it was last heard.
+    """
+
+    identity: Identity
+    problem: str
+    since: float
+    heard: float
+
+
+class Strangers:
+    """The modules whose beacons are refused, few at a time: a full table takes no more until one falls silent."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, int], Stranger] = {}
+        self._rate = TokenBucket(limits.STRANGER_BEACONS_PER_SECOND, limits.STRANGER_BEACONS_PER_SECOND)
+
+    def may_read(self, now: float) -> bool:
+        """Whether one more refused beacon may be parsed for its name."""
+        return self._rate.take(now)
+
+    def hear(self, beacon: Beacon, problem: str, now: float) -> bool:
+        """Take in a refused beacon; return whether its sender is shown."""
+        self._expire(now)
+        identity = beacon.identity
+        key = identity.name, identity.guid.place
+        if beacon.kind is BeaconKind.GOODBYE:
+            self._known.pop(key, None)
+            return False
+        known = self._known.get(key)
+        if known is not None:
+            known.identity, known.problem, known.heard = identity, problem, now
+        elif len(self._known) < limits.STRANGERS_SHOWN:
+            self._known[key] = Stranger(identity, problem, now, now)
+        return key in self._known
+
+    def shown(self, now: float) -> tuple[Stranger, ...]:
+        """Those that were heard lately, in the order in which they were found."""
+        self._expire(now)
+        return tuple(self._known.values())
+
+    def _expire(self, now: float) -> None:
+        for key in [key for key, one in self._known.items() if now - one.heard > limits.STRANGER_KEPT]:
+            del self._known[key]
+
+
+# Events and outputs of the membership protocol, and the view of a peer.
+
+
+class HeardBy(Enum):
+    """How a peer was heard."""
+
+    MULTICAST = "multicast"
+    UNICAST = "unicast"
+    GOSSIP = "gossip"
+    """It answered an announcement to an address that another peer's gossip had."""
+    LINK = "link"
+
+
+class LossReason(Enum):
+    """Why a peer is no member any more."""
+
+    SILENCE = "silent for its lease"
+    GOODBYE = "said goodbye"
+    MOVED = "started anew at another port"
+    CONFLICT = "another live peer has its GUID address"
+
+
+class ConflictKind(Enum):
+    """The property that two live peers share, though it must be unique."""
+
+    GUID = "guid"
+    OWN_GUID = "own guid"
+    NAME = "name"
+
+
+@dataclass(frozen=True, slots=True)
+class PeerFound:
+    """A peer has become a member.
+
+    Args:
+        identity: As in its beacon or handshake.
+        source: Where its first packet came from; ``None`` if a link brought it.
+        heard: How it was found.
+    """
+
+    identity: Identity
+    source: Address | None
+    heard: HeardBy
+
+    @property
+    def guid(self) -> Guid:
+        """The peer's GUID."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerChanged:
+    """The same run of a peer has another identity: addresses or name have changed."""
+
+    identity: Identity
+    previous: Identity
+
+    @property
+    def guid(self) -> Guid:
+        """The peer's GUID as it is now."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRestarted:
+    """Another run of an agent is at the endpoint of ``previous``, which is gone."""
+
+    identity: Identity
+    previous: Identity
+    source: Address | None
+
+    @property
+    def guid(self) -> Guid:
+        """The new run's GUID."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLost:
+    """A peer is no member any more."""
+
+    identity: Identity
+    reason: LossReason
+
+    @property
+    def guid(self) -> Guid:
+        """The GUID it had."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerConflict:
+    """Two live peers claim the same GUID address or name. ``str`` says what to do. Reported once until it clears.
+
+    Args:
+        kind: What they share.
+        identity: The peer that was heard now.
+        other: The peer that was there; this agent itself for ``OWN_GUID`` and perhaps for ``NAME``.
+    """
+
+    kind: ConflictKind
+    identity: Identity
+    other: Identity
+
+    def __str__(self) -> str:
+        """What happened, where, and what to do."""
+        host, port = self.identity.guid.endpoint
+        if self.kind is ConflictKind.NAME:
+            return (
+                f"two modules are named {self.identity.name}: {self.identity.guid} and {self.other.guid}, so rules "
+                "and commands that name it may mean either; rename one: rmpa up --name"
+            )
+        if self.kind is ConflictKind.OWN_GUID:
+            what = f"the live peer {self.identity.name} has our own GUID address {host}:{port}"
+        else:
+            what = f"two live peers share one GUID address {host}:{port}: {self.identity.name} and {self.other.name}"
+        return f"{what}; give one of them another --port, or fix the NAT between them"
+
+
+@dataclass(frozen=True, slots=True)
+class RunDoubted:
+    """Another run was heard at the address of a linked peer: its link is worth a check, as it may have restarted."""
+
+    identity: Identity
+    """The linked run."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConflictCleared:
+    """Only one of the two peers of a ``PeerConflict`` over a GUID address is left."""
+
+    kind: ConflictKind
+    identity: Identity
+
+
+Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | PeerConflict | RunDoubted | ConflictCleared
+
+
+@dataclass(frozen=True, slots=True)
+class SendMulticast:
+    """Send to the group, on every usable interface."""
+
+    beacon: Beacon
+
+
+@dataclass(frozen=True, slots=True)
+class SendUnicast:
+    """Send to one address.
+
+    Args:
+        beacon: What is sent.
+        address: Where to.
+        key: Of a secured mesh: the number of the older group key that the receiver has (its low 16 bits); 0: the
+            present one.
+    """
+
+    beacon: Beacon
+    address: Address
+    key: int = 0
+
+
+Output = SendMulticast | SendUnicast
+
+
+@dataclass(frozen=True, slots=True)
+class PeerView:
+    """One peer, for display.
+
+    Args:
+        identity: As in its last beacon or handshake.
+        since: When it was found, in seconds of the protocol's clock.
+        heard: When it was last heard by beacon or had a link, on the same clock.
+        found_by: How it was found.
+        heard_by: How it was last heard.
+        source: Where its last packet came from, if there was one.
+        linked: Whether it has a link.
+        conflicts: Its conflicts, as texts for the user.
+        present: Whether it is a member; ``False`` while a conflict prevents it.
+    """
+
+    identity: Identity
+    since: float
+    heard: float
+    found_by: HeardBy
+    heard_by: HeardBy
+    source: Address | None
+    linked: bool
+    conflicts: tuple[str, ...]
+    present: bool

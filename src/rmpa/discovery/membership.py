@@ -16,11 +16,11 @@ from rmpa.core import limits as core_limits
 from rmpa.core.counters import Counters, earliest
 from rmpa.core.identity import Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Address, Beacon, BeaconKind
-from rmpa.discovery.beacon_sender import BeaconSender
-from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
-from rmpa.discovery.endpoint_table import EndpointTable
-from rmpa.discovery.events import (
+from rmpa.discovery.announcing import BeaconSender, GossipCandidates, LateAnswers, dissemination_interval, is_many
+from rmpa.discovery.beacon import (
+    Address,
+    Beacon,
+    BeaconKind,
     ConflictCleared,
     ConflictKind,
     Event,
@@ -34,15 +34,14 @@ from rmpa.discovery.events import (
     PeerRestarted,
     RunDoubted,
 )
-from rmpa.discovery.gossip import GossipCandidates
-from rmpa.discovery.pacing import LateAnswers, dissemination_interval, is_many
+from rmpa.discovery.endpoints import Endpoint, EndpointChange, EndpointTable, PeerInstance
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from ipaddress import IPv4Address
 
     from rmpa.core.identity import Guid
-    from rmpa.discovery.events import PeerView
+    from rmpa.discovery.beacon import PeerView
 
 _NEVER: Final = float("-inf")
 

@@ -17,16 +17,25 @@ import pytest
 from rmpa.config.settings import HostPort, Multicast, Settings
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
-from rmpa.discovery.io.discovery import Discovery
-from rmpa.discovery.io.interfaces import Interface, list_interfaces
+from rmpa.discovery.beacon import (
+    Beacon,
+    BeaconKind,
+    Event,
+    HeardBy,
+    LossReason,
+    PeerConflict,
+    PeerFound,
+    PeerLost,
+    PeerRestarted,
+)
+from rmpa.discovery.discovery import Discovery
+from rmpa.discovery.network import Interface, list_interfaces
 from rmpa.trust.packets import GroupKey, KeyRing, PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.discovery.events import PeerView
+    from rmpa.discovery.beacon import PeerView
 
 DEADLINE = 15.0
 
@@ -334,7 +343,7 @@ async def test_a_discovery_port_that_somebody_keeps_is_said(
 async def test_the_watcher_looks_by_itself_where_netlink_is_refused(
     monkeypatch: pytest.MonkeyPatch, agents: list[Agent], settings: Settings
 ) -> None:
-    monkeypatch.setattr("rmpa.discovery.io.interfaces._open_netlink", lambda: None)
+    monkeypatch.setattr("rmpa.discovery.network._open_netlink", lambda: None)
     monkeypatch.setattr(limits, "INTERFACE_LOOK", 0.05)
     there: list[Interface] = []
     base = Agent("base", settings, look=lambda: tuple(there))

@@ -6,8 +6,8 @@ from ipaddress import IPv4Address
 
 import pytest
 
-from rmpa.discovery.io import interfaces
-from rmpa.discovery.io.interfaces import Interface, choose, further_addresses, pick_address, unknown_names
+from rmpa.discovery import network as interfaces
+from rmpa.discovery.network import Interface, choose, further_addresses, pick_address, unknown_names
 
 
 def interface(name: str, *addresses: str, up: bool = True, multicast: bool = True) -> Interface:

@@ -9,7 +9,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.io.packet_filter import PacketFilter, Recognised
+from rmpa.discovery.discovery import PacketFilter, Recognised
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import GroupKey, KeyPurpose, KeyRing, PacketSigner, PacketTrust, PacketVerifier
 

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.io.part import Services
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.identity import Identity
-    from rmpa.discovery.events import PeerView
-    from rmpa.discovery.io.discovery import Discovery
-    from rmpa.discovery.strangers import Stranger
+    from rmpa.discovery.beacon import PeerView, Stranger
+    from rmpa.discovery.discovery import Discovery
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh

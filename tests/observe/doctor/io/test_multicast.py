@@ -11,9 +11,8 @@ import pytest
 from rmpa.config import limits as config_limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
-from rmpa.discovery.io.interfaces import Interface, list_interfaces
-from rmpa.discovery.io.packet_filter import PacketFilter
-from rmpa.discovery.io.sockets import receive
+from rmpa.discovery.discovery import PacketFilter
+from rmpa.discovery.network import Interface, list_interfaces, receive
 from rmpa.observe import limits
 from rmpa.observe.doctor.io import multicast
 from rmpa.observe.doctor.io.multicast import hear

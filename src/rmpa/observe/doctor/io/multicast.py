@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.io.sockets import GroupMembership, open_receiver, receive
+from rmpa.discovery.network import GroupMembership, open_receiver, receive
 from rmpa.observe import limits
 from rmpa.observe.doctor.network import MulticastEcho
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.discovery.io.interfaces import Interface
+    from rmpa.discovery.network import Interface
 
 _PKTINFO: Final = struct.Struct("@i4s4s")
 _IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.discovery.io.interfaces import choose, list_interfaces
-from rmpa.discovery.io.sockets import open_receiver
+from rmpa.discovery.network import choose, list_interfaces, open_receiver
 from rmpa.observe.doctor.io.programs import ask_program
 from rmpa.observe.doctor.network import NetworkInterface, Port, Radio
 from rmpa.runtime.tcp_connections import program_at
