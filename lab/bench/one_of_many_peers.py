@@ -35,13 +35,13 @@ from rmpa.core.limits import PEER_LEASE
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
-from rmpa.mesh.connection_events import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived
+from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.discovery.beacon import Address
-    from rmpa.mesh.connection_events import ConnectionEvent
+    from rmpa.mesh.keepalive import ConnectionEvent
 
 _FIRST_PORT: Final = 20000
 _NODES: Final = 4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
-from rmpa.mesh.handshake import Hello, KnownLink, Refuse, judge, judge_welcome
+from rmpa.mesh.frames import Hello, KnownLink, Refuse, judge, judge_welcome
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")

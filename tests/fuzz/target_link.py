@@ -6,9 +6,8 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import ConnectionEvent, HelloReceived
-from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
-from rmpa.mesh.handshake import Hello, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Refuse, pack_data_header, pong
+from rmpa.mesh.keepalive import ConnectionEvent, HelloReceived
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")

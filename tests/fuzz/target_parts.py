@@ -11,15 +11,14 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
-from rmpa.mesh.connection_events import HelloReceived
-from rmpa.mesh.frames import WHOLE, Frame, FrameKind
-from rmpa.mesh.handshake import Hello
+from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Hello
+from rmpa.mesh.keepalive import HelloReceived
 from rmpa.ros import limits
 from tests.simulation.network import World
 from tests.simulation.process import Process
 
 if TYPE_CHECKING:
-    from rmpa.mesh.connection_events import ConnectionEvent
+    from rmpa.mesh.keepalive import ConnectionEvent
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")

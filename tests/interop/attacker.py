@@ -32,8 +32,7 @@ from cryptography.x509.oid import NameOID
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Hello, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Refuse
 
 RNG = random.Random(14)
 TIMEOUT = 10.0

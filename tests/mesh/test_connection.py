@@ -8,15 +8,8 @@ from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolEr
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import (
-    ConnectionClosed,
-    ControlReceived,
-    HandshakeDone,
-    HelloReceived,
-    Refused,
-)
-from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
-from rmpa.mesh.handshake import Hello, Refusal, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Refusal, Refuse, pack_data_header, pong
+from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived, Refused
 from rmpa.runtime import limits as runtime_limits
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 

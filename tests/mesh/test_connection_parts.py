@@ -9,15 +9,8 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import (
-    ConnectionClosed,
-    ControlReceived,
-    HandshakeDone,
-    HelloReceived,
-    MarkReceived,
-)
-from rmpa.mesh.frames import WHOLE, Frame, FrameKind, pack_data_header
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Lane, pack_data_header
+from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived, MarkReceived
 from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, pass_time, side
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid
-from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Lane, Refusal, Refuse, judge, judge_welcome
+from rmpa.mesh.frames import HandshakeError, Hello, KnownLink, Lane, Refusal, Refuse, judge, judge_welcome
 from tests.mesh.worlds import HIGH, LOW
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ import pytest
 
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import ConnectionClosed, PongReceived
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.keepalive import RestPace
+from rmpa.mesh.keepalive import ConnectionClosed, PongReceived, RestPace
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
 if TYPE_CHECKING:

@@ -11,17 +11,9 @@ import pytest
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import FULL, Hello, Refusal, Refuse
+from rmpa.mesh.frames import FULL, Hello, Refusal, Refuse
+from rmpa.mesh.keepalive import CloseLink, Dial, LinkDown, LinkDownCause, LinkRefused, LinkUp, PeeringOutput
 from rmpa.mesh.peering import Peering
-from rmpa.mesh.peering_events import (
-    CloseLink,
-    Dial,
-    LinkDown,
-    LinkDownCause,
-    LinkRefused,
-    LinkUp,
-    PeeringOutput,
-)
 from tests.mesh.worlds import HIGH, LOW
 
 DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))

@@ -12,8 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.mesh import limits
-from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender
-from rmpa.mesh.resume_table import ResumeTable
+from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender, ResumeTable
 from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)

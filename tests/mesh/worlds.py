@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
-    from rmpa.mesh.connection_events import ConnectionEvent
-    from rmpa.mesh.keepalive import RestPace
+    from rmpa.mesh.keepalive import ConnectionEvent, RestPace
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")

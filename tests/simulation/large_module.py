@@ -14,15 +14,14 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.handshake import Hello
-from rmpa.mesh.keepalive import RestPace
+from rmpa.mesh.frames import Hello
+from rmpa.mesh.keepalive import CloseLink, Dial, LinkDown, LinkUp, RestPace
 from rmpa.mesh.peering import Peering
-from rmpa.mesh.peering_events import CloseLink, Dial, LinkDown, LinkUp
 from tests.simulation.large_network import TCP_BYTES, Link
 
 if TYPE_CHECKING:
     from rmpa.discovery.beacon import Address, Beacon, Event, LossReason, Output
-    from rmpa.mesh.peering_events import PeeringOutput
+    from rmpa.mesh.keepalive import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 
 TOPICS: Final = 20

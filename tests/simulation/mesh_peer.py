@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters
 from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted
-from rmpa.mesh.io.dialler import Dialler
+from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from tests.simulation.process import Process
@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.discovery.beacon import Event as RosterEvent
-    from rmpa.mesh.frames import FrameKind
-    from rmpa.mesh.handshake import Lane
+    from rmpa.mesh.frames import FrameKind, Lane
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.peering_events import LinkDown
+    from rmpa.mesh.keepalive import LinkDown
     from tests.simulation.network import Address, World
 
 

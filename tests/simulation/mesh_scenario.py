@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from unittest import mock
 
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import Lane
 from tests.simulation.mesh_peer import MeshPeer
 from tests.simulation.scenario import Outcome, Scenario
 
@@ -58,7 +58,7 @@ class MeshScenario(Scenario):
         """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
         with (
-            mock.patch("rmpa.mesh.io.redials.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.mesh.io.dial.unacknowledged", lambda sock: sock.in_flight),
             mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
                 limits,

@@ -11,8 +11,7 @@ from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.reliable import ReliableReceiver, ReliableSender
-from rmpa.mesh.resume_table import ResumeTable
+from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.io.route_sender import RouteSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.peering_events import LinkDown
+    from rmpa.mesh.keepalive import LinkDown
 
 _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)

@@ -21,7 +21,7 @@ from rmpa.discovery.network import choose, further_addresses, list_interfaces, p
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.peering_events import LinkDown, LinkDownCause
+from rmpa.mesh.keepalive import LinkDown, LinkDownCause
 from rmpa.runtime.accept import open_mesh_port
 from rmpa.runtime.loop import SystemClock
 

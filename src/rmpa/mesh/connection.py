@@ -26,20 +26,20 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
-from rmpa.mesh.connection_events import (
+from rmpa.mesh.frames import Frame, FrameKind, HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.keepalive import (
     ConnectionClosed,
     ConnectionEvent,
     ControlReceived,
     HandshakeDone,
     HelloReceived,
+    Keepalive,
     MarkReceived,
     PongReceived,
     Refused,
+    RemoteClock,
+    RestPace,
 )
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
-from rmpa.mesh.keepalive import Keepalive, RestPace
-from rmpa.mesh.remote_clock import RemoteClock
 from rmpa.runtime import limits as runtime_limits
 from rmpa.trust.certificates import TrustReason
 

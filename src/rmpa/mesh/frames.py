@@ -13,12 +13,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.core.identity import SERIAL_MASK
+from rmpa.core.identity import SERIAL_MASK, Guid, Identity, peer_name_problem
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
+from rmpa.trust.certificates import TrustReason
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.core.outbox import QueuedMessage
 
@@ -219,3 +220,295 @@ def parse_text(payload: Buffer) -> str:
     """The text of a refuse or bye frame, safe for a log: one line, nothing unprintable."""
     text = bytes(payload).decode("utf-8", "replace")
     return "".join(c if c.isprintable() else " " for c in text)[:512]
+
+
+# The handshake: each side sends its identity, and accepts or refuses (docs/design/protocol.md, "Handshake").
+#
+# ``judge`` decides on a hello, ``judge_welcome`` on the answer. Both are pure functions; the machines act on their
+# results.
+
+
+MAGIC: Final = b"RMPA"
+VERSION: Final = 2
+
+_PREFIX: Final = struct.Struct(">4sBBH")
+_HELLO: Final = struct.Struct(">4sBBHQ16sIQB")
+_CODE: Final = struct.Struct(">H")
+
+
+class Lane(IntEnum):
+    """What a connection is for."""
+
+    EXPRESS = 1
+    BULK = 2
+
+
+LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
+"""The lanes that this version knows."""
+
+
+class Refusal(IntEnum):
+    """Why a connection was refused; the numbers are those on the wire, which ``TrustReason`` continues."""
+
+    VERSION = 1
+    DOMAIN = 2
+    MYSELF = 3
+    ALREADY_LINKED = 4
+    DUPLICATE = 5
+    WRONG_PEER = 6
+    MALFORMED = 7
+    BUSY = 8
+    LANE = 9
+    NO_EXPRESS = 10
+    FULL = 21
+
+
+@dataclass(frozen=True, slots=True)
+class Refuse:
+    """A refusal with its reason: the payload of a refuse frame.
+
+    Args:
+        code: One of ``Refusal`` or ``TrustReason``, or a number of a later version.
+        text: For people: what is wrong and what to do.
+    """
+
+    code: int
+    text: str
+
+    @classmethod
+    def parse(cls, payload: Buffer) -> Refuse:
+        """Read a refuse frame's payload.
+
+        Raises:
+            RemoteProtocolError: It has no code.
+        """
+        if len(payload) < _CODE.size:
+            raise RemoteProtocolError(f"refusal of {len(payload)} bytes has no code")
+        (code,) = _CODE.unpack_from(payload)
+        return cls(code, parse_text(payload[_CODE.size :]))
+
+    def serialize(self) -> bytes:
+        """The bytes on the wire."""
+        return _CODE.pack(self.code) + text_payload(self.text)
+
+    @property
+    def label(self) -> str:
+        """The code for the names of counters: ``version``, ``already_linked``, ``code 27``."""
+        return _LABELS.get(self.code, f"code {self.code}")
+
+    def __str__(self) -> str:
+        """``domain: …``."""
+        return f"{self.label}: {self.text}"
+
+
+_LABELS: Final = {code.value: code.name.lower() for kind in (Refusal, TrustReason) for code in kind}
+
+
+class HandshakeError(RemoteProtocolError):
+    """A hello or welcome that cannot be read; ``refuse`` is the answer to its sender."""
+
+    def __init__(self, refuse: Refuse) -> None:
+        super().__init__(refuse.text)
+        self.refuse = refuse
+
+
+def _malformed(text: str) -> HandshakeError:
+    return HandshakeError(Refuse(Refusal.MALFORMED, f"the handshake is malformed: {text}"))
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """The identity and the terms of one side: the payload of hello and welcome frames.
+
+    Args:
+        guid: The sender's.
+        instance: The sender's, 16 bytes.
+        name: The sender's.
+        domain: The sender's.
+        lease_ms: The sender is dead when it was silent for this long, in milliseconds.
+        expected: Hello: the GUID that the sender dialled, ``None`` if it knows only an address; welcome: the
+            hello's GUID.
+        lane: What the connection is for; an ``int``, because a later version may know more lanes.
+    """
+
+    guid: Guid
+    instance: bytes
+    name: str
+    domain: int
+    lease_ms: int
+    expected: Guid | None = None
+    lane: int = Lane.EXPRESS
+
+    @classmethod
+    def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
+        """The hello of this identity; ``lease`` in seconds."""
+        return cls(
+            identity.guid,
+            identity.instance,
+            identity.name,
+            identity.domain,
+            round(lease * 1000),
+            expected,
+            lane,
+        )
+
+    @classmethod
+    def parse(cls, payload: Buffer) -> Hello:
+        """Read a hello or welcome; bytes after what is known are for later versions and ignored.
+
+        Raises:
+            HandshakeError: The payload is of another version, or malformed.
+        """
+        if len(payload) < _PREFIX.size:
+            raise _malformed(f"{len(payload)} bytes")
+        magic, version, _, _ = _PREFIX.unpack_from(payload)
+        if magic != MAGIC:
+            raise _malformed("it does not begin with RMPA; is this port meant for something else?")
+        if version != VERSION:
+            text = f"protocol version {version} meets version {VERSION}: install the same release of rmpa on both"
+            raise HandshakeError(Refuse(Refusal.VERSION, text))
+        if len(payload) < _HELLO.size:
+            raise _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")
+        _, _, lane, domain, guid, instance, lease_ms, expected, size = _HELLO.unpack_from(payload)
+        raw = bytes(payload[_HELLO.size : _HELLO.size + size])
+        if len(raw) != size:
+            raise _malformed("it is shorter than its name")
+        name = raw.decode("utf-8", "replace")
+        if problem := peer_name_problem(name):
+            raise _malformed(problem)
+        if lease_ms == 0:
+            raise _malformed("a lease of 0")
+        if not Guid(guid).dialable:
+            # Discovery would gossip about this GUID, and no beacon may carry such a one.
+            raise _malformed(f"no peer can be reached at {Guid(guid)}")
+        dialled = Guid(expected) if expected else None
+        return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane)
+
+    def serialize(self) -> bytes:
+        """The bytes on the wire."""
+        name = self.name.encode()
+        expected = self.expected.value if self.expected is not None else 0
+        head = _HELLO.pack(
+            MAGIC,
+            VERSION,
+            self.lane,
+            self.domain,
+            self.guid.value,
+            self.instance,
+            self.lease_ms,
+            expected,
+            len(name),
+        )
+        return head + name
+
+    @property
+    def lease(self) -> float:
+        """The lease in seconds, held within ``limits.LINK_LEASE_MIN`` and ``LINK_LEASE_MAX``."""
+        return min(max(self.lease_ms / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
+
+    @property
+    def identity(self) -> Identity:
+        """The sender's identity; only valid after its domain was checked."""
+        return Identity(self.guid, self.instance, self.name, self.domain)
+
+    def __str__(self) -> str:
+        """``base (10.0.0.1:40001#7) domain 0``."""
+        return f"{self.name} ({self.guid}) domain {self.domain}"
+
+
+def same_place(one: Guid, other: Guid) -> bool:
+    """Whether two GUIDs have the same address and port: incarnations of one peer, or two peers in conflict."""
+    return one.place == other.place
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLink:
+    """A link that is up, against which a hello is judged.
+
+    Args:
+        guid: The peer's.
+        instance: The peer's.
+        dialled: Whether this side dialled.
+        alive: Whether bytes were received within ``limits.GHOST_QUIET``; otherwise the peer may be dead.
+    """
+
+    guid: Guid
+    instance: bytes
+    dialled: bool
+    alive: bool
+
+
+FULL: Final = Refuse(
+    Refusal.FULL,
+    f"this mesh has {limits.MODULES_MAX} modules and no place for one more: make further ones a site of their own "
+    "(`rmpa gateway`, docs/sites.md)",
+)
+"""The answer to a module for which a mesh has no place; it may join when one becomes free."""
+
+
+def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, full: bool = False) -> Refuse | None:
+    """Decide on a hello: ``None`` accepts the connection.
+
+    Args:
+        hello: The dialler's hello.
+        ours: The identity of this agent.
+        links: The links that are up, or at least those with a peer of the hello's address and port.
+        full: Whether there is no place for one more peer.
+    """
+    if refuse := _judge_identity(hello, ours):
+        return refuse
+    if hello.lane not in LANES:
+        return Refuse(Refusal.LANE, f"lane {hello.lane} is not supported here: install the same release on both")
+    if hello.expected is not None and not same_place(hello.expected, ours.guid):
+        text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
+        return Refuse(Refusal.WRONG_PEER, text)
+    there = [link for link in links if same_place(link.guid, hello.guid)]
+    if hello.lane == Lane.BULK:
+        if any(link.instance == hello.instance for link in there):
+            return None
+        return Refuse(Refusal.NO_EXPRESS, "a bulk lane belongs to an express one, and there is none yet")
+    for link in there:
+        if link.instance != hello.instance:
+            if link.alive:
+                return _duplicate(hello.guid)
+        elif link.dialled and ours.guid < hello.guid:
+            return Refuse(Refusal.ALREADY_LINKED, "we are linked already; the link that the lower GUID dialled stays")
+    if full and not there:
+        return FULL
+    return None
+
+
+def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refuse | None:
+    """Decide on the answer to a hello of this side: ``None`` accepts the connection.
+
+    Args:
+        welcome: The acceptor's welcome.
+        ours: The identity of this agent.
+        expected: The GUID that was dialled; ``None`` if only the address is known.
+    """
+    if refuse := _judge_identity(welcome, ours):
+        return refuse
+    if expected is not None and not same_place(expected, welcome.guid):
+        who = f"{welcome.name} ({welcome.guid})"
+        text = f"we called {expected}, but {who} answers: the address changed hands, or two have it"
+        return Refuse(Refusal.WRONG_PEER, text)
+    if welcome.expected != ours.guid:
+        return Refuse(Refusal.MALFORMED, f"the welcome is for {welcome.expected}, but we are {ours.guid}")
+    return None
+
+
+def _judge_identity(hello: Hello, ours: Identity) -> Refuse | None:
+    if hello.instance == ours.instance:
+        return Refuse(Refusal.MYSELF, f"{ours.name} reached its own port: one of its addresses leads back to it")
+    if hello.domain != ours.domain:
+        text = f"domain {hello.domain} meets domain {ours.domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+        return Refuse(Refusal.DOMAIN, text)
+    if same_place(hello.guid, ours.guid):
+        return _duplicate(hello.guid)
+    return None
+
+
+def _duplicate(guid: Guid) -> Refuse:
+    address, port = guid.endpoint
+    text = f"two live agents are {address}:{port}: give one of them another --port or address (are both behind NAT?)"
+    return Refuse(Refusal.DUPLICATE, text)

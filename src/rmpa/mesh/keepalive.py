@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.mesh import limits
-from rmpa.mesh.frames import PaceFlag
+from rmpa.mesh.frames import PaceFlag, Refusal, Refuse
+from rmpa.trust.certificates import TrustReason
+
+if TYPE_CHECKING:
+    from rmpa.core.identity import Guid, Identity
+    from rmpa.mesh.frames import FrameKind, Hello
 
 
 class RestPace:
@@ -230,3 +239,287 @@ class Keepalive:
     def _hold(self, lease: float, interval: float) -> None:
         self.lease = lease
         self._interval = interval * (limits.ACCEPTOR_KEEPALIVE_FACTOR if self._acceptor else 1.0)
+
+
+# The round-trip time of a connection and the remote clock, from four time stamps (RFC 5905, section 8).
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSample:
+    """One exchange of ping and pong.
+
+    Args:
+        rtt: Seconds on the wire: the round trip without the time that the remote side took to answer.
+        offset: Seconds that the remote wall clock is ahead of the local one, ±rtt/2.
+        taken: When, in monotonic seconds.
+    """
+
+    rtt: float
+    offset: float
+    taken: float
+
+
+class RemoteClock:
+    """The remote clock, by the exchange with the least error among the last ``limits.CLOCK_SAMPLES``.
+
+    Queues only make round trips longer, so the shortest has the least error; the error grows with age, because the
+    two clocks drift apart (PHI of RFC 5905).
+    """
+
+    def __init__(self) -> None:
+        self._pings: dict[int, float] = {}
+        self._samples: deque[ClockSample] = deque(maxlen=limits.CLOCK_SAMPLES)
+        self.rtt: float | None = None
+        """The last round trip, in seconds; ``None`` before the first."""
+
+    def pinged(self, t1: int, now: float) -> None:
+        """A ping with stamp ``t1`` (ns) is sent."""
+        self._pings[t1] = now
+        while len(self._pings) > limits.CLOCK_SAMPLES:
+            del self._pings[next(iter(self._pings))]
+
+    def ponged(self, t1: int, t2: int, t3: int, t4: int, now: float) -> ClockSample | None:
+        """A pong came at wall time ``t4``; all stamps in ns. Returns ``None`` if it answers no known ping.
+
+        ``t1`` and ``t4`` are of the local clock, ``t2`` (ping received) and ``t3`` (pong sent) of the remote one.
+        """
+        sent = self._pings.pop(t1, None)
+        if sent is None:
+            return None
+        rtt = ((t4 - t1) - (t3 - t2)) / 1e9
+        if abs((t4 - t1) / 1e9 - (now - sent)) > limits.CLOCK_STEP or rtt < 0:
+            # A wall clock was set in between: earlier samples are void.
+            self._samples.clear()
+            return None
+        sample = ClockSample(rtt, ((t2 - t1) + (t3 - t4)) / 2e9, now)
+        if self._samples and self._contradicts(sample):
+            self._samples.clear()
+        self._samples.append(sample)
+        self.rtt = sample.rtt
+        return sample
+
+    def estimate(self, now: float) -> tuple[float, float] | None:
+        """Offset and its error bound, in seconds: the true offset lies within ±error; ``None`` if unknown."""
+        best = min(self._samples, key=lambda s: self._error(s, now), default=None)
+        return None if best is None else (best.offset, self._error(best, now))
+
+    def _contradicts(self, sample: ClockSample) -> bool:
+        """Whether a sample and the present estimate cannot both be true: a clock was set."""
+        offset, error = self.estimate(sample.taken) or (sample.offset, 0.0)
+        return abs(sample.offset - offset) > error + sample.rtt / 2 + 1e-6
+
+    @staticmethod
+    def _error(sample: ClockSample, now: float) -> float:
+        return sample.rtt / 2 + limits.CLOCK_DRIFT * max(0.0, now - sample.taken)
+
+
+# The events that the protocol machine of a connection reports; see ``mesh.connection``.
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReceived:
+    """Acceptor: a hello was received; the driver answers it with ``accept`` or ``refuse``."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class HandshakeDone:
+    """Both sides accepted the connection; frames may be sent."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class ControlReceived:
+    """A control frame was received.
+
+    Args:
+        payload: A copy of its bytes.
+    """
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PongReceived:
+    """The answer to a ping was received.
+
+    Args:
+        stamp: The time stamp of the ping, which identifies it.
+        rtt: Round trip on the wire in seconds, without the time that the remote side took to answer.
+    """
+
+    stamp: int
+    rtt: float
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
+
+    Args:
+        refuse: Why.
+        by_us: Whether this side refused.
+    """
+
+    refuse: Refuse
+    by_us: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionClosed:
+    """The connection is over: the driver sends the remaining output and closes the socket.
+
+    Args:
+        reason: Why, for people.
+    """
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class MarkReceived:
+    """An acknowledgement, a fence, the answer to a fence, or the wish for the bulk lane was received.
+
+    Args:
+        kind: ``ACK``, ``FENCE``, ``FENCED`` or ``LANE``.
+        route: The id of the route.
+        sequence: For ``ACK`` the last message that arrived; otherwise the fence's number.
+    """
+
+    kind: FrameKind
+    route: int
+    sequence: int
+
+
+ConnectionEvent = (
+    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
+)
+
+
+# The orders and events of the peering machine, and the status of a peer; see ``mesh.peering``.
+
+
+SocketAddress = tuple[str, int]
+
+SELDOM_MENDED: Final = frozenset(
+    {
+        Refusal.VERSION,
+        Refusal.DOMAIN,
+        Refusal.DUPLICATE,
+        Refusal.MALFORMED,
+        Refusal.LANE,
+        Refusal.FULL,
+        TrustReason.PLAIN,
+        TrustReason.FOREIGN,
+        TrustReason.EXPIRED,
+        TrustReason.REVOKED,
+        TrustReason.NAME,
+        TrustReason.DOWNGRADE,
+    }
+)
+"""Refusals for reasons that seldom pass by themselves."""
+UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.CLOCK})
+"""Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause."""
+OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dial:
+    """Connect to this peer, at the endpoint that answers first.
+
+    Args:
+        guid: The peer.
+        endpoints: Its endpoints, best first; a peer with several addresses may be reachable at some of them only.
+        briefly: Whether to give up after one short attempt at each, because the next ``Dial`` follows soon.
+    """
+
+    guid: Guid
+    endpoints: tuple[SocketAddress, ...]
+    briefly: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CloseLink:
+    """Send a bye on this link and close it."""
+
+    link_id: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LinkUp:
+    """This link is the one that is used with its peer."""
+
+    link_id: int
+    identity: Identity
+
+
+class LinkDownCause(Enum):
+    """Why a link is no longer used; the value is the text for users."""
+
+    REPLACED = "replaced by a newer link"
+    """The same run of the peer has another link from the same moment on."""
+    RESTARTED = "the peer restarted"
+    """Another run of the peer has taken its place."""
+    ENDED = "the connection ended"
+    """The connection of its express lane ended; ``LinkDown.reason`` says how."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkDown:
+    """The link that was used with this peer is no longer used.
+
+    Args:
+        link_id: Its number.
+        identity: The peer.
+        cause: The kind of its end.
+        reason: Why, for people.
+    """
+
+    link_id: int
+    identity: Identity
+    cause: LinkDownCause
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LinkRefused:
+    """A peer refuses links for a reason that was not reported before; ``refuse`` says what to do."""
+
+    identity: Identity
+    refuse: Refuse
+
+
+PeeringOutput = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
+
+
+@dataclass(frozen=True, slots=True)
+class PeerStatus:
+    """The state of one peer, for the snapshot.
+
+    Args:
+        identity: The peer.
+        state: ``refused``: waiting after a refusal for a reason that seldom passes by itself.
+        link_id: Its link, if linked.
+        lower: Whether this agent has the lower GUID of the two, and dials first.
+        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
+        attempts: Dials since the last link.
+        last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
+        next_attempt: When it is dialled next, monotonic seconds.
+        endpoint: The endpoint that is dialled, or was dialled last.
+        foreign: Why it is not of this mesh, if its last refusal says so.
+    """
+
+    identity: Identity
+    state: Literal["linked", "dialling", "waiting", "refused"]
+    link_id: int | None
+    lower: bool
+    since: float | None
+    attempts: int
+    last_error: str
+    next_attempt: float | None
+    endpoint: SocketAddress | None
+    foreign: TrustReason | None = None

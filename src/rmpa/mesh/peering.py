@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Literal
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import FULL, Hello, KnownLink, Lane, Refusal, Refuse, judge
-from rmpa.mesh.peering_events import (
+from rmpa.mesh.frames import FULL, Hello, KnownLink, Lane, Refusal, Refuse, judge
+from rmpa.mesh.keepalive import (
     OTHER_PEER,
     SELDOM_MENDED,
     UNPROVEN,

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from rmpa.bridge.data.lane_switch import BULK, EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, Priority
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import Lane
 
 SMALL = limits.EXPRESS_MESSAGE_MAX
 LARGE = SMALL + 1

@@ -23,8 +23,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Hello
+from rmpa.mesh.frames import Frame, FrameKind, Hello
 
 RNG = random.Random(7)
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"

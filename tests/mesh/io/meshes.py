@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Hello, Lane
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Lane
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 

@@ -20,9 +20,8 @@ from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Lane, Refusal, Refuse
-from rmpa.mesh.io.sockets import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
+from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
+from rmpa.mesh.io.dial import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until

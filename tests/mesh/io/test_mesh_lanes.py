@@ -14,16 +14,14 @@ from rmpa.config.settings import LaneSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, unpack_header
-from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse, pack_data_header, unpack_header
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from rmpa.mesh.io.connection import Connection
-    from rmpa.mesh.io.lane import LaneSender
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.link import LaneSender, PeerLink
 
 HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 

@@ -20,8 +20,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import MIB
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tls import TlsHandshake
@@ -32,7 +31,7 @@ from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
 
 if TYPE_CHECKING:
-    from rmpa.mesh.peering_events import PeerStatus
+    from rmpa.mesh.keepalive import PeerStatus
 
 DAY = 86_400.0
 

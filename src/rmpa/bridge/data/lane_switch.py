@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.contract import Priority
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Lane
+from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract

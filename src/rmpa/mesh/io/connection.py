@@ -14,7 +14,9 @@ from rmpa.core.identity import SERIAL_MASK
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
-from rmpa.mesh.connection_events import (
+from rmpa.mesh.frames import Frame, FrameKind, Lane
+from rmpa.mesh.io.securing import tls_failure
+from rmpa.mesh.keepalive import (
     ConnectionClosed,
     ConnectionEvent,
     ControlReceived,
@@ -24,9 +26,6 @@ from rmpa.mesh.connection_events import (
     PongReceived,
     Refused,
 )
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Lane
-from rmpa.mesh.io.securing import tls_failure
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
 
@@ -37,10 +36,9 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Clock
     from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.connection import OnData, OnPart
-    from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket
-    from rmpa.mesh.keepalive import RestPace
-    from rmpa.mesh.remote_clock import RemoteClock
+    from rmpa.mesh.keepalive import RemoteClock, RestPace
 
     OnMark = Callable[[FrameKind, int, int], None]
 

@@ -1,19 +1,177 @@
-"""The link to one peer: two lanes, each with a connection, and the handlers of the received messages."""
+"""The bulk lanes of all links: each is dialled when a message first wants it, and ends with its link.
+
+Only the side that dialled the link dials its bulk lane; the other side asks for it by a lane frame.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core import limits as core_limits
+from rmpa.core.counters import Backoff
+from rmpa.core.identity import SERIAL_MASK
+from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FrameKind
-from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
 if TYPE_CHECKING:
-    from rmpa.core.counters import Clock
+    from collections.abc import Coroutine
+
+    from rmpa.core.counters import Clock, Counters
     from rmpa.mesh.io.connection import Connection
+    from rmpa.runtime.stream import Stream
+    from rmpa.runtime.tls import Buffer
+
+
+# The sending end of one lane of a link, whether the lane has its connection or not.
+#
+# Messages that are sent while there is no connection wait within the lane's bounds, and go first over the next one.
+
+
+class LaneSender:
+    """Sends data frames by one lane of a link.
+
+    Args:
+        name: ``express`` or ``bulk``, for people.
+        on_wanted: Called when something is queued while the lane has no connection.
+    """
+
+    def __init__(self, name: str, on_wanted: Callable[[], None] | None = None) -> None:
+        self.name = name
+        self._on_wanted = on_wanted if on_wanted is not None else _nothing
+        self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LANE_QUEUE_BYTES, frame=pack_fragment_header)
+        self.ended = False
+        """Whether the link is closing: nothing is sent or queued any more."""
+        self._stream: Stream | None = None
+        self._open: dict[int, QueuedMessage] = {}
+        """The messages that ``open`` has begun, by route."""
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the lane has its connection."""
+        return self._stream is not None
+
+    def connect(self, stream: Stream) -> None:
+        """Use a connection from now on; waiting messages are sent first."""
+        self._stream = stream
+        stream.adopt(self.outbox, pack_fragment_header)
+
+    def disconnect(self) -> int:
+        """Handle the end of the connection; return how many messages were cut off, without those in the kernel."""
+        self._stream = None
+        for parcel in self._open.values():
+            if 0 < parcel.sent < parcel.size:
+                parcel.dropped = True  # its first bytes were lost with the connection
+        self._open.clear()
+        return self.outbox.reset()
+
+    def end(self) -> None:
+        """Take no more messages, because the link closes; waiting ones are sent within the drain time."""
+        self.ended = True
+        self._on_wanted = _nothing  # its link holds this lane
+        self._stream = None
+
+    def clear(self) -> None:
+        """Drop the waiting messages, because the link is gone."""
+        self.outbox.clear()
+        self._open.clear()
+
+    def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
+        """Send one message; bytes that the socket does not take are copied into a keep-last queue.
+
+        Args:
+            route: The route's id, 32 bits.
+            sequence: The message's number on its route; its low 32 bits are sent.
+            stamp_ns: When it was published, wall clock.
+            payload: Its bytes, not kept after the call.
+
+        Returns:
+            How many older messages were dropped to make room. Without effect (0) once the link is closing.
+        """
+        size = len(payload)
+        if size > core_limits.FRAGMENT_BYTES:
+            return self.extend(self._parcel(route, size, sequence, stamp_ns), payload)
+        header = pack_data_header(size, route, sequence, stamp_ns)
+        if self._stream is not None:
+            return self._stream.send((header, payload), route)
+        if self.ended:
+            return 0
+        dropped = self.outbox.push(b"".join((header, payload)), route, self._loop.time())
+        self._on_wanted()
+        return dropped
+
+    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
+        """Begin a message of ``size`` bytes that follow by ``extend``, before the next one of its route."""
+        parcel = self._open[route] = self._parcel(route, size, sequence, stamp_ns)
+        return parcel
+
+    def _parcel(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
+        return QueuedMessage(route, size, sequence & SERIAL_MASK, stamp_ns, self._loop.time())
+
+    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
+        """Send further bytes of an opened message; return how many older messages were dropped to make room."""
+        if self._stream is not None:
+            return self._stream.extend(parcel, data)
+        if self.ended:
+            return 0
+        dropped = self.outbox.extend(parcel, bytes(data))
+        self._on_wanted()
+        return dropped
+
+    def abandon(self, parcel: QueuedMessage) -> None:
+        """Give up a message whose rest will never come."""
+        if self._stream is not None:
+            self._stream.abandon(parcel)
+        elif not self.ended:
+            self.outbox.abandon(parcel)
+
+    def fence(self, route: int, number: int) -> None:
+        """Send a fence after the messages of a route; the peer answers it when all of them have arrived."""
+        frame = Frame(FrameKind.FENCE, route=route, sequence=number, flags=FIRST | LAST).serialize()
+        if self._stream is not None:
+            self._stream.send_mark(frame, route)
+        elif not self.ended:
+            self.outbox.push(frame, route, self._loop.time(), pinned=True)
+            self._on_wanted()
+
+    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+        """Bound the waiting messages of one route; see ``core.outbox``.
+
+        Without ``max_age`` the route is a reliable one: its sender's window bounds it, and the bound on the bytes of
+        all routes drops none of its messages.
+        """
+        self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
+
+    def discard(self, route: int) -> None:
+        """Drop the waiting messages of a route, and its bounds; the route stays open."""
+        self.outbox.discard(route)
+        self._open.pop(route, None)
+        if self._stream is not None:
+            self._stream.pump()
+
+    def close_route(self, route: int) -> int:
+        """Discard the waiting messages of a closed route, and its counts; return the number of messages."""
+        count = self.outbox.discard(route)
+        self._open.pop(route, None)
+        self.outbox.dropped.pop(route, None)
+        self.outbox.expired.pop(route, None)
+        if self._stream is not None:
+            self._stream.pump()
+        return count
+
+
+def _nothing() -> None:
+    """The ``on_wanted`` of a lane that always has a connection, or that has ended."""
+
+
+# The link to one peer: two lanes, each with a connection, and the handlers of the received messages.
+
 
 OnLinkData = Callable[["PeerLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["PeerLink", int, int, int, int, memoryview], None]
@@ -272,3 +430,99 @@ class PeerLink:
             self.mark(FrameKind.FENCED, route, sequence)
         elif self._handlers is not None:
             self._handlers.mark(self, kind, route, sequence)
+
+
+_log = logging.getLogger(__name__)
+
+
+class BulkLanes:
+    """Dials the bulk lanes, again for as long as their links stand.
+
+    Args:
+        connect: Connects to the peer of a link, and begins the handshake; raises ``OSError``.
+        start: Runs a coroutine as a task.
+        rng: Uniform numbers in [0, 1), for jitter.
+        counters: Where failures are counted.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[PeerLink], Coroutine[object, object, None]],
+        start: Callable[[Coroutine[object, object, None], str], asyncio.Task[None]],
+        *,
+        rng: Callable[[], float],
+        counters: Counters,
+    ) -> None:
+        self._connect = connect
+        self._start = start
+        self._rng = rng
+        self._counters = counters
+        self._dials: dict[int, asyncio.Task[None]] = {}
+        self._backoffs: dict[int, Backoff] = {}
+        self._closed = False
+
+    def close(self) -> list[asyncio.Task[None]]:
+        """Dial no more; return the cancelled tasks, to be awaited."""
+        self._closed = True
+        tasks = list(self._dials.values())
+        for task in tasks:
+            task.cancel()
+        return tasks
+
+    def link_up(self, link: PeerLink) -> None:
+        """A link is used with its peer, which may have asked for the lane before."""
+        if link.dialled and link.bulk_wanted:
+            self._dial(link)
+
+    def link_ended(self, link_id: int) -> None:
+        """A link is gone."""
+        self._backoffs.pop(link_id, None)
+
+    def want(self, link: PeerLink) -> None:
+        """A message waits for the bulk lane of a link, here or at the peer that asks for it."""
+        if link.bulk_wanted:
+            return
+        link.bulk_wanted = True
+        if link.dialled:
+            self._dial(link)
+        else:
+            link.mark(FrameKind.LANE, 0, 0)
+
+    def opened(self, link: PeerLink, bulk: Connection) -> None:
+        """A handshake of the lane succeeded."""
+        self._backoffs.pop(link.id, None)
+        link.attach(bulk)
+        _log.debug("= %s: bulk lane (%s)", bulk.name, "dialled" if bulk.dialled else "accepted")
+
+    def ended(self, link: PeerLink, bulk: Connection, reason: str, *, expected: bool) -> None:
+        """A connection ended; ``expected`` says that it was dialled for this link, and its handshake was not done."""
+        if link.bulk_connection is bulk:
+            link.detach(bulk)
+        elif not (link.used and expected):
+            return
+        if link.used:
+            self._counters.add("link.bulk_lost")
+            _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
+            if link.dialled:
+                self._dial(link, self._backoff(link).delay())
+
+    def _dial(self, link: PeerLink, delay: float = 0.0) -> None:
+        if not self._closed and link.used and link.bulk_connection is None and link.id not in self._dials:
+            self._dials[link.id] = task = self._start(self._connected(link, delay), f"bulk {link.name}")
+            task.add_done_callback(lambda _: self._dials.pop(link.id, None))
+
+    async def _connected(self, link: PeerLink, delay: float) -> None:
+        backoff = self._backoff(link)
+        await asyncio.sleep(delay)
+        while link.used:
+            try:
+                await self._connect(link)
+            except OSError as error:
+                self._counters.add("link.bulk_failed")
+                _log.debug("! %s: no bulk lane: %s", link.name, error)
+                await asyncio.sleep(backoff.delay())
+            else:
+                return
+
+    def _backoff(self, link: PeerLink) -> Backoff:
+        return self._backoffs.setdefault(link.id, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))

@@ -14,17 +14,12 @@ from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole
-from rmpa.mesh.handshake import FULL, Lane, Refusal, Refuse
-from rmpa.mesh.io.bulk_lanes import BulkLanes
+from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.connection import Connection
-from rmpa.mesh.io.dialler import Dialler
-from rmpa.mesh.io.link import LinkHandlers, PeerLink
-from rmpa.mesh.io.redials import Redials, is_over
+from rmpa.mesh.io.dial import Dialler, Redials, bound_queue, is_over, tune_bulk, tune_express
+from rmpa.mesh.io.link import BulkLanes, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.io.sockets import bound_queue, tune_bulk, tune_express
-from rmpa.mesh.keepalive import RestPace
-from rmpa.mesh.peering import Peering
-from rmpa.mesh.peering_events import (
+from rmpa.mesh.keepalive import (
     CloseLink,
     Dial,
     LinkDown,
@@ -33,7 +28,9 @@ from rmpa.mesh.peering_events import (
     LinkUp,
     PeeringOutput,
     PeerStatus,
+    RestPace,
 )
+from rmpa.mesh.peering import Peering
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -45,9 +42,9 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Clock
     from rmpa.core.identity import Guid, Identity
-    from rmpa.mesh.handshake import Hello
+    from rmpa.mesh.frames import Hello
     from rmpa.mesh.io.securing import OnJoin, SecuredSocket
-    from rmpa.mesh.peering_events import SocketAddress
+    from rmpa.mesh.keepalive import SocketAddress
     from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.handshake import Refusal, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Refusal, Refuse
 from rmpa.runtime.tls import SecureSocket, TlsHandshake
 from rmpa.trust.certificates import TrustError, TrustReason
 from rmpa.trust.membership import ALPN_JOIN, ALPN_LINK
@@ -29,8 +28,8 @@ from rmpa.trust.membership import ALPN_JOIN, ALPN_LINK
 if TYPE_CHECKING:
     from rmpa.core.counters import Clock, RefusalLog
     from rmpa.core.identity import Identity
-    from rmpa.mesh.handshake import Hello
-    from rmpa.mesh.peering_events import SocketAddress
+    from rmpa.mesh.frames import Hello
+    from rmpa.mesh.keepalive import SocketAddress
     from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)

@@ -22,10 +22,9 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import PeerView, Stranger
     from rmpa.discovery.discovery import Discovery
-    from rmpa.mesh.io.lane import LaneSender
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.link import LaneSender, PeerLink
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.peering_events import PeerStatus
+    from rmpa.mesh.keepalive import PeerStatus
     from rmpa.runtime.stream import Stream
 
 _DENY: Final = {"services": "services.deny"}

@@ -21,8 +21,7 @@ from rmpa.ros import limits as ros_limits
 from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
-    from rmpa.mesh.io.lane import LaneSender
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.link import LaneSender, PeerLink
     from rmpa.runtime.tls import Buffer
 
 _LENGTH: Final = 4

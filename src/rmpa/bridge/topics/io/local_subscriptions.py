@@ -13,7 +13,7 @@ from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.resume_table import ResumeTable
+from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription

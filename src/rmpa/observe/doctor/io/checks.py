@@ -15,7 +15,7 @@ from rmpa.config.read import load_settings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.discovery.network import choose, list_interfaces
-from rmpa.mesh.io.sockets import may_use_bbr, repeats_quickly
+from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.agents import judge_agents

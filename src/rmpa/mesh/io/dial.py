@@ -1,0 +1,335 @@
+"""Connects to peers: one TCP connect, and the race of all addresses of a peer."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import socket
+import struct
+import sys
+import termios
+from typing import TYPE_CHECKING, Final
+
+from rmpa.mesh import limits
+from rmpa.mesh.frames import Lane
+from rmpa.runtime.accept import DESCRIPTORS, Use
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine, Sequence
+
+    from rmpa.config.settings import LaneSettings
+    from rmpa.core.counters import Counters
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.securing import SecuredSocket
+    from rmpa.mesh.keepalive import SocketAddress
+
+
+# Options and kernel statistics of the connections' sockets.
+
+
+_RTO_MIN_US: Final = 45
+_REPETITION: Final = (
+    (16, 1, 0),  # TCP_THIN_LINEAR_TIMEOUTS, Linux 2.6.34
+    (44, limits.EXPRESS_RTO_MAX_MS, 120_000),  # TCP_RTO_MAX_MS, 6.15
+    (_RTO_MIN_US, limits.EXPRESS_RTO_MIN_US, 200_000),  # TCP_RTO_MIN_US, 6.18
+)
+"""Options with their values on the express lane, and Linux's own; Python's ``socket`` lacks these numbers of
+linux/tcp.h."""
+_BBR: Final = b"bbr"
+_INFO_BYTES: Final = 256
+_MIN_RTT: Final = struct.Struct("=148xI")  # microseconds, in struct tcp_info of linux/tcp.h
+_DELIVERY_RATE: Final = struct.Struct("=160xQ")  # bytes a second, since Linux 4.9
+
+
+def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
+    """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority.
+
+    Lost packets are repeated sooner where the kernel has options for it: TCP waits 0.2 s before the first repetition,
+    and each time twice as long as before.
+    """
+    _tune(sock, limits.EXPRESS_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
+    for name, quick, _ in _REPETITION:
+        _try(sock, name, quick)
+
+
+def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
+    """Set up the bulk lane: the shortest kernel queue, a low priority, congestion control by BBR if it is permitted.
+
+    BBR keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them until packets
+    are lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a connection is made,
+    so this is called again then.
+    """
+    _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
+    for name, _, usual in _REPETITION:  # the lane of an accepted connection is known late
+        _try(sock, name, usual)
+    _try(sock, socket.TCP_CONGESTION, _BBR)
+
+
+def bound_queue(sock: socket.socket) -> None:
+    """Bound what a bulk lane without BBR has on the way: two round trips and ``limits.BULK_QUEUE`` at its rate.
+
+    To be called from time to time while it sends: where the window itself was the bound, it grows.
+    """
+    try:
+        if sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0") == _BBR:
+            return
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        rate: int = _DELIVERY_RATE.unpack_from(info)[0]
+        window = round(rate * (2e-6 * _MIN_RTT.unpack_from(info)[0] + limits.BULK_QUEUE))
+        if not rate:
+            return
+        window = max(limits.BULK_WINDOW_MIN, min(window, limits.BULK_WINDOW_MAX))
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, window // 2)  # the kernel doubles it
+    except (OSError, struct.error):
+        return
+
+
+def repeats_quickly() -> bool:
+    """Whether this kernel lets the express lane repeat lost packets within milliseconds."""
+    with socket.socket() as sock:
+        return _try(sock, _RTO_MIN_US, limits.EXPRESS_RTO_MIN_US)
+
+
+def may_use_bbr() -> bool:
+    """Whether this process may use BBR for the bulk lane."""
+    with socket.socket() as sock:
+        return _try(sock, socket.TCP_CONGESTION, _BBR)
+
+
+def unacknowledged(sock: socket.socket) -> int:
+    """Bytes written to a socket that the remote kernel has not acknowledged, unsent ones included; 0 if closed."""
+    if sock.fileno() < 0:
+        return 0
+    try:
+        return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    except OSError:
+        return 0
+
+
+def limit_segments(sock: socket.socket, counters: Counters) -> None:
+    """Before connecting: let both sides send packets that fit through usual tunnels, whatever the path's MTU is."""
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, limits.SEGMENT_BYTES + limits.TIME_STAMP_BYTES)
+    except OSError:
+        counters.add("link.option_refused")
+
+
+def _try(sock: socket.socket, name: int, value: int | bytes) -> bool:
+    """Set an option of TCP that many kernels lack or do not permit."""
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, name, value)
+    except OSError:
+        return False
+    return True
+
+
+def _tune(sock: socket.socket, unsent: int, dscp: int, priority: int, counters: Counters) -> None:
+    """Set the options of a lane's socket.
+
+    IP_TOS comes before SO_PRIORITY because setting it sets the priority too. An option that the system refuses
+    only costs quality of service: it is counted as ``link.option_refused`` and the link runs on.
+    """
+    options = (
+        (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(limits.LINK_UNACKED * 1000)),
+        (socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, unsent),
+        (socket.IPPROTO_IP, socket.IP_TOS, dscp << 2),
+        (socket.SOL_SOCKET, socket.SO_PRIORITY, priority),
+    )
+    for level, name, value in options:
+        try:
+            sock.setsockopt(level, name, value)
+        except OSError:
+            counters.add("link.option_refused")
+
+
+class Dialler:
+    """Opens the TCP connections that this side dials.
+
+    Args:
+        lanes: The options of the lanes' sockets.
+        counters: Where options that the system refuses are counted.
+    """
+
+    def __init__(self, lanes: LaneSettings, counters: Counters) -> None:
+        self._lanes = lanes
+        self._counters = counters
+        self._attempts: set[asyncio.Task[socket.socket]] = set()
+
+    async def connect(
+        self, endpoint: SocketAddress, lane: Lane, within: float = limits.DIAL_TIMEOUT
+    ) -> socket.socket:
+        """Connect once, for one lane.
+
+        Raises:
+            OSError: It failed, or took longer than ``within`` seconds (``TimeoutError``).
+        """
+        sock = DESCRIPTORS.open_socket(Use.LINK, what=f"a link to {endpoint[0]}:{endpoint[1]}")
+        try:
+            (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self._counters)
+            if not endpoint[0].startswith("127."):
+                limit_segments(sock, self._counters)
+            async with asyncio.timeout(within):
+                await asyncio.get_running_loop().sock_connect(sock, endpoint)
+        except BaseException:
+            sock.close()
+            raise
+        return sock
+
+    async def dial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
+        """Connect for the express lane where a peer answers first; raises as ``_race``."""
+        return await self._race(endpoints, self._connect_repeatedly)
+
+    async def redial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
+        """The same with one short attempt at each endpoint, for a peer that was linked until now."""
+        return await self._race(endpoints, self._connect_briefly)
+
+    def close(self) -> list[asyncio.Task[socket.socket]]:
+        """Cancel all attempts; return them, to be awaited."""
+        for task in self._attempts:
+            task.cancel()
+        return list(self._attempts)
+
+    async def _connect_briefly(self, endpoint: SocketAddress) -> socket.socket:
+        return await self.connect(endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
+
+    async def _connect_repeatedly(self, endpoint: SocketAddress) -> socket.socket:
+        """Connect; a lost SYN is repeated by new attempts, because TCP waits a second."""
+        *short, last = limits.DIAL_ATTEMPTS
+        for within in short:
+            with contextlib.suppress(TimeoutError):
+                return await self.connect(endpoint, Lane.EXPRESS, within)
+        return await self.connect(endpoint, Lane.EXPRESS, last)
+
+    async def _race(
+        self,
+        endpoints: Sequence[SocketAddress],
+        attempt: Callable[[SocketAddress], Coroutine[object, object, socket.socket]],
+    ) -> tuple[socket.socket, SocketAddress]:
+        """Connect to the endpoint that answers first (RFC 8305).
+
+        The next endpoint has its turn when the one before it failed, or was silent for ``limits.DIAL_STAGGER``.
+
+        Raises:
+            OSError: No endpoint answers; the error is the one that came first.
+        """
+        left = list(endpoints)
+        if len(left) == 1:
+            return await attempt(left[0]), left[0]
+        running: dict[asyncio.Task[socket.socket], SocketAddress] = {}
+        first: OSError | None = None
+        try:
+            while left or running:
+                if left:
+                    endpoint = left.pop(0)
+                    task = asyncio.get_running_loop().create_task(attempt(endpoint))
+                    running[task] = endpoint
+                    self._attempts.add(task)
+                    task.add_done_callback(self._attempts.discard)
+                pause = limits.DIAL_STAGGER if left else None
+                done, _ = await asyncio.wait(running, timeout=pause, return_when=asyncio.FIRST_COMPLETED)
+                for task in [task for task in running if task in done]:
+                    endpoint = running.pop(task)
+                    try:
+                        return task.result(), endpoint
+                    except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
+                        first = first if first is not None else error
+        finally:
+            for task in running:  # not awaited: the link does not wait for the slower attempts
+                task.add_done_callback(_close_late)
+                task.cancel()
+        raise first if first is not None else OSError(errno.EHOSTUNREACH, os.strerror(errno.EHOSTUNREACH))
+
+
+def _close_late(task: asyncio.Task[socket.socket]) -> None:
+    """Close the socket of an attempt that succeeded although another one was faster."""
+    if not task.cancelled() and task.exception() is None:
+        task.result().close()
+
+
+# Replaces silent links by new connections to their peers, because TCP retransmits more and more rarely.
+
+
+_log = logging.getLogger(__name__)
+
+
+class Redials:
+    """One attempt for each silent link, repeated until the peer answers on either connection.
+
+    Args:
+        dialler: Opens the connections.
+        start: ``(work, name)``: begins a task that is not awaited.
+        alive: Whether bytes were received on a link lately.
+        endpoints: Where the peer of a link may be reached.
+        secure: Does the TLS handshake of a dialled connection in a secured mesh.
+        opened: ``(link, sock, endpoint, secured)``: a new connection to the peer of a link.
+    """
+
+    def __init__(
+        self,
+        dialler: Dialler,
+        *,
+        start: Callable[[Coroutine[object, object, None], str], asyncio.Task[None]],
+        alive: Callable[[int], bool],
+        endpoints: Callable[[PeerLink], list[SocketAddress]],
+        secure: Callable[[socket.socket], Awaitable[SecuredSocket | None]],
+        opened: Callable[[PeerLink, socket.socket, SocketAddress, SecuredSocket | None], None],
+    ) -> None:
+        self._dialler = dialler
+        self._start = start
+        self._alive = alive
+        self._endpoints = endpoints
+        self._secure = secure
+        self._opened = opened
+        self._tasks: dict[int, asyncio.Task[None]] = {}
+
+    def begin(self, link: PeerLink) -> None:
+        """Try to reach the peer of a silent link by a new connection, unless that is done already."""
+        if link.id not in self._tasks:
+            self._tasks[link.id] = task = self._start(self._redial(link), f"redial {link.name}")
+            task.add_done_callback(lambda _: self._tasks.pop(link.id, None))
+
+    def close(self) -> list[asyncio.Task[None]]:
+        """Cancel all attempts; return their tasks."""
+        tasks = list(self._tasks.values())
+        for task in tasks:
+            task.cancel()
+        return tasks
+
+    async def _redial(self, link: PeerLink) -> None:
+        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
+        while link.used and not self._alive(link.id):
+            try:
+                sock, endpoint = await self._dialler.redial(self._endpoints(link))
+            except OSError as error:
+                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+                continue
+            if is_over(link):
+                # The link and its socket ended meanwhile: the peering machine decides on the next dial.
+                sock.close()
+                return
+            if self._alive(link.id) or not unacknowledged(link.connection.sock):
+                _log.debug("= %s: silent, but not for want of a way to it", link.name)
+                sock.close()
+                return
+            try:
+                secured = await self._secure(sock)
+            except OSError as error:
+                _log.debug("! %s: silent, and no TLS handshake: %s", link.name, str(error) or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+                continue
+            if is_over(link):
+                sock.close()
+                return
+            self._opened(link, sock, endpoint, secured)
+            return
+
+
+def is_over(link: PeerLink) -> bool:
+    """Whether a link was replaced or has ended; to be checked after an ``await``."""
+    return not link.used
