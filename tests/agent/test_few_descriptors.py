@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.session import proxy_nodes
+from rmpa.bridge import proxies as proxy_nodes
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.bridge.io.node_presence import NODES, NodePresence
+from rmpa.bridge.nodes import NODES, NodePresence
 from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits

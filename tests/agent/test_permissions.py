@@ -15,10 +15,9 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.permission_notes import permission_notes
-from rmpa.bridge.io.node_requests import INFO, LIST, PING
-from rmpa.bridge.io.proxy_kills import KILL
-from rmpa.bridge.params import transfer
-from rmpa.bridge.session.peer_session import PeerSession
+from rmpa.bridge.nodes import INFO, KILL, LIST, PING
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.sessions import PeerSession
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import NodeSettings, ParamSettings, ServiceSettings, Settings, TrustSettings
 from rmpa.core.contract import ContractRule, Transport

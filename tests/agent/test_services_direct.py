@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.policy import Needs
 from rmpa.config.settings import ServiceRule, ServiceSettings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import ServiceInfo
 

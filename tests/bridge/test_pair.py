@@ -35,7 +35,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.settings import PolicySettings
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa.bridge import limits
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.cli.trust import check
 from rmpa.config.peer_rules import Access, PermissionRule
 from rmpa.config.read import load_settings

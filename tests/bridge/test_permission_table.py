@@ -12,7 +12,7 @@ import rmpa
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.bridge.permission_gate import Needs
+    from rmpa.bridge.policy import Needs
 
 SOURCE: Final = Path(rmpa.__file__).parent
 PAGE: Final = Path(__file__).parents[2] / "docs" / "security.md"

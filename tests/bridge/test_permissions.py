@@ -19,13 +19,11 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.naming import Names
-from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.actions import EndRoute, LocalService, ServiceAbout
-from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.policy import PermissionGate, Policy
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.bodies import EndRoute, LocalService, ServiceAbout
+from rmpa.bridge.services.exports import ServiceExports, ServiceRules
 from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.peer_rules import Access, Effect, PermissionRule

@@ -14,13 +14,10 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.relay import LinkedPeer, Relay, RelayPaths, may_have
-from rmpa.bridge.services.actions import ExportAction, ImportAction, LocalService, Provide, Withdraw
-from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy, Relay, RelayPaths, may_have
+from rmpa.bridge.services.bodies import ExportAction, ImportAction, LocalService, Provide, Withdraw
+from rmpa.bridge.services.exports import ServiceExports, ServiceRules
 from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import PolicySettings, ServiceSettings

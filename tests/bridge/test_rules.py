@@ -35,11 +35,11 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.proxies import Names
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.settings import PeerRule, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 

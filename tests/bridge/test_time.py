@@ -6,8 +6,8 @@ import pytest
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import Advertise, Mismatch, Source, TopicOffer
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.proxies import Names
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import PolicySettings, TimeSettings

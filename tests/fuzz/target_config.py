@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 
 from rmpa.bridge.messages import OpenRoute, decode, encode
-from rmpa.bridge.naming import PeerNames
+from rmpa.bridge.proxies import PeerNames
 from rmpa.config import limits
 from rmpa.config.peer_rules import PEER_RULES
 from rmpa.config.read import SCHEMAS, parse_config

@@ -6,8 +6,8 @@ import json
 
 import msgspec
 
-from rmpa.bridge.direct.conditions import Grant, read_reply, reply_of
-from rmpa.bridge.direct.requests import DirectAsk, read_ask, read_want, write
+from rmpa.bridge.direct.grants import DirectAsk, read_ask, read_want, write
+from rmpa.bridge.direct.nodes import Grant, read_reply, reply_of
 from rmpa.core.contract import Contract
 from rmpa.core.errors import RemoteProtocolError
 

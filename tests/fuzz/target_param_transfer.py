@@ -7,11 +7,11 @@ from typing import Any, cast
 
 import msgspec
 
-from rmpa.bridge.data.io.link_time import LinkTime
+from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import Message, Request, Response
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
-from rmpa.bridge.session.peer_rpc import LargeMessages
+from rmpa.bridge.rpc import LargeMessages
 from rmpa.core.errors import RmpaError
 from rmpa.ros.master.parameters import leaves
 from tests.bridge.services.io.test_calls import Wire

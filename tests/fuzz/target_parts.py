@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.data.io.import_flow import ImportFlow
-from rmpa.bridge.data.io.link_time import LinkTime
+from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity

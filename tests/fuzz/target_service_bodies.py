@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.bridge.services.io.bodies import BodyReceiver, Budget
+from rmpa.bridge.services.bodies import BodyReceiver, Budget
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.policy import PermissionGate
 from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters

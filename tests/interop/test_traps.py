@@ -16,10 +16,9 @@ from lab.bed.processes import eventually
 from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
-from rmpa.bridge.session.peer_proxies import PeerProxies
-from rmpa.bridge.session.peer_session import PeerSession
-from rmpa.bridge.session.proxy_nodes import ProxyNodes
-from rmpa.bridge.topics.io.peer_topics import PeerTopics
+from rmpa.bridge.proxies import PeerProxies, ProxyNodes
+from rmpa.bridge.sessions import PeerSession
+from rmpa.bridge.topics.peer_topics import PeerTopics
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.direct.nodes import Condition, Grant, Unmet
 from rmpa.bridge.messages import Source
-from rmpa.bridge.topics.io import direct_importer
-from rmpa.bridge.topics.io.direct_exporter import DirectExporter
-from rmpa.bridge.topics.io.direct_importer import DirectImporter
+from rmpa.bridge.topics import direct as direct_importer
+from rmpa.bridge.topics.direct import DirectImporter
+from rmpa.bridge.topics.local import DirectExporter
 from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import UnreachableError

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 from unittest.mock import patch
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.direct.requests import Want
+from rmpa.bridge.direct.grants import Want
+from rmpa.bridge.direct.nodes import Condition
 from rmpa.bridge.messages import Source
 from rmpa.ros.master.parameters import RegistrationKind
 from tests.bridge.io.virtual import VirtualLoop, run

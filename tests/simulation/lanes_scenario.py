@@ -38,8 +38,8 @@ class LanesScenario(MeshScenario):
         """As ``MeshScenario``, and topics change their lanes after a few messages."""
         with (
             super().simulated(),
-            mock.patch("rmpa.bridge.data.io.export_flow.time", self.world),
-            mock.patch("rmpa.bridge.data.io.import_flow.time", self.world),
+            mock.patch("rmpa.bridge.data.export.time", self.world),
+            mock.patch("rmpa.bridge.data.reception.time", self.world),
             mock.patch.multiple(limits, EXPRESS_AGAIN_MESSAGES=3, EXPRESS_AGAIN_AFTER=0.1),
         ):
             yield

@@ -10,10 +10,8 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.data.io.export_flow import ExportFlow
-from rmpa.bridge.data.io.import_flow import ImportFlow
-from rmpa.bridge.data.io.link_time import LinkTime
-from rmpa.bridge.data.io.route_sender import ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
+from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.mesh.frames import FrameKind
 from tests.simulation.mesh_peer import MeshPeer
@@ -21,7 +19,7 @@ from tests.simulation.mesh_peer import MeshPeer
 if TYPE_CHECKING:
     import random
 
-    from rmpa.bridge.data.io.route_sender import RouteSender
+    from rmpa.bridge.data.export import RouteSender
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.keepalive import LinkDown
 

@@ -14,7 +14,7 @@ import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.data.quality import QosEventKind
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.web import limits
 from rmpa.web.metrics import EVENT_KINDS, exposition, metrics

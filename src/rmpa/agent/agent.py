@@ -19,16 +19,13 @@ from rmpa.agent.reload import Reloader
 from rmpa.agent.trust import AgentTrust, open_membership
 from rmpa.agent.trust_operations import PlainOperations, TrustOperations
 from rmpa.agent.web_process import WebProcess, web_command, web_environment
-from rmpa.bridge.io.bridge import Bridge
-from rmpa.bridge.io.node_presence import NodePresence
-from rmpa.bridge.io.node_requests import NodeRequests
-from rmpa.bridge.io.twin_watch import TwinWatch
-from rmpa.bridge.naming import Names
-from rmpa.bridge.params.io.part import Params
-from rmpa.bridge.permission_gate import Needs
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.io.part import Services
-from rmpa.bridge.services.rules import ServiceRules
+from rmpa.bridge.bridge import Bridge, TwinWatch
+from rmpa.bridge.nodes import NodePresence, NodeRequests
+from rmpa.bridge.params.follower import Params
+from rmpa.bridge.policy import Needs, Policy
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.exports import ServiceRules
+from rmpa.bridge.services.part import Services
 from rmpa.core.counters import Counters
 from rmpa.discovery.network import list_interfaces
 from rmpa.observe.io.control_operations import ControlOperations

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ipaddress import IPv4Address
 
     from rmpa.agent.trust import AgentTrust
-    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.bridge import Bridge
     from rmpa.config.settings import Settings
     from rmpa.discovery.beacon import Event
     from rmpa.discovery.network import Interface

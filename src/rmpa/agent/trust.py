@@ -9,8 +9,8 @@ import os
 import time
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.permission_gate import Needs
-from rmpa.bridge.session.part import Part
+from rmpa.bridge.policy import Needs
+from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError, UnreachableError
@@ -21,8 +21,8 @@ from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Clock
     from rmpa.trust.authority import MeshAuthority

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.agent.trust import AgentTrust
-    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.bridge import Bridge
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.trust.authority import MeshAuthority

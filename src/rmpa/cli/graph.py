@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_node, proxied_peer
+from rmpa.bridge.proxies import proxied_node, proxied_peer
 from rmpa.cli.output import printable, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError

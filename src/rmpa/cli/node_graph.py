@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.cli.graph import GraphName, read_graph, read_namespace
 from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
 from rmpa.cli.options import GraphOptions, completes, graph_options

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.bridge.proxy_names import proxied_node, proxied_peer
+from rmpa.bridge.proxies import proxied_node, proxied_peer
 from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.output import warn
 from rmpa.core.errors import PeerRefused, RmpaError

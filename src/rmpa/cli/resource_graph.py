@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_node, proxied_peer
-from rmpa.bridge.relay import OUTSIDE_GUID
+from rmpa.bridge.policy import OUTSIDE_GUID
+from rmpa.bridge.proxies import proxied_node, proxied_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name
 from rmpa.cli.output import printable
 from rmpa.cli.stream import with_node

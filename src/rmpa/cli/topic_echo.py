@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.proxies import proxied_node
 from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, warn_unpublished
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.options import GraphOptions, completes, graph_options

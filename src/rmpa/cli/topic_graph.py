@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.cli.graph import (
     origin_json,
     origin_text,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.cli.graph import read_name, require_peer, warn_unpublished
 from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import print_json, size

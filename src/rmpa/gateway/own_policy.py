@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.rules import ServiceRules
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.exports import ServiceRules
 from rmpa.gateway.neighbour import SourceKind
 
 if TYPE_CHECKING:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.permission_gate import OPEN_GATE
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.trust.documents import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.bridge.permission_gate import PermissionGate
+    from rmpa.bridge.policy import PermissionGate
     from rmpa.config.peer_rules import Access
     from rmpa.trust.documents import PermissionDecision
 

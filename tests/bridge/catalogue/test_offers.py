@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
+from rmpa.bridge.offers import CataloguePeer, OfferCatalogue
 
 Peer = CataloguePeer[str, int, str, str]
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Send
-from rmpa.bridge.catalogue.pacing import Pacing
+from rmpa.bridge.actions import Pacing, Send
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import PolicySettings

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.actions import ImportAction, LocalService, Provide, Withdraw
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.bodies import ImportAction, LocalService, Provide, Withdraw
 from rmpa.bridge.services.exports import ServiceExports
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.topics.imports import Imports

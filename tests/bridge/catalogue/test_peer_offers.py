@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.catalogue.peer_limits import NodePlaces
-from rmpa.bridge.catalogue.peer_offers import Change, PeerOffers
+from rmpa.bridge.offers import Change, NodePlaces, PeerOffers
 
 if TYPE_CHECKING:
     import pytest

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.data.downsampling import Downsampler
+from rmpa.bridge.data.route import Downsampler
 from rmpa.config import limits
 
 RATES = st.sampled_from([limits.CONTRACT_RATE_MIN, 0.5, 1.0, 10.0, 30.0, 1000.0, limits.CONTRACT_RATE_MAX])

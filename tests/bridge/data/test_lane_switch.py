@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rmpa.bridge.data.lane_switch import BULK, EXPRESS, LaneSwitch
+from rmpa.bridge.data.route import BULK, EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, Priority
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane

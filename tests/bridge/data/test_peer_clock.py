@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.peer_clock import ClockEstimate, PeerClockHistory
+from rmpa.bridge.data.quality import ClockEstimate, PeerClockHistory
 from rmpa.mesh import limits as mesh_limits
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.qos_events import QosEvent, QosEventKind, QosWatch
+from rmpa.bridge.data.quality import QosEvent, QosEventKind, QosWatch
 from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract, Liveliness
 

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.peer_clock import PeerClockHistory
-from rmpa.bridge.data.quality import Quality
+from rmpa.bridge.data.quality import PeerClockHistory, Quality
 from rmpa.core.counters import SampleSummary
 from rmpa.mesh import limits as mesh_limits
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, read_unmet, reply_of, unmet_by_trust
-from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, read_reply, read_unmet, reply_of, unmet_by_trust
+from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.trust.documents import Permissions

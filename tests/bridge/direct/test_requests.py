@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.direct.requests import DirectAsk, Want, read_ask, read_want, write
+from rmpa.bridge.direct.grants import DirectAsk, Want, read_ask, read_want, write
 from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RemoteProtocolError

@@ -85,8 +85,8 @@ def running(clock: Clock) -> Iterator[Clock]:
     try:
         wall = SimpleNamespace(time_ns=clock.wall_ns)
         with (
-            mock.patch("rmpa.bridge.data.io.export_flow.time", wall),
-            mock.patch("rmpa.bridge.data.io.import_flow.time", wall),
+            mock.patch("rmpa.bridge.data.export.time", wall),
+            mock.patch("rmpa.bridge.data.reception.time", wall),
         ):
             yield clock
     finally:

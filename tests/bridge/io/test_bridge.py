@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.io.bridge import Bridge
+from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.messages import Advertise, AdvertiseServices, TopicOffer, encode, op_of
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.session.part import Part
+from rmpa.bridge.sessions import Part
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PolicySettings
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import ContractRule, History, Reliability
 from rmpa.mesh import limits as mesh_limits

@@ -14,7 +14,7 @@ from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
-    from rmpa.bridge.data.io.import_flow import ImportFlow
+    from rmpa.bridge.data.reception import ImportFlow
 
 BIG = Source("/big", "/one")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Self, cast
 from unittest import mock
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.io.bridge import Bridge
+from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.policy import Policy
 from rmpa.config.settings import PolicySettings
 from rmpa.core import limits as core_limits
@@ -23,7 +23,7 @@ from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Spe
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.core.contract import ContractRule
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
@@ -322,10 +322,8 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
             stack.enter_context(mock.patch.object(module, name, value))
         for where in ("session.proxy_nodes", "io.bridge"):
             stack.enter_context(mock.patch(f"rmpa.bridge.{where}.SlaveNode", Node))
-        stack.enter_context(mock.patch("rmpa.bridge.session.proxy_nodes.is_loopback", return_value=False))
-        stack.enter_context(
-            mock.patch("rmpa.bridge.topics.io.local_subscriptions.PublisherConnection", PublisherConnection)
-        )
+        stack.enter_context(mock.patch("rmpa.bridge.proxies.is_loopback", return_value=False))
+        stack.enter_context(mock.patch("rmpa.bridge.topics.local.PublisherConnection", PublisherConnection))
         for flow in ("export_flow", "import_flow"):
             wall = SimpleNamespace(time_ns=loop.time_ns)
             stack.enter_context(mock.patch(f"rmpa.bridge.data.io.{flow}.time", wall))

@@ -14,7 +14,7 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.actions import EndRoute, LocalService, Probe, ServerGone, ServeRoute, ServiceAbout
+from rmpa.bridge.services.bodies import EndRoute, LocalService, Probe, ServerGone, ServeRoute, ServiceAbout
 from rmpa.bridge.services.exports import ServiceExports
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings

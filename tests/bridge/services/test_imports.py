@@ -16,9 +16,9 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.actions import EndedService, ForgetAbout, OpenedService, Provide, ServiceAbout, Withdraw
+from rmpa.bridge.services.bodies import EndedService, ForgetAbout, OpenedService, Provide, ServiceAbout, Withdraw
+from rmpa.bridge.services.exports import ServiceRouteState
 from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules

@@ -21,7 +21,7 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.services.actions import (
+from rmpa.bridge.services.bodies import (
     EndedService,
     EndRoute,
     ExportAction,
@@ -36,9 +36,8 @@ from rmpa.bridge.services.actions import (
     ServiceAbout,
     Withdraw,
 )
-from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState
 from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.services.remote_service import ServiceRouteState
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules

@@ -9,8 +9,8 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Describe, Disconnect, Warn
+from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import Advertise, Description, Source, encode, op_of
-from rmpa.bridge.session.graph_driver import GraphDriver
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.actions import Action
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.sessions import PeerSession
 
 ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
 

@@ -6,7 +6,7 @@ import asyncio
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.session.peer_proxies import PeerProxies, ProxyCallbacks
+from rmpa.bridge.proxies import PeerProxies, ProxyCallbacks
 
 if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.session.part import Part
-from rmpa.bridge.session.peer_session import PeerSession, PeerState
-from rmpa.bridge.session.peer_sessions import PeerSessions
+from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.sessions import Part, PeerSession, PeerSessions, PeerState
 from rmpa.config.settings import TrustSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import psutil
 
-from rmpa.bridge.session.proxy_nodes import ProxyNodes
+from rmpa.bridge.proxies import ProxyNodes
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.topics.audience import audience, compares_names, is_watched
+from rmpa.bridge.topics.subscribers import audience, compares_names, is_watched
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.bridge.proxies import Names
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import LimitSettings, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport

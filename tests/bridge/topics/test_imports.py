@@ -17,10 +17,10 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.proxies import Names
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.remote_topic import TRANSITIONS, RouteState
+from rmpa.bridge.topics.routes import TRANSITIONS, RouteState
 from rmpa.config.settings import PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability, Transport
 

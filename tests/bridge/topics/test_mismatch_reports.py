@@ -9,7 +9,7 @@ import pytest
 
 from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import Mismatch, Source
-from rmpa.bridge.topics.mismatch_reports import MismatchReports
+from rmpa.bridge.topics.subscribers import MismatchReports
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.topics.mismatches import Mismatches
+from rmpa.bridge.topics.subscribers import Mismatches
 
 CMD = Source("/cmd", "/joy")
 POSE = Source("/pose", "/base")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.relay import OUTSIDE_GUID, is_outside
+from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
 from rmpa.gateway.graph.origins import foreign_origin, site_instance
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import rules as transfer
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway.sites.io.param_exports import SiteParamExports
 from rmpa.gateway.sites.io.param_imports import SiteParamImports

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.bridge.policy import PermissionGate, Policy, PolicyDecision
 from rmpa.config.peer_rules import Access, PermissionRule, PolicySettings
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.bridge.permission_gate import PermissionGate
+from rmpa.bridge.policy import PermissionGate
 from rmpa.config.peer_rules import Access, PermissionRule
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings

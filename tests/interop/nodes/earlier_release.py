@@ -4,8 +4,8 @@ import runpy
 import sys
 from typing import Any
 
-from rmpa.bridge.session.peer_rpc import PeerRpc
-from rmpa.bridge.topics.io.direct_importer import DirectImporter
+from rmpa.bridge.rpc import PeerRpc
+from rmpa.bridge.topics.direct import DirectImporter
 
 DirectImporter.kind = "earlier"  # what nobody asks for is not answered
 _on_request = PeerRpc.on_request

@@ -14,7 +14,7 @@ from typing import Any
 
 from hostile_peer import Link, say
 
-from rmpa.bridge.direct.requests import DirectAsk, write
+from rmpa.bridge.direct.grants import DirectAsk, write
 from rmpa.bridge.messages import Advertise, TopicOffer, encode
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.identity import Guid

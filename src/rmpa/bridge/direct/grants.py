@@ -8,22 +8,103 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, reply_of, unmet_by_trust
-from rmpa.bridge.direct.io.nodes import end_from
-from rmpa.bridge.direct.requests import Want, read_ask, read_want
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, end_from, reply_of, unmet_by_trust
+from rmpa.bridge.messages import check_contract, is_crossing_name
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.direct.requests import DirectAsk
-    from rmpa.bridge.session.peer_rpc import PeerRpc
-    from rmpa.bridge.session.peer_session import PeerSession
-    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.core.contract import Contract
     from rmpa.core.counters import Counters
+
+
+# The arguments of the requests and notifications about direct transport, as JSON.
+#
+# Topics and services have the same three messages: ``direct.topic`` or ``direct.service`` asks, ``…_again`` makes
+# the
+# asking side ask again, ``…_release`` gives a grant back. docs/design/protocol.md has examples.
+
+
+class Want(NamedTuple):
+    """What is to be reached directly.
+
+    Args:
+        name: The topic or service, by its name on the wire.
+        node: The node that publishes or provides it.
+        user: The subscribing node; empty: a service, for every node of the asking module.
+    """
+
+    name: str
+    node: str
+    user: str = ""
+
+
+class DirectAsk(msgspec.Struct, frozen=True, omit_defaults=True):
+    """May this be reached directly?
+
+    Args:
+        name: As in ``Want``.
+        node: As in ``Want``.
+        user: As in ``Want``.
+        contract: What the subscriber's module asks for; topics only.
+        broken: Whether an earlier connection ended by itself, so that the publisher may be dead.
+    """
+
+    name: str
+    node: str
+    user: str = ""
+    contract: Contract | None = None
+    broken: bool = False
+
+    @property
+    def want(self) -> Want:
+        """What is asked for."""
+        return Want(self.name, self.node, self.user)
+
+
+def write(asked: DirectAsk) -> dict[str, Any]:
+    """The arguments as values that JSON can represent."""
+    values: dict[str, Any] = msgspec.to_builtins(asked)
+    return values
+
+
+def read_ask(args: dict[str, Any]) -> DirectAsk:
+    """Read and validate a request; it is about a topic if it has a user and a contract.
+
+    Raises:
+        RemoteProtocolError: A name or a value is invalid.
+    """
+    try:
+        found = msgspec.convert(args, DirectAsk)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise RemoteProtocolError(f"direct transport: {error}") from error
+    if bool(found.user) != (found.contract is not None):
+        raise RemoteProtocolError("direct transport: a subscriber has a contract, and a service has neither")
+    for name in found.want if found.user else found.want[:2]:
+        if not is_crossing_name(name):
+            raise RemoteProtocolError(f"direct transport: {name[:200]!r} is not a global ROS name")
+    if found.contract is not None:
+        check_contract(found.contract, found.name)
+    return found
+
+
+def read_want(args: dict[str, Any]) -> Want:
+    """Read and validate a notification; errors as ``read_ask``."""
+    names = args.get("name"), args.get("node"), args.get("user", "")
+    for name in names if names[2] else names[:2]:
+        if not isinstance(name, str) or not is_crossing_name(name):
+            raise RemoteProtocolError(f"direct transport: {str(name)[:200]!r} is not a global ROS name")
+    return Want(*map(str, names))
+
 
 _log = logging.getLogger(__name__)
 _GIVEN_UP = Unmet(Condition.AGENT, "it was given up meanwhile")

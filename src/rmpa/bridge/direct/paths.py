@@ -14,19 +14,18 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, read_reply
-from rmpa.bridge.direct.requests import DirectAsk, Want, read_want, write
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
+from rmpa.bridge.direct.grants import DirectAsk, Want, read_want, write
+from rmpa.bridge.direct.nodes import NO_LINK, Condition, Grant, Unmet, read_reply
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
 
-    from rmpa.bridge.session.peer_rpc import PeerRpc
-    from rmpa.bridge.session.peer_session import PeerSession
-    from rmpa.bridge.session.peer_sessions import PeerSessions
+    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.core.contract import Contract
     from rmpa.core.counters import Counters
 

@@ -11,11 +11,11 @@ and what servers said of their services; it gets back actions. A peer opens a se
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
-from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue, Portion
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -25,9 +25,10 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.relay import may_have
-from rmpa.bridge.services.actions import (
+from rmpa.bridge.offers import CataloguePeer, OfferCatalogue, Portion
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, PolicyDecision, is_own, may_have
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.bodies import (
     EndRoute,
     ExportAction,
     LocalService,
@@ -36,14 +37,176 @@ from rmpa.bridge.services.actions import (
     ServeRoute,
     ServiceAbout,
 )
+from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.services.rules import ServiceRules
+    from rmpa.bridge.messages import Origin
+    from rmpa.bridge.policy import Policy
+    from rmpa.config.settings import ServiceRule, ServiceSettings
+    from rmpa.core.contract import Transport
+
+
+# One service of one peer, and the states in which it can be called or not. Pure.
+
+
+class ServiceRouteState(Enum):
+    """Whether a service of a peer can be called now."""
+
+    IDLE = auto()
+    """No route is open or asked for."""
+    OPENING = auto()
+    """The route is asked for, and the peer has not answered."""
+    OPEN = auto()
+    """The service can be called."""
+
+
+_S = ServiceRouteState
+TRANSITIONS: Final[Mapping[ServiceRouteState, frozenset[ServiceRouteState]]] = {
+    _S.IDLE: frozenset({_S.OPENING}),
+    _S.OPENING: frozenset({_S.OPEN, _S.IDLE}),
+    _S.OPEN: frozenset({_S.IDLE}),
+}
+
+
+@dataclass(slots=True)
+class RemoteService:
+    """One service of one peer.
+
+    Args:
+        wire: Its name on the wire.
+        node: Its node, in the peer's graph.
+        name: Its name here.
+        shown: Whether it is in the local graph.
+        hidden: Why it is not in the local graph, or empty.
+        denied: Whether it is hidden because no permission lets its module serve it here.
+        state: Whether it can be called now.
+        route: The route of its replies while it is asked for or open; else 0.
+        requests: The route of its requests while it is open; else 0.
+        due: While it is asked for: when the peer's answer is overdue, in monotonic seconds.
+        about: What its server said of it; ``None`` while that is unknown.
+        problem: Why it could not be opened or was closed last, or empty.
+        origin: Its module and node, if the peer relays it.
+    """
+
+    wire: str
+    node: str
+    name: str
+    shown: bool = False
+    hidden: str = ""
+    denied: bool = False
+    state: ServiceRouteState = ServiceRouteState.IDLE
+    route: int = 0
+    requests: int = 0
+    due: float = 0.0
+    about: ServiceAbout | None = None
+    problem: str = ""
+    origin: Origin | None = None
+
+
+# Which services may cross, their names at a peer and here, the time-out of a call and its path. Without I/O.
+
+
+OWN_SERVICES: Final = "/rmpa/**"
+LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
+"""Every node has these two services; if they crossed, they would double the graph for no use."""
+
+
+class ServiceRules:
+    """Judges and names services.
+
+    Args:
+        settings: ``[services]`` and ``[[service]]``.
+        policy: For what ``[[peer]]`` allows; the rules of topics do not apply to services.
+        names: For what ``[[peer]]`` renames.
+    """
+
+    def __init__(self, settings: ServiceSettings, policy: Policy, names: Names | None = None) -> None:
+        self._settings = settings
+        self._policy = policy
+        self._names = names if names is not None else Names()
+
+    def judge(self, service: str, node: str) -> PolicyDecision:
+        """Decide whether a service may cross at all.
+
+        The built-in rules go first, then ``services.deny``, then ``services.allow``; what no glob fits may not cross.
+
+        Args:
+            service: Its name in the local graph.
+            node: The node that provides it.
+        """
+        settings = self._settings
+        if is_own(node):
+            return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
+        if matches(OWN_SERVICES, service):
+            return PolicyDecision(False, "built in: the agent's own services stay home")
+        if not settings.loggers and any(matches(pattern, service) for pattern in LOGGERS):
+            return PolicyDecision(
+                False, "built in: a node's log is set at home; services.loggers = true lets it cross"
+            )
+        for pattern in settings.deny:
+            if matches(pattern, service):
+                return PolicyDecision(False, f"services.deny has {pattern!r}")
+        for pattern in settings.allow:
+            if matches(pattern, service):
+                return PolicyDecision(True, f"services.allow has {pattern!r}")
+        return PolicyDecision(False, f"no glob of services.allow fits {service}")
+
+    def judge_for(self, peer: str, service: str, wire: str) -> PolicyDecision:
+        """Decide whether a service that ``judge`` allows may cross between this module and one peer.
+
+        Args:
+            peer: The peer's name.
+            service: The service's name in the local graph.
+            wire: Its name on the wire.
+        """
+        return self._policy.judge_for(peer, service, wire=wire)
+
+    def local_name(self, peer: str, wire: str) -> str:
+        """The name in the local graph of a service that a peer offers as ``wire``."""
+        return self._names.local_name(peer, wire)
+
+    def wire_name(self, peer: str, service: str) -> str:
+        """The name on the wire, to this peer, of a service of this module."""
+        return self._names.wire_name(peer, service)
+
+    def own_name(self, peer: str, wire: str) -> str:
+        """The name in the local graph of a service of this module that this peer knows as ``wire``."""
+        return next(iter(self._names.of(peer).locals_of(wire)), wire)
+
+    def timeout(self, service: str) -> float:
+        """The time-out of a call of a service, in seconds.
+
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
+        """
+        said = (rule.timeout for rule in self._fitting(service) if rule.timeout is not None)
+        return next(said, self._settings.timeout)
+
+    def has_timeout(self, service: str) -> bool:
+        """Whether a service has another time-out than the built-in one.
+
+        Only agents keep time-outs: a call from node to node has none.
+        """
+        return self.timeout(service) != config_limits.SERVICE_TIMEOUT
+
+    def transport(self, service: str) -> Transport:
+        """The path of a service's calls that this module wants.
+
+        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
+        ``[services]``.
+        """
+        said = (rule.transport for rule in self._fitting(service) if rule.transport is not None)
+        return next(said, self._settings.transport)
+
+    def _fitting(self, service: str) -> Iterator[ServiceRule]:
+        """The rules ``[[service]]`` that fit a service, in order."""
+        return (rule for rule in self._settings.rules if any(matches(pattern, service) for pattern in rule.names))
 
 
 @dataclass(slots=True)

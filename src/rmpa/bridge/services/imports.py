@@ -23,10 +23,8 @@ from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge import offers as peer_limits
 from rmpa.bridge.actions import Send, Warn
-from rmpa.bridge.catalogue import peer_limits
-from rmpa.bridge.catalogue.peer_limits import NodePlaces
-from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -36,9 +34,9 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.relay import LinkedPeer, RelayPaths, is_outside
-from rmpa.bridge.services.actions import (
+from rmpa.bridge.offers import NodePlaces, PeerOffers
+from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, RelayPaths, is_outside
+from rmpa.bridge.services.bodies import (
     EndedService,
     ForgetAbout,
     ImportAction,
@@ -47,7 +45,7 @@ from rmpa.bridge.services.actions import (
     ServiceAbout,
     Withdraw,
 )
-from rmpa.bridge.services.remote_service import TRANSITIONS, RemoteService, ServiceRouteState
+from rmpa.bridge.services.exports import TRANSITIONS, RemoteService, ServiceRouteState
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
@@ -56,8 +54,8 @@ from rmpa.core.identity import Guid
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from rmpa.bridge.catalogue.peer_offers import Change
-    from rmpa.bridge.services.rules import ServiceRules
+    from rmpa.bridge.offers import Change
+    from rmpa.bridge.services.exports import ServiceRules
 
 
 @dataclass(slots=True, kw_only=True)

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
-from rmpa.bridge.catalogue.offers import CataloguePeer, OfferCatalogue
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -40,9 +39,9 @@ from rmpa.bridge.messages import (
     is_crossing_name,
     is_crossing_type,
 )
-from rmpa.bridge.naming import Names
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.relay import may_have
+from rmpa.bridge.offers import CataloguePeer, OfferCatalogue
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, may_have
+from rmpa.bridge.proxies import Names
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
@@ -52,8 +51,8 @@ from rmpa.mesh import limits as mesh_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
-    from rmpa.bridge.catalogue.offers import Portion
     from rmpa.bridge.messages import Origin
+    from rmpa.bridge.offers import Portion
     from rmpa.bridge.policy import Policy
     from rmpa.mesh.reliable import ReliableSender
 

@@ -17,10 +17,8 @@ from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge import offers as peer_limits
 from rmpa.bridge.actions import Action, Detach, Publish, Retract, Send, Warn
-from rmpa.bridge.catalogue import peer_limits
-from rmpa.bridge.catalogue.peer_limits import NodePlaces
-from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     Advertise,
     Mismatch,
@@ -30,11 +28,10 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.naming import Names, PeerNames
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.relay import LinkedPeer, RelayPaths
-from rmpa.bridge.topics.import_routes import ImportRoutes
-from rmpa.bridge.topics.remote_topic import RemoteTopic, RouteState
+from rmpa.bridge.offers import NodePlaces, PeerOffers
+from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, RelayPaths
+from rmpa.bridge.proxies import Names, PeerNames
+from rmpa.bridge.topics.routes import ImportRoutes, RemoteTopic, RouteState
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import LimitSettings
@@ -43,8 +40,8 @@ from rmpa.core.contract import Contracts
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
-    from rmpa.bridge.catalogue.peer_offers import Change
     from rmpa.bridge.messages import Origin
+    from rmpa.bridge.offers import Change
     from rmpa.bridge.policy import Policy
 
 

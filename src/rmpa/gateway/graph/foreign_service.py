@@ -7,7 +7,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import Source
-from rmpa.bridge.relay import service_place
+from rmpa.bridge.policy import service_place
 from rmpa.core.errors import RmpaError
 from rmpa.gateway.graph.foreign_source import ProxiedSource
 from rmpa.ros.node.service_server import ServiceEndpoint
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.relay import Relay
-    from rmpa.bridge.session.peer_proxies import PeerProxies
+    from rmpa.bridge.policy import Relay
+    from rmpa.bridge.proxies import PeerProxies
     from rmpa.gateway.neighbour import ForeignSource
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.service_server import ServiceCall

@@ -6,14 +6,14 @@ import logging
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.session.peer_proxies import ProxyCallbacks
+from rmpa.bridge.proxies import ProxyCallbacks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.relay import Relay
-    from rmpa.bridge.session.peer_proxies import PeerProxies
+    from rmpa.bridge.policy import Relay
+    from rmpa.bridge.proxies import PeerProxies
     from rmpa.gateway.neighbour import ForeignSource
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode

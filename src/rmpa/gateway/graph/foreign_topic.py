@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.relay import Relay
-    from rmpa.bridge.session.peer_proxies import PeerProxies
+    from rmpa.bridge.policy import Relay
+    from rmpa.bridge.proxies import PeerProxies
     from rmpa.gateway.neighbour import ForeignSource
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode

@@ -7,9 +7,8 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.relay import is_outside, service_place
-from rmpa.bridge.topics.io.local_sources import LocalSources
+from rmpa.bridge.policy import Policy, is_outside, is_own, service_place
+from rmpa.bridge.topics.local import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind

@@ -6,7 +6,7 @@ import hashlib
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.messages import Origin
-from rmpa.bridge.relay import OUTSIDE_GUID
+from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.core import limits as core_limits
 
 if TYPE_CHECKING:

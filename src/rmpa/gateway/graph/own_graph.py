@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OWN_NODE
-from rmpa.bridge.relay import is_outside
-from rmpa.bridge.services.actions import LocalService
-from rmpa.bridge.services.io.connection_pool import ServicePool
-from rmpa.bridge.session.part import Part
-from rmpa.bridge.session.peer_proxies import PeerProxies
+from rmpa.bridge.policy import OWN_NODE, is_outside
+from rmpa.bridge.proxies import PeerProxies
+from rmpa.bridge.services.bodies import LocalService, ServicePool
+from rmpa.bridge.sessions import Part
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import peer_name_problem
 from rmpa.gateway.graph.foreign_service import ProxiedService

@@ -27,7 +27,7 @@ from rmpa.runtime.process import in_thread
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.permission_gate import Needs
+    from rmpa.bridge.policy import Needs
     from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.gateway.zenoh_api import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.io import node_requests
-from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
+from rmpa.bridge import nodes as node_requests
+from rmpa.bridge.params.rules import QUESTIONS as PARAM_REQUESTS
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
@@ -29,10 +29,10 @@ from rmpa.ros.environment import NodeLine, PeerNodes
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.node_requests import NodeRequests
-    from rmpa.bridge.params.io.part import Params
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.nodes import NodeRequests
+    from rmpa.bridge.params.follower import Params
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.observe.io.control_server import Handler
     from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder

@@ -18,7 +18,7 @@ from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 if TYPE_CHECKING:
     import asyncio
 
-    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.bridge import Bridge
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.api import Core

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.bridge.direct.conditions import Condition, unmet_by_contract
-from rmpa.bridge.direct.requests import Want
+from rmpa.bridge.direct.grants import Want
+from rmpa.bridge.direct.nodes import Condition, unmet_by_contract
 from rmpa.core.contract import Transport
 from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 
 if TYPE_CHECKING:
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.direct.paths import Interruption, Path
-    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.messages import Source
     from rmpa.core.contract import Contract
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.data.peer_clock import PeerClockHistory
+from rmpa.bridge.data.quality import PeerClockHistory
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.bridge import Bridge
 
 
 class PeerClocks:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
 from rmpa.ros.master.parameters import leaves

@@ -15,10 +15,9 @@ from rmpa.trust.certificates import not_of_this_mesh
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.twin_watch import TwinWatch
-    from rmpa.bridge.services.io.part import Services
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge, TwinWatch
+    from rmpa.bridge.services.part import Services
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import PeerView, Stranger
     from rmpa.discovery.discovery import Discovery

@@ -11,10 +11,10 @@ from rmpa.runtime.loop import sorted_yielding, yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rmpa.bridge.services.actions import LocalService
-    from rmpa.bridge.services.io.calls import CallStats
-    from rmpa.bridge.services.io.part import Services
-    from rmpa.bridge.services.remote_service import RemoteService
+    from rmpa.bridge.services.bodies import LocalService
+    from rmpa.bridge.services.calls import CallStats
+    from rmpa.bridge.services.exports import RemoteService
+    from rmpa.bridge.services.part import Services
 
 
 class ServicesSection:

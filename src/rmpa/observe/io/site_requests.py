@@ -7,16 +7,16 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.bridge import limits
-from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
-from rmpa.bridge.session.peer_rpc import UNKNOWN_QUESTION
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from rmpa.bridge.session.peer_rpc import PeerRpc
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.sessions import PeerSession
 
 REPORT: Final = "site.report"
 """The request for a ``SitesReport`` without sources."""

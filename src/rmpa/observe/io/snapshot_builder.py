@@ -27,9 +27,8 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.twin_watch import TwinWatch
-    from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.bridge import Bridge, TwinWatch
+    from rmpa.bridge.services.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
     from rmpa.observe.contract_term import ContractTerm

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from rmpa.bridge.data.io.route_sender import ReliableRouteSender
-from rmpa.bridge.data.qos_events import shown_seconds
+from rmpa.bridge.data.export import ReliableRouteSender
+from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, PolicyDecision, is_own
-from rmpa.bridge.topics.remote_topic import RouteState
+from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
@@ -24,14 +24,12 @@ from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yield
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
-    from rmpa.bridge.data.losses import ReceptionHistory
-    from rmpa.bridge.data.peer_clock import PeerClockHistory
-    from rmpa.bridge.data.qos_events import QosWatch
-    from rmpa.bridge.data.quality import QualitySummary
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.data.quality import PeerClockHistory, QosWatch, QualitySummary
+    from rmpa.bridge.data.route import ReceptionHistory
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.remote_topic import RemoteTopic
+    from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.io.direct_section import DirectSection
     from rmpa.observe.io.peer_clocks import PeerClocks

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.relay import OUTSIDE_GUID
+from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.proxies import proxied_node
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.data.io.export_flow import ExportFlow
-from rmpa.bridge.data.io.import_flow import ImportFlow
-from rmpa.bridge.data.io.link_time import LinkTime
-from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.data.export import ExportFlow
+from rmpa.bridge.data.quality import QosEventKind
+from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError

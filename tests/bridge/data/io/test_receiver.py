@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.bridge.data.io.receiver import DataReceiver
+from rmpa.bridge.data.reception import DataReceiver
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import FIRST

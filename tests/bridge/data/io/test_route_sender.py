@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from rmpa.bridge.data.io.route_sender import ReliableRouteSender, RouteSender, make_route_sender
+from rmpa.bridge.data.export import ReliableRouteSender, RouteSender, make_route_sender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.io.endpoints import LocalEndpoints
+from rmpa.bridge.direct.nodes import Condition, Grant, LocalEndpoints, Unmet
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply

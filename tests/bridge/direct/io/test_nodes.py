@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.direct.io.nodes import direct_links, end_from, end_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.nodes import direct_links, end_from, end_links, end_to, publisher_update, standing
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription

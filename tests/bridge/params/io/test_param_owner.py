@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.io.core import read_text, write_text
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params.owner import read_text, write_text
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import ParamSettings, TrustSettings
 from rmpa.core.errors import PeerRefused

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.io.link_time import LinkTime
+from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import decode
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.io.core import read_text, write_text
-from rmpa.bridge.params.io.part import Params
-from rmpa.bridge.permission_gate import OPEN_GATE, Needs, PermissionGate
-from rmpa.bridge.session.peer_rpc import PeerRpc
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params.follower import Params
+from rmpa.bridge.params.owner import read_text, write_text
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
@@ -28,7 +28,7 @@ from tests.bridge.services.io.test_calls import Wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.core.api import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.io.link_time import LinkTime
-from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
-from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, Server
+from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
+from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Server
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
@@ -25,7 +25,7 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.services.io.connection_pool import ServicePool
+    from rmpa.bridge.services.bodies import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.tls import Buffer
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.services.actions import LocalService
-from rmpa.bridge.services.io.connection_pool import ServicePool
+from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.core.errors import RmpaError
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode

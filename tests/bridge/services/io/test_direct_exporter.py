@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.direct.requests import DirectAsk, write
-from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.services.io.direct_exporter import DirectServiceExporter
+from rmpa.bridge.direct.grants import DirectAsk, write
+from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.services.direct import DirectServiceExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.trust.documents import Permissions
 
 if TYPE_CHECKING:
-    from rmpa.bridge.services.actions import LocalService
+    from rmpa.bridge.services.bodies import LocalService
 
 AGAIN = "direct.service_again"
 URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"

@@ -9,12 +9,13 @@ from typing import Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct import grants, requests
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
-from rmpa.bridge.direct.requests import DirectAsk, Want
+from rmpa.bridge.direct import grants
+from rmpa.bridge.direct import grants as requests
+from rmpa.bridge.direct.grants import DirectAsk, Want
+from rmpa.bridge.direct.nodes import Condition, Grant, Unmet
 from rmpa.bridge.messages import Source
-from rmpa.bridge.permission_gate import PermissionGate
-from rmpa.bridge.topics.io.direct_exporter import DirectExporter
+from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.topics.local import DirectExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
 from rmpa.core.counters import Counters

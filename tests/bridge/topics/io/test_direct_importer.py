@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition
-from rmpa.bridge.direct.requests import Want
+from rmpa.bridge.direct.grants import Want
+from rmpa.bridge.direct.nodes import Condition
 from rmpa.bridge.messages import Source
-from rmpa.bridge.topics.io import direct_importer
-from rmpa.bridge.topics.io.direct_importer import DirectImporter
+from rmpa.bridge.topics import direct as direct_importer
+from rmpa.bridge.topics.direct import DirectImporter
 from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError

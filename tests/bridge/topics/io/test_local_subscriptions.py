@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.bridge.actions import AddRoute, Connect
 from rmpa.bridge.messages import Source
-from rmpa.bridge.topics.io.local_subscriptions import LocalSubscriptions
+from rmpa.bridge.topics.local import LocalSubscriptions
 from rmpa.core.contract import Contract
 from rmpa.ros.node.publication import Publication
 from tests.bridge.io.doubles import Link

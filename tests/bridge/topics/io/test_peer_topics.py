@@ -10,12 +10,11 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Describe, Detach, Publish, Retract
-from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Description, Source
-from rmpa.bridge.session.peer_proxies import PeerProxies
-from rmpa.bridge.session.peer_session import PeerSession
-from rmpa.bridge.session.proxy_nodes import ProxyNodes
-from rmpa.bridge.topics.io.peer_topics import PeerTopics
+from rmpa.bridge.proxies import PeerProxies, ProxyNodes
+from rmpa.bridge.sessions import PeerSession
+from rmpa.bridge.topics.peer_topics import PeerTopics
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
 from rmpa.core.outbox import FIRST
 from rmpa.mesh import limits as mesh_limits
@@ -26,8 +25,8 @@ from tests.bridge.io.virtual import VirtualLoop, run
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from rmpa.bridge.data.io.import_flow import ImportFlow
-    from rmpa.bridge.data.qos_events import QosEvent
+    from rmpa.bridge.data.quality import QosEvent
+    from rmpa.bridge.data.reception import ImportFlow
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.publication import Publication
 

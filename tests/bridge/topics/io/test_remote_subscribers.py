@@ -23,13 +23,11 @@ from rmpa.bridge.messages import (
     TopicOffer,
     decode,
 )
-from rmpa.bridge.permission_gate import OPEN_GATE, PermissionGate
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.relay import LinkedPeer
+from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy
+from rmpa.bridge.topics import subscribers as module
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.io import remote_subscribers as module
-from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
+from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
 from rmpa.core.identity import Guid
@@ -38,7 +36,7 @@ from rmpa.trust.documents import Permissions
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.sessions import PeerSession
 
 GOAL = Source("/count/goal", "/client")
 CHATTER = Source("/chatter", "/client")

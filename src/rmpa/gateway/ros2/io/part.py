@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.policy import Needs
 from rmpa.ros.types.definitions import known_types
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.topics.audience import is_watched
+from rmpa.bridge.topics.subscribers import is_watched
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.part import SitePart

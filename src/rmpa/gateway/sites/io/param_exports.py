@@ -6,8 +6,8 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.params import transfer
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.gateway import limits

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.io.core import read_text, write_text
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.sites.attachment import SiteAttachment

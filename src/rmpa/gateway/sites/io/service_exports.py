@@ -8,7 +8,7 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.gateway import limits

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits

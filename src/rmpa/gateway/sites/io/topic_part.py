@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError

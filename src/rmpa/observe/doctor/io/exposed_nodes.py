@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.exposed_nodes import is_beyond_loopback

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
-from rmpa.bridge.services.rules import ServiceRules
+from rmpa.bridge.proxies import Names
+from rmpa.bridge.services.exports import ServiceRules
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
@@ -20,9 +20,9 @@ from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.services.io.part import Services
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.services.part import Services
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
 

@@ -25,9 +25,9 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.session.peer_session import PeerSession
-    from rmpa.bridge.topics.remote_topic import RemoteTopic
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.peer_info import PeerInfo

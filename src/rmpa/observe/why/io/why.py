@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.permission_gate import Needs
+from rmpa.bridge.policy import Needs
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
@@ -28,9 +28,9 @@ from rmpa.observe.why.services import ServiceAtServer, diagnose_service
 from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.services.io.part import Services
-    from rmpa.bridge.session.peer_session import PeerSession
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.services.part import Services
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.io.site_requests import SiteRequests
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder

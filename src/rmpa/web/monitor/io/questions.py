@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 
-from rmpa.bridge.io.node_requests import INFO
+from rmpa.bridge.nodes import INFO
 from rmpa.bridge.policy import is_own
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits

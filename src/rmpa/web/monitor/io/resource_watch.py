@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_peer
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor

@@ -1,0 +1,375 @@
+"""The bridge of one agent: its parts connect the local core with the links of the mesh."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.data.reception import DataReceiver
+from rmpa.bridge.messages import decode, op_of
+from rmpa.bridge.nodes import ProxyKills
+from rmpa.bridge.policy import OWN_NODE, Needs, PermissionGate, Policy, Relay, is_own
+from rmpa.bridge.proxies import Names, ProxyNodes
+from rmpa.bridge.rpc import PeerRpc
+from rmpa.bridge.sessions import Part, PeerSessions, guarded
+from rmpa.bridge.topics.part import Topics
+from rmpa.config.peer_rules import Access
+from rmpa.config.settings import LimitSettings
+from rmpa.core.contract import Contracts
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import is_global_name, matches
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Set as AbstractSet
+
+    from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.config.settings import PeerRule, Settings
+    from rmpa.core.identity import Identity
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.trust.documents import Permissions
+
+_log = logging.getLogger(__name__)
+
+
+class Bridge:
+    """Wires the parts: each gets the sessions of the peers, their messages and the changes of the local graph.
+
+    Args:
+        core: The local core, started.
+        policy: Decides what may cross.
+        contracts: The contracts of the module's topics.
+        names: Translates names between this module and its peers.
+        relay: Whether this module offers the sources of one peer to others.
+        limit_settings: Bounds what is taken from one peer, and what is offered.
+        rng: Uniform numbers in [0, 1) for back-off jitter.
+        permissions: What each peer may do here; ``None``: the mesh is not secured.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        policy: Policy,
+        *,
+        rng: Callable[[], float],
+        contracts: Contracts | None = None,
+        names: Names | None = None,
+        relay: bool = False,
+        limit_settings: LimitSettings | None = None,
+        permissions: Permissions | None = None,
+    ) -> None:
+        self._core = core
+        self.counters = Counters()
+        self.gate = PermissionGate(permissions, self.counters)
+        """Decides what each peer may do."""
+        self.rpc = PeerRpc(self.counters)
+        """The requests and notifications to and from the peers."""
+        kills = ProxyKills(self.rpc)
+        self.node = SlaveNode(
+            OWN_NODE,
+            core.node_host,
+            core.uri,
+            advertised_host=core.node_address,
+            counters=self.counters,
+            on_param_update=self._param_update,
+            on_kill=kills.own,
+            taps=lambda: self.topics.outbound.connections,
+        )
+        """The agent's own node in the local graph."""
+        self.proxy_nodes = ProxyNodes(core, self.counters)
+        """Makes the nodes that stand for the nodes of peers."""
+        self.receiver = DataReceiver(self.counters, self._sender)
+        """Takes the data frames of the links."""
+        self._parts: list[Part] = [self.rpc]
+        self._by_op: dict[str, Part] = {}
+        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
+        """The sessions of the peers."""
+        self.relay = Relay(enabled=relay)
+        """Which sources of one peer are offered to others."""
+        self.topics = Topics(
+            core,
+            self.node,
+            self.sessions,
+            self.rpc,
+            self.relay,
+            policy,
+            contracts=contracts if contracts is not None else Contracts(),
+            names=names if names is not None else Names(),
+            limit_settings=limit_settings if limit_settings is not None else LimitSettings(),
+            rng=rng,
+            counters=self.counters,
+            gate=self.gate,
+            find=self.proxy_nodes.publication,
+        )
+        self.add(self.topics)
+        self._reconciler: asyncio.TimerHandle | None = None
+
+    def add(self, part: Part) -> None:
+        """Add a part; before ``start()``."""
+        self._parts.append(part)
+        if part.advertisement:
+            self._by_op[part.advertisement] = part
+
+    def place(self, identity: Identity) -> None:
+        """Set this agent's identity, before the first link; its own sources that a relay brings back are hidden."""
+        self.relay.instance = identity.instance.hex()
+
+    def reload(self, settings: Settings) -> None:
+        """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
+        self.gate.reload(settings.trust)
+        for part in self._parts:
+            with guarded(part):
+                part.reload(settings)
+
+    async def start(self) -> None:
+        """Start the agent's node, the parts and the following of the local graph."""
+        self.node.master_uri = self._core.uri  # only now does the embedded core listen
+        await self.node.start()
+        await self.proxy_nodes.start()
+        self._core.on_change(self._graph_changed)
+        self._reconcile_later()
+        for part in self._parts:
+            part.start()
+
+    async def close(self) -> None:
+        """Retract everything that came from peers, and disconnect all local publishers."""
+        if self._reconciler is not None:
+            self._reconciler.cancel()
+        await self.sessions.close()
+        for part in reversed(self._parts):
+            with guarded(part):
+                await part.close()
+        await self.proxy_nodes.close()
+        await self.node.close()
+
+    # --- the mesh's side ---------------------------------------------------------------------------------------
+
+    def control(self, link: PeerLink, payload: bytes | bytearray | memoryview) -> None:
+        """Pass a control frame of a link to the part that it belongs to.
+
+        Raises:
+            RemoteProtocolError: It is no valid message, or belongs to no part; the caller closes the link.
+        """
+        session = self.sessions.of(link)
+        if session is None:
+            return
+        part = self._by_op.get(op_of(payload))
+        if part is not None:
+            # Parsing takes long, and this is called from a reader of data: so it is done later.
+            part.advertised(session, bytes(payload))
+            return
+        message = decode(payload)
+        if not any(part.message(session, message) for part in self._parts):
+            raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
+
+    def _sender(self, peer: int, route: int) -> RouteSender | None:
+        return self.topics.outbound.sender(peer, route)
+
+    # --- the local graph's side --------------------------------------------------------------------------------
+
+    def _graph_changed(self, change: GraphChange) -> None:
+        for part in self._parts:
+            with guarded(part):
+                part.graph_changed(change)
+
+    def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
+        return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called
+
+    def _reconcile_later(self) -> None:
+        self._reconciler = call_at_tick(limits.RECONCILE_INTERVAL, self._reconcile)
+
+    def _reconcile(self) -> None:
+        self._reconcile_later()
+        self.sessions.reconcile()
+        for part in self._parts:
+            yield_to_data()
+            with guarded(part):
+                part.reconcile()
+
+
+# Decides whether a peer is a *twin*: a module of the same kind, each of which drives the other by equal names.
+# Pure.
+#
+# Two identical robots offer the same topics (``/odom``, ``/scan``) and take the same commands (``/cmd_vel``). By
+# default one name is one topic in the whole mesh, so the command of one reaches both. In one robot that is split
+# over
+# several modules a name is offered by one module, and taken by others.
+
+
+_NAMES_MIN: Final = 3
+"""Names in common that make two modules twins."""
+OFFERED_MIN: Final = 2
+"""Of these, names that both offer: a driver and its driven have none, whatever passes between them."""
+_NAMES_SHOWN: Final = 4
+_COMMON: Final = frozenset({
+    "/tf", "/tf_static", "/diagnostics", "/diagnostics_agg", "/diagnostics_toplevel_state", "/statistics",
+    "/client_count", "/connected_clients", "/clock", "/rosout", "/rosout_agg",
+})  # fmt: skip
+"""Names that modules of every kind may share: transforms, diagnostics, time, logs, and those of common tools."""
+_COMMON_ENDINGS: Final = (
+    "/parameter_updates", "/parameter_descriptions", "/bond",
+    "/quality", "/requirements", "/responses", "/observed", "/alarms", "/profile", "/context", "/state", "/decision",
+    "/descriptor", "/set_context",
+)  # fmt: skip
+"""Ends of names of nodes' own interfaces: dynamic_reconfigure, nodelets, Smart Resources."""
+
+
+def telling(names: Iterable[str]) -> frozenset[str]:
+    """The names that tell something of the kind of a module: not those that all modules may share."""
+    return frozenset(name for name in names if name not in _COMMON and not name.endswith(_COMMON_ENDINGS))
+
+
+def twin_names(
+    offered: AbstractSet[str], taken: AbstractSet[str], offered_there: AbstractSet[str], taken_there: AbstractSet[str]
+) -> tuple[str, ...]:
+    """The names that make a peer a twin, those first by which one drives the other; empty: it is none.
+
+    All by their names here, and only telling ones.
+
+    Args:
+        offered: What this module's own nodes publish.
+        taken: What they subscribe to.
+        offered_there: What the peer's own nodes publish here.
+        taken_there: What they subscribe to, as far as the peer said.
+    """
+    both = offered & offered_there
+    driven = taken & (taken_there | offered_there)
+    if len(both) < OFFERED_MIN or not driven or len(both | driven) < _NAMES_MIN:
+        return ()
+    return (*sorted(driven), *sorted(both - driven))
+
+
+def twin_text(peer: str, names: tuple[str, ...]) -> str:
+    """What the user is told of a twin, with what to do behind the semicolon."""
+    more = len(names) - _NAMES_SHOWN
+    shown = ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return (
+        f"its nodes offer and take the same names as ours ({shown}), so each module drives the other; start both "
+        f'with rmpa up --prefix-peers, or write in rmpa.toml below [[peer]]: name = "{peer}" and prefix = "/{{peer}}"'
+    )
+
+
+# Finds twins among the peers, and tells each that may be one what this module's nodes take.
+
+
+TAKEN: Final = "names.taken"
+"""The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to."""
+
+
+class TwinWatch(Part):
+    """The part of the bridge that knows which peers are twins; it looks each ``limits.RECONCILE_INTERVAL``.
+
+    Args:
+        core: The local graph.
+        bridge: Its sessions, topics and requests.
+        rules: The ``[[peer]]`` tables. A peer that one of them names is no twin: the user has decided about it.
+    """
+
+    def __init__(self, core: Core, bridge: Bridge, rules: tuple[PeerRule, ...]) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._rules = rules
+        self._clock = SystemClock()
+        self._told = RefusalLog(_log, bridge.counters)
+        self._state: GraphState | None = None
+        self._offered: frozenset[str] = frozenset()
+        self._taken: frozenset[str] = frozenset()
+        self._said: dict[int, tuple[str, ...]] = {}
+        """By peer: the names that it was told last."""
+        self._taken_there: dict[int, tuple[str, ...]] = {}
+        """By peer: what its nodes take, by wire names, as it said last."""
+        self._twins: dict[int, tuple[str, ...]] = {}
+        bridge.rpc.on_notification(TAKEN, self._told_by_peer, Needs((), "names of the peer's own graph"))
+
+    def problem(self, session: PeerSession) -> str:
+        """What the user is told of a peer, while it is a twin; else empty."""
+        names = self._twins.get(session.peer)
+        return twin_text(session.link.name, names) if names else ""
+
+    def reload(self, settings: Settings) -> None:
+        """Take the rules of new settings."""
+        self._rules = settings.peers
+
+    def reconcile(self) -> None:
+        """Judge all peers again."""
+        state = self._core.state()
+        if state is not self._state:
+            self._state = state
+            self._offered, self._taken = telling(_own(state.publishers)), telling(_own(state.subscribers))
+        for session in self._bridge.sessions.linked():
+            yield_to_data()
+            self._judge(session)
+
+    def link_up(self, session: PeerSession) -> None:
+        """Forget what was said over an earlier link."""
+        self._said.pop(session.peer, None)
+
+    def gone(self, session: PeerSession) -> None:
+        """Forget a peer."""
+        for known in (self._said, self._taken_there, self._twins):
+            known.pop(session.peer, None)
+
+    def _judge(self, session: PeerSession) -> None:
+        peer, name = session.peer, session.link.name
+        if not self._offered or not self._taken or self._is_decided(name):
+            self._set(session, ())
+            return
+        imports, rename = self._bridge.topics.imports, self._bridge.topics.names.of(name).local_name
+        offers = imports.offered_by(peer)
+        offered_there = frozenset(
+            topic
+            for topic in (self._offered | self._taken).intersection(offers)
+            if any(
+                (entry := imports.get(peer, source)) is not None and entry.shown and entry.origin is None
+                for source in offers[topic]
+            )
+        )
+        if len(self._offered & offered_there) >= OFFERED_MIN:
+            self._say(session)
+        taken_there = frozenset(map(rename, self._taken_there.get(peer, ())))
+        self._set(session, twin_names(self._offered, self._taken, offered_there, taken_there))
+
+    def _is_decided(self, name: str) -> bool:
+        return any(rule.name != "*" and matches(rule.name, name) for rule in self._rules)
+
+    def _set(self, session: PeerSession, names: tuple[str, ...]) -> None:
+        before = self._twins.pop(session.peer, ())
+        if names:
+            self._twins[session.peer] = names
+        name = session.link.name
+        if names and not before:
+            self._told.refuse(self._clock.now(), "peer.twin", name, f"{name}: {twin_text(name, names)}")
+        elif before and not names:
+            _log.info("= %s and this module share no commands any more", name)
+
+    def _say(self, session: PeerSession) -> None:
+        """Tell a peer what nodes here take of what it may publish here, if that has changed."""
+        name = session.link.name
+        wire, judge = self._bridge.topics.names.of(name).wire_name, self._bridge.gate.judge
+        allowed = (each for each in sorted(self._taken) if judge(Access.PUBLISH, name, each).allowed)
+        names = tuple(map(wire, allowed))[: limits.TWIN_NAMES_MAX]
+        if session.linked and names != self._said.get(session.peer):
+            self._said[session.peer] = names
+            self._bridge.rpc.notify(session, TAKEN, {"names": names})
+
+    def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
+        names = args.get("names")
+        found = names[: limits.TWIN_NAMES_MAX] if isinstance(names, list) else ()
+        self._taken_there[session.peer] = tuple(
+            name for name in found if isinstance(name, str) and is_global_name(name)
+        )
+        self._judge(session)
+
+
+def _own(table: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """The topics of a table of the graph that have a node of this module."""
+    return [topic for topic, nodes in table.items() if not all(map(is_own, nodes))]

@@ -1,0 +1,508 @@
+"""The data path from one local publisher to the peers; only what each message needs is done here.
+
+An ``ExportFlow`` is called from a socket's read callback with a view of its buffer, and passes it on with one system
+call for each receiver, a large message in parts while it still arrives. It takes routes as commands and shares no
+state with the planning side.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch
+from rmpa.core.contract import Contract, Durability, History, Reliability
+from rmpa.core.identity import SERIAL_MASK, is_earlier
+from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.reliable import ReliableSender
+from rmpa.ros import limits as ros_limits
+from rmpa.runtime import limits as runtime_limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.core.outbox import QueuedMessage
+    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.runtime.tls import Buffer
+
+
+# The sending end of a route: the lane of its messages, queue bounds, down-sampling, and messages kept for replay.
+#
+# A route sender is called for each message from the publisher's read callback. ``RouteSender.message`` has a short
+# path
+# for the usual case: a small message on the express lane, without down-sampling.
+
+
+class RouteSender:
+    """Sends the messages of one best-effort route.
+
+    Args:
+        link: The link to the peer.
+        route: The route's id.
+        contract: The route's contract.
+        large: Whether the source is known to have large messages.
+    """
+
+    reliable = False
+
+    def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
+        self.link: PeerLink | None = link
+        self.route = route
+        self.contract = contract
+        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self.sequence = 0
+        self.dropped = 0
+        """Messages dropped here because a bound was reached; those dropped by the lane are counted there."""
+        self._loop = asyncio.get_running_loop()
+        self._lane: LaneSender = link.express
+        self._switch = LaneSwitch(contract, large=large)
+        self._small = mesh_limits.EXPRESS_MESSAGE_MAX
+        self._held: deque[tuple[int, int, bytes]] = deque()
+        """Sequence, stamp and bytes of messages that wait until the lane has changed."""
+        self._held_bytes = 0
+        self._open_message: QueuedMessage | None = None
+        self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
+        self._newest: tuple[int, bytes] | None = None
+        """Stamp and bytes of the message that down-sampling sends next."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._direct = False
+        """Whether ``message`` may take its short path for small messages."""
+        self._set_bounds()
+        self._use_lane()
+
+    @property
+    def lane(self) -> str:
+        """The present lane, ``express`` or ``bulk``, to show."""
+        return self._switch.lane.name.lower()
+
+    @property
+    def large(self) -> bool:
+        """Whether its messages use, or are about to use, the bulk lane."""
+        return self._switch.target is not EXPRESS
+
+    @property
+    def skipped(self) -> int:
+        """Messages left out to keep to the contract's rate."""
+        return self._downsampler.skipped if self._downsampler is not None else 0
+
+    def message(self, stamp_ns: int, framed: Buffer) -> int:
+        """Send one message; return how many older ones were dropped for it."""
+        if self._direct and len(framed) <= self._small:
+            self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
+            return self._lane.send(self.route, sequence, stamp_ns, framed)
+        if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
+            self._keep_newest(self._downsampler, stamp_ns, framed)
+            return 0
+        if self._downsampler is not None and self._newest is not None:
+            self._downsampler.skipped += 1
+            self._newest = None
+        return self._send(stamp_ns, framed)
+
+    def begin(self, stamp_ns: int, size: int) -> bool:
+        """Begin a message of ``size`` bytes; return whether it can be sent in parts; otherwise it must come whole."""
+        if self._downsampler is not None or not self._lane_for(size):
+            return False
+        self.sequence = self.sequence + 1 & SERIAL_MASK
+        self._open_message = self._lane.open(self.route, size, self.sequence, stamp_ns)
+        return True
+
+    def part(self, part: Buffer) -> int:
+        """Send a part of a message that was begun; return how many older messages were dropped for it."""
+        return self._lane.extend(self._open_message, part) if self._open_message is not None else 0
+
+    def abort(self) -> None:
+        """Abort the message that was begun: its rest will not come."""
+        if self._open_message is not None:
+            self._lane.abandon(self._open_message)
+            self._open_message = None
+
+    def fenced(self, number: int) -> None:
+        """Take the peer's answer to a fence, and send the held messages over the new lane."""
+        if self._switch.fenced(number):
+            self._resume_lane()
+
+    def acknowledged(self, sequence: int) -> None:
+        """Ignore an acknowledgement; only reliable routes need it."""
+
+    def lane_lost(self) -> None:
+        """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
+        if self._switch.lane_lost():
+            self._discard_bulk()
+            self._resume_lane()
+
+    def close(self) -> None:
+        """Send no more messages."""
+        self.link = None
+        self._direct = False
+        self._held.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _send(self, stamp_ns: int, framed: Buffer) -> int:
+        self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
+        if self._lane_for(len(framed)):
+            return self._lane.send(self.route, sequence, stamp_ns, framed)
+        return self._hold(sequence, stamp_ns, bytes(framed))
+
+    def _lane_for(self, size: int) -> bool:
+        """Whether a message may be sent over the present lane now; if not, begins the change of lane it needs."""
+        if self.link is None or self._switch.fencing:
+            return False
+        if not self._switch.judge(size, self._loop.time()):
+            return True
+        self._begin_fence()
+        return False
+
+    def _begin_fence(self) -> None:
+        self._direct = False
+        self._lane.fence(self.route, self._switch.fence())
+
+    def _hold(self, sequence: int, stamp_ns: int, payload: bytes) -> int:
+        """Keep a message until the lane has changed, within the contract's bounds."""
+        self._held.append((sequence, stamp_ns, payload))
+        self._held_bytes += len(payload)
+        dropped = 0
+        while len(self._held) > 1 and (
+            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
+        ):
+            self._held_bytes -= len(self._held.popleft()[2])
+            dropped += 1
+        self.dropped += dropped
+        return dropped
+
+    def _resume_lane(self) -> None:
+        self._use_lane()
+        held, self._held = self._held, deque()
+        self._held_bytes = 0
+        for sequence, stamp_ns, payload in held:
+            # A large message may have come during the change back to the express lane.
+            if self._lane_for(len(payload)):
+                self._lane.send(self.route, sequence, stamp_ns, payload)
+            else:
+                self._hold(sequence, stamp_ns, payload)
+
+    def _discard_bulk(self) -> None:
+        """Drops messages that wait for the bulk lane's next connection: they would arrive after newer ones."""
+        if self.link is not None:
+            self.link.bulk.discard(self.route)
+            self._set_bounds()
+
+    def _use_lane(self) -> None:
+        """Uses the lane that the switch is on; begins a further change at once if the target is another lane."""
+        if self.link is None:
+            return
+        self._lane = self.link.express if self._switch.lane is EXPRESS else self.link.bulk
+        if self._switch.target is not self._switch.lane:
+            self._begin_fence()
+            return
+        # On the bulk lane small messages are counted for the return, so only the express lane is direct.
+        self._direct = self._switch.lane is EXPRESS and self._downsampler is None
+
+    def _set_bounds(self) -> None:
+        if self.link is None:
+            return
+        contract = self.contract
+        for lane, stale in (
+            (self.link.express, runtime_limits.STALE_AGE),
+            (self.link.bulk, mesh_limits.BULK_STALE_AGE),
+        ):
+            strict = contract.lifespan is not None
+            lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
+
+    def _keep_newest(self, downsampler: Downsampler, stamp_ns: int, framed: Buffer) -> None:
+        """Keeps a message, in place of an older one, until the rate allows it."""
+        if self._newest is not None:
+            downsampler.skipped += 1
+        self._newest = (stamp_ns, bytes(framed))
+        if self._timer is None:
+            self._timer = self._loop.call_at(downsampler.due, self._send_newest)
+
+    def _send_newest(self) -> None:
+        self._timer = None
+        if self._newest is None or self._downsampler is None:
+            return
+        if not self._downsampler.admit(self._loop.time()):
+            self._timer = self._loop.call_at(self._downsampler.due, self._send_newest)
+            return
+        stamp_ns, payload = self._newest
+        self._newest = None
+        self._send(stamp_ns, payload)
+
+
+class ReliableRouteSender(RouteSender):
+    """Sends the messages of one reliable route: each is kept until the peer has it, over links that come and go.
+
+    Args:
+        link: The link to the peer.
+        route: The route's id.
+        contract: The route's contract.
+        epoch: Identifies this numbering; see ``mesh.reliable``.
+        large: Whether the source is known to have large messages.
+    """
+
+    reliable = True
+
+    def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
+        depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self.sender = ReliableSender(
+            depth,
+            mesh_limits.REPLAY_BYTES,
+            mesh_limits.RELIABLE_WINDOW_MESSAGES,
+            mesh_limits.RELIABLE_WINDOW_BYTES,
+            epoch,
+        )
+        self._keep: Callable[[bytes, int], object] | None = None
+        self._reported = 0
+        super().__init__(link, route, contract, large=large)
+        self._direct = False
+
+    def begin(self, stamp_ns: int, size: int) -> bool:  # noqa: ARG002 - as the other kind
+        """Return ``False``: a message that may have to be sent again is needed whole."""
+        return False
+
+    def acknowledged(self, sequence: int) -> None:
+        """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
+        self.sender.acknowledged(sequence)
+        self._pump()
+
+    def lane_lost(self) -> None:
+        """Send the messages again that were on the lost bulk lane; the peer drops those that it has."""
+        if self._switch.lane is EXPRESS or self.link is None:
+            return
+        # Messages that still wait for the lane are sent again too: ahead of the lost ones they would show as a gap.
+        self._discard_bulk()
+        self.sender.rewind()
+        if self._switch.lane_lost():
+            self._resume_lane()
+        else:
+            self._pump()
+
+    def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """Keep messages while the link is gone, until ``resume`` or until they are given up.
+
+        Args:
+            keep: ``(payload, stamp_ns)``: offers a message to the sender within the bounds that all suspended
+                senders have together.
+        """
+        self.link = None
+        self._keep = keep
+        self.sender.suspend()
+
+    def resume(self, link: PeerLink, route: int, after: int) -> None:
+        """Continue on a new link; the peer has everything up to ``after``.
+
+        If a later message is already acknowledged, that one counts: with two links at once, the older one's request
+        may come last.
+
+        Raises:
+            RemoteProtocolError: ``after`` was never sent.
+        """
+        known = self.sender.confirmed
+        self.sender.resume(known if is_earlier(after, known) else after)
+        self._keep = None
+        self.link, self.route = link, route
+        self._switch.restart()
+        self._set_bounds()
+        self._use_lane()
+        self._direct = False
+        self._pump()
+
+    def missed(self) -> int:
+        """Return how many messages were lost for the peer since the last call."""
+        missed, self._reported = self.sender.lost - self._reported, self.sender.lost
+        return missed
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _send(self, stamp_ns: int, framed: Buffer) -> int:
+        before = self.sender.overflowed
+        if self._keep is not None:
+            self._keep(bytes(framed), stamp_ns)
+        else:
+            self.sender.offer(bytes(framed), stamp_ns)
+            self._pump()
+        lost = self.sender.overflowed - before
+        self.dropped += lost
+        return lost
+
+    def _pump(self) -> None:
+        """Sends what the window allows."""
+        while self.link is not None and not self._switch.fencing:
+            for message in self.sender.take(1):
+                if not self._lane_for(len(message.payload)):
+                    self.sender.put_back()
+                    return
+                self._lane.send(self.route, message.sequence, message.stamp_ns, message.payload)
+                break
+            else:
+                return
+
+    def _resume_lane(self) -> None:
+        self._use_lane()
+        self._direct = False
+        self._pump()
+
+    def _set_bounds(self) -> None:
+        """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
+        if self.link is not None:
+            for lane in (self.link.express, self.link.bulk):
+                lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
+
+
+def make_route_sender(link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
+    """Make the kind of sender that the contract's reliability needs."""
+    if contract.reliability is Reliability.RELIABLE:
+        return ReliableRouteSender(link, route, contract, epoch, large=large)
+    return RouteSender(link, route, contract, large=large)
+
+
+class ExportFlow:
+    """From one local publisher to the peers that want it, each by a route sender of its own."""
+
+    __slots__ = (
+        "_history",
+        "_keeping",
+        "_received",
+        "_senders",
+        "_size",
+        "_stamp",
+        "_streaming",
+        "_whole",
+        "by_peer",
+        "bytes",
+        "dropped",
+        "large",
+        "latching",
+        "messages",
+        "oversized",
+        "oversized_bytes",
+    )
+
+    def __init__(self) -> None:
+        self.by_peer: dict[int, RouteSender] = {}
+        self._senders: tuple[RouteSender, ...] = ()
+        self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
+        """Bytes and stamps of the last messages, for routes that are opened later."""
+        self._keeping = False
+        self._streaming: list[RouteSender] = []
+        """The senders that pass on the present message in parts."""
+        self._whole: bytearray | None = None
+        """The present message so far, where a sender or the history needs it whole."""
+        self._size = self._received = self._stamp = 0
+        self.latching = False
+        """Whether the publisher latches: a route opened later gets its last message, whatever the contract."""
+        self.large = False
+        """Whether the publisher has sent a message that came in parts."""
+        self.messages = 0
+        self.bytes = 0
+        self.dropped = 0
+        self.oversized = self.oversized_bytes = 0
+        """Messages that were left out because they are too long; size of the last one, in bytes."""
+
+    def left_out(self, size: int) -> None:
+        """Count a message of ``size`` bytes that was too long."""
+        self.oversized += 1
+        self.oversized_bytes = size
+
+    def latch(self) -> None:
+        """Keep the last message: the publisher latches."""
+        self.latching = True
+        self.keep(1)
+
+    def keep(self, depth: int) -> None:
+        """Keep at least the last ``depth`` messages, at most ``ros.limits.LATCHED_MAX``, for routes opened later."""
+        self._keeping = True
+        if depth > (self._history.maxlen or 0):
+            self._history = deque(self._history, maxlen=min(depth, ros_limits.LATCHED_MAX))
+
+    def add(self, peer: int, link: PeerLink, route: int, contract: Contract, epoch: int) -> RouteSender:
+        """Send to one more peer; first the kept messages that its contract, or the latching publisher, allows."""
+        self.remove(peer)
+        sender = make_route_sender(link, route, contract, epoch, large=self.large)
+        if contract.durability is Durability.TRANSIENT_LOCAL:
+            self.keep(contract.kept)
+        # Messages kept only for another peer's contract are old data here, perhaps old commands.
+        kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
+        for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
+            sender.message(stamp, framed)
+        self.by_peer[peer] = sender
+        self._senders = tuple(self.by_peer.values())
+        return sender
+
+    def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """Suspend the reliable route of a peer whose link is gone; see ``ReliableRouteSender.suspend``."""
+        sender = self.by_peer.get(peer)
+        if isinstance(sender, ReliableRouteSender):
+            sender.suspend(keep)
+
+    def remove(self, peer: int) -> None:
+        """Stop sending to a peer."""
+        sender = self.by_peer.pop(peer, None)
+        if sender is not None:
+            sender.close()
+            self._senders = tuple(self.by_peer.values())
+            if sender in self._streaming:
+                self._streaming.remove(sender)
+
+    def close(self) -> None:
+        """Remove all peers, and free the kept messages, which may be large."""
+        for peer in tuple(self.by_peer):
+            self.remove(peer)
+        self._history.clear()
+        self._whole = None
+
+    def message(self, framed: memoryview) -> None:
+        """Pass one message on; ``framed`` has its length in front and is valid during the call only."""
+        stamp = time.time_ns()
+        self.messages += 1
+        self.bytes += len(framed)
+        for sender in self._senders:
+            dropped = sender.message(stamp, framed)
+            if dropped:
+                self.dropped += dropped
+        if self._keeping:
+            self._history.append((bytes(framed), stamp))
+
+    def begin(self, size: int) -> None:
+        """Begin a message of ``size`` bytes, length field included, that comes in parts."""
+        self._stamp = time.time_ns()
+        self._size, self._received = size, 0
+        self.large = True
+        self._streaming = [sender for sender in self._senders if sender.begin(self._stamp, size)]
+        self._whole = bytearray() if self._keeping or len(self._streaming) < len(self._senders) else None
+
+    def part(self, part: memoryview) -> None:
+        """Pass on a part of the message; ``part`` is valid during the call only."""
+        for sender in self._streaming:
+            self.dropped += sender.part(part)
+        if self._whole is not None:
+            self._whole += part
+        self._received += len(part)
+        if self._received >= self._size:
+            self._complete()
+
+    def abort(self) -> None:
+        """Abort the message that comes in parts: the publisher closed its connection."""
+        for sender in self._streaming:
+            sender.abort()
+        self._streaming = []
+        self._whole = None
+
+    def _complete(self) -> None:
+        self.messages += 1
+        self.bytes += self._size
+        streamed, self._streaming = self._streaming, []
+        if self._whole is None:
+            return
+        whole, self._whole = bytes(self._whole), None
+        for sender in self._senders:
+            if sender not in streamed:
+                self.dropped += sender.message(self._stamp, whole)
+        if self._keeping:
+            self._history.append((whole, self._stamp))

@@ -1,1 +1,0 @@
-"""What direct transport asks of nodes and of the kernel."""

@@ -1,1 +1,0 @@
-"""The bridge itself, and its parts for nodes (list, ping, kill) and for limits."""

@@ -1,0 +1,439 @@
+"""Nodes of which nothing crosses: each peer is told of them, and they stand in every graph by their proxies.
+
+Topics and services bring the proxies of their nodes. A node that only subscribes, or whose services stay home, would
+not be known to ``rosnode`` in the other modules. Its proxy is registered with one service of its own,
+``~get_loggers``, as every ROS node has it: no publisher, relay or subscriber takes notice of that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.messages import is_crossing_name
+from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, Policy, is_own
+from rmpa.bridge.proxies import ProxyCallbacks, proxied_node
+from rmpa.bridge.sessions import Part
+from rmpa.bridge.topics.direct import MEASURING
+from rmpa.config import limits as config_limits
+from rmpa.config.peer_rules import Access
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.identity import is_global_name, matches
+from rmpa.ros import limits as ros_limits
+from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
+from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
+from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.node.slave_node import GET
+from rmpa.ros.wire.tcpros import LENGTH
+from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.runtime.loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping
+
+    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.services.part import Services
+    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.topics.part import Topics
+    from rmpa.config.settings import Settings
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.master.parameters import GraphChange
+    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.slave_node import SlaveNode
+
+NODES: Final = "nodes"
+"""The notification of the sender's nodes of which nothing crosses: ``nodes``, their names."""
+_HELD: Final = "node"
+_EVERYWHERE: Final = "/rosout"
+"""Every module has this node."""
+_NO_LOGGERS: Final = LENGTH.pack(0)
+
+
+class NodePresence(Part):
+    """The part of the bridge that tells of nodes and shows those of peers.
+
+    Args:
+        core: The local core.
+        sessions: The peers.
+        rpc: Sends and receives the notifications.
+        topics: The part with the topics' plans.
+        services: The part with the services' plans.
+        settings: The agent's settings: ``limits.nodes`` bounds how many are shown of one peer, and told to it.
+        visible: ``(peer) -> nodes``: which nodes a peer may know of.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        sessions: PeerSessions,
+        rpc: PeerRpc,
+        topics: Topics,
+        services: Services,
+        settings: Settings,
+        visible: Callable[[str], Collection[str]],
+    ) -> None:
+        self._core = core
+        self._sessions = sessions
+        self._rpc = rpc
+        self._topics = topics
+        self._services = services
+        self._max = settings.limits.nodes
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
+        self._visible = visible
+        self._told: dict[int, tuple[str, ...]] = {}
+        """What each linked peer was told, by the number of its session."""
+        self._shown: dict[int, set[str]] = {}
+        """The nodes that each peer has told of."""
+        self._soon: asyncio.TimerHandle | None = None
+        rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
+
+    async def close(self) -> None:
+        """Tell nothing any more."""
+        if self._soon is not None:
+            self._soon.cancel()
+
+    def reload(self, settings: Settings) -> None:
+        """Take other rules for peers, and another limit."""
+        self._max = settings.limits.nodes
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
+        self._later()
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Tell the peers soon, unless it was a proxy that came or went."""
+        if not is_own(change.node):
+            self._later()
+
+    def reconcile(self) -> None:
+        """Register missing proxies again: the core has been restarted."""
+        services = self._core.state().services
+        for peer, nodes in self._shown.items():
+            session = self._sessions.get(peer)
+            for node in nodes:
+                proxy = session.proxies.get(node) if session is not None else None
+                if proxy is not None and _service(proxy) not in services:
+                    self._register(proxy)
+
+    # --- to the peers -------------------------------------------------------------------------------------------
+
+    def link_up(self, session: PeerSession) -> None:
+        """Tell a peer with a new link."""
+        self._told.pop(session.peer, None)
+        self._later()
+
+    def link_down(self, session: PeerSession) -> None:
+        """Forget what a peer was told: it is told anew over its next link."""
+        self._told.pop(session.peer, None)
+
+    def _later(self) -> None:
+        """In a moment: a node that starts registers its loggers first, and then perhaps a topic that crosses."""
+        if self._soon is None:
+            self._soon = asyncio.get_running_loop().call_later(limits.NODES_PAUSE, self._tell)
+
+    def _tell(self) -> None:
+        if self._soon is not None:
+            self._soon.cancel()
+            self._soon = None
+        crossing = {source.node for source in self._topics.exports.offered}
+        crossing |= {server.node for server in self._services.exports.offered.values()}
+        nodes = [
+            node
+            for node in self._core.state().nodes
+            if node not in crossing
+            and node != _EVERYWHERE
+            and not is_own(node)
+            and not node.startswith(MEASURING)
+            and is_crossing_name(node)
+        ]
+        for session in self._sessions.linked():
+            peer = session.link.name
+            visible = self._visible(peer)
+            names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[: self._max])
+            if names != self._told.get(session.peer):  # over a new link also that there are none any more
+                self._told[session.peer] = names
+                self._rpc.notify(session, NODES, {"nodes": list(names)})
+
+    def _passes(self, peer: str, node: str) -> bool:
+        """Whether the rules for a peer let a node's name cross, as they do its topics and services."""
+        return self._policy.judge_for(peer, node, wire=node).allowed
+
+    # --- of the peers -------------------------------------------------------------------------------------------
+
+    def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
+        told = args.get("nodes")
+        names: list[Any] = told[: self._max] if isinstance(told, list) else [None]
+        if not all(isinstance(name, str) and is_crossing_name(name) for name in names):
+            raise RemoteProtocolError(f"{NODES} has no list of nodes' names")
+        wanted = {name for name in names if self._passes(session.link.name, name)}
+        shown = self._shown.setdefault(session.peer, set())
+        for node in sorted(shown - wanted):
+            session.proxies.release(node, _HELD)
+        for node in sorted(wanted - shown):
+            session.proxies.hold(node, _HELD, ProxyCallbacks(self._show, self._hide))
+        self._shown[session.peer] = wanted
+
+    def gone(self, session: PeerSession) -> None:
+        """Forget a peer; its proxies go with its session."""
+        self._told.pop(session.peer, None)
+        for node in self._shown.pop(session.peer, ()):
+            session.proxies.release(node, _HELD)
+
+    def _show(self, proxy: SlaveNode) -> None:
+        proxy.add_service(ServiceEndpoint(_service(proxy), proxy.name, _answer, description=GET))
+        self._register(proxy)
+
+    def _register(self, proxy: SlaveNode) -> None:
+        self._core.call("registerService", proxy.name, _service(proxy), proxy.service_uri, proxy.uri)
+
+    def _hide(self, proxy: SlaveNode) -> None:
+        self._core.call("unregisterService", proxy.name, _service(proxy), proxy.service_uri)
+        proxy.remove_service(_service(proxy))
+
+
+def _service(proxy: SlaveNode) -> str:
+    return f"{proxy.name}/get_loggers"
+
+
+def _answer(call: ServiceCall) -> None:
+    """No logger of a node of another module is set from here."""
+    call.reply(True, _NO_LOGGERS)
+
+
+# Answers ``rosnode kill`` of a proxy: asks the agent of the node's module to end the node itself.
+
+
+_log = logging.getLogger(__name__)
+
+KILL: Final = "node.kill"
+"""The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
+
+The response is a ``NodeEnd``.
+"""
+_REFUSED: Final = 0
+
+
+class ProxyKills:
+    """Answers the ``shutdown`` calls to proxies and to the agent's own node.
+
+    ``rosnode kill -a`` calls every node of the graph in the order of their names, so the agent's own node comes
+    before the proxies. It ends only the nodes of this module; nodes of other modules live on.
+
+    Args:
+        rpc: Sends the requests.
+    """
+
+    def __init__(self, rpc: PeerRpc) -> None:
+        self._rpc = rpc
+        self._all: dict[str, float] = {}
+        self._under_way = 0
+
+    async def own(self, caller: str, reason: str) -> RosReply:
+        """Refuse to end the agent's own node, and remember the caller for ``limits.NODE_KILL_ALL`` seconds."""
+        now = asyncio.get_running_loop().time()
+        self._all = {other: until for other, until in self._all.items() if until > now}
+        if len(self._all) < limits.NODE_KILLS_AT_ONCE:
+            self._all[caller] = now + limits.NODE_KILL_ALL
+        _log.info("= %s asks the agent's own node to end (%s): it stays, end the agent instead", caller, reason)
+        return RosReply(_REFUSED, "this node is the agent; it ends with `rmpa up`", 0)
+
+    async def proxy(self, session: PeerSession, node: str, caller: str, reason: str) -> RosReply:
+        """End the node that a proxy stands for, because the proxy was asked to end.
+
+        Args:
+            session: The peer that has the node.
+            node: The node's name in the peer's graph.
+            caller: The caller's node.
+            reason: The caller's reason, as text.
+        """
+        whose = f"{session.link.name}:{node}"
+        if caller == MASTER_ID:
+            # Another local node took the proxy's name. That does not concern the node at the peer.
+            _log.warning("! another node has the name of the proxy of %s", whose)
+            return RosReply(1, "shutdown", 0)
+        problem = await self._ask(session, node, caller, reason)
+        if problem:
+            _log.warning("! %s, which %s asks to end, lives on: %s", whose, caller, problem)
+            return RosReply(_REFUSED, problem, 0)
+        _log.info("= %s was ended for %s (%s)", whose, caller, reason)
+        return RosReply(1, "shutdown", 0)
+
+    async def _ask(self, session: PeerSession, node: str, caller: str, reason: str) -> str:
+        """Asks the peer to end the node; returns why it is not ended, or empty."""
+        loop = asyncio.get_running_loop()
+        if self._all.get(caller, 0.0) > loop.time():
+            self._all[caller] = loop.time() + limits.NODE_KILL_ALL
+            return "kill -a ends the nodes of this module only; name a node of another module to end it"
+        if not session.linked:
+            return f"{session.link.name} is not linked"
+        if self._under_way >= limits.NODE_KILLS_AT_ONCE:
+            return f"{self._under_way} other nodes are being ended; try again"
+        self._under_way += 1
+        try:
+            args = {"node": node, "by": caller, "reason": reason[: limits.ASK_NAME_MAX]}
+            answer = await self._rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
+        except RmpaError as error:
+            return str(error)
+        finally:
+            self._under_way -= 1
+        if isinstance(answer, dict) and answer.get("gone"):
+            return ""
+        return f"it was asked, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"
+
+
+# The peers' requests about this module's nodes: list, describe, ping and end them.
+
+
+LIST: Final = "node.list"
+"""The request for a module's own nodes."""
+INFO: Final = "node.info"
+"""The request for the facts about a ``node``: ``NodeFacts``."""
+PING: Final = "node.ping"
+"""The request to ping a ``node``."""
+_VISIBLE: Final = Needs(
+    (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
+    "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
+)
+REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
+"""The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
+
+
+class NodeRequests:
+    """Answers the peers' requests about this module's nodes.
+
+    Args:
+        settings: The agent's settings.
+        core: The local core.
+        asks: Receives the requests.
+        gate: Decides which nodes each peer may end.
+    """
+
+    def __init__(self, settings: Settings, core: Core, asks: PeerRpc, gate: PermissionGate = OPEN_GATE) -> None:
+        self._gate = gate
+        self._settings = settings
+        self._core = core
+        asks.on_request(LIST, self._list, _VISIBLE)
+        asks.on_request(INFO, self._info, _VISIBLE)
+        asks.on_request(PING, self._ping, _VISIBLE)
+        asks.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
+
+    def reload(self, settings: Settings) -> None:
+        """Take new settings."""
+        self._settings = settings
+
+    def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
+        state, peer = self._core.state(), asker.link.name
+        problems = {node: found.problem for node, found in self._core.unreachable().items()}
+        publishers, subscribers, services = self._tables(peer)
+        found = list_nodes(publishers, subscribers, services, state.nodes, problems, yielding_to_data)
+        return tuple(line for line in found if not is_own(line.name))
+
+    def _tables(self, peer: str) -> list[Mapping[str, Collection[str]]]:
+        """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
+        state = self._core.state()
+        tables: list[Mapping[str, Collection[str]]] = [state.publishers, state.subscribers, state.services]
+        if not self._gate.on:
+            return tables
+        return [
+            {
+                name: nodes
+                for name, nodes in yielding_to_data(list(table.items()))
+                if self._gate.judge(access, peer, name).allowed
+            }
+            for access, table in zip((Access.SUBSCRIBE, Access.PUBLISH, Access.CALL), tables, strict=True)
+        ]
+
+    def visible(self, peer: str) -> Collection[str]:
+        """The nodes that a peer is told of: those of which it may have something."""
+        if not self._gate.on:
+            return self._core.state().nodes
+        return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
+
+    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+        self._own(args, self.visible(asker.link.name))
+        return self._permitted(asker.link.name, await self.info(args))
+
+    async def info(self, args: Mapping[str, object]) -> NodeFacts:
+        """The facts about the ``node`` of this module that a request names.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        node, uri = self._own(args)
+        state = self._core.state()
+        facts = describe_node(node, uri, state.publishers, state.subscribers, state.services, state.types)
+        try:
+            answer = await ping_node(node, uri, OWN_NODE)
+        except RmpaError as error:
+            return msgspec.structs.replace(facts, problem=str(error))
+        names = {address: name for name, address in state.nodes.items()}
+        connections = await node_connections(uri, OWN_NODE, names)
+        return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
+
+    def _permitted(self, asker: str, facts: NodeFacts) -> NodeFacts:
+        """The facts about a node, without the names of what a peer may not have."""
+
+        def may(access: Access, name: str) -> bool:
+            return self._gate.judge(access, asker, name).allowed
+
+        connections = facts.connections
+        if connections is not None:
+            needed = {True: Access.PUBLISH, False: Access.SUBSCRIBE}
+            connections = tuple(one for one in connections if may(needed[one.inbound], one.topic))
+        return msgspec.structs.replace(
+            facts,
+            publications={name: kind for name, kind in facts.publications.items() if may(Access.SUBSCRIBE, name)},
+            subscriptions={name: kind for name, kind in facts.subscriptions.items() if may(Access.PUBLISH, name)},
+            services=tuple(name for name in facts.services if may(Access.CALL, name)),
+            connections=connections,
+        )
+
+    async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
+        node, uri = self._own(args, self.visible(asker.link.name))
+        return await ping_node(node, uri, OWN_NODE)
+
+    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
+        peer = asker.link.name
+        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+        if why := self._gate.why_not(Access.KILL, peer, named):
+            raise RmpaError(why)  # before whether there is such a node
+        nodes = [node for node in self._core.state().nodes if self._gate.judge(Access.KILL, peer, node).allowed]
+        node, uri = self._own(args, nodes)
+        who = f"{peer}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
+        here = self._settings.name
+        if not any(matches(glob, node) for glob in self._settings.nodes.kill):
+            _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
+            raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
+        _log.warning("= %s ends %s", who, node)
+        gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
+        self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
+        return NodeEnd(gone=gone)
+
+    def _own(self, args: Mapping[str, object], told: Collection[str] | None = None) -> tuple[str, str]:
+        """The node of this module that a request names, and its slave API.
+
+        Args:
+            args: The request's.
+            told: The nodes that may be told of; ``None``: all.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        here = self._settings.name
+        node = args.get("node")
+        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
+            raise RmpaError("the question names no node")
+        if is_own(node):
+            origin = proxied_node(node)
+            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
+            raise RmpaError(f"{node} is no node of {here}: {whose}")
+        nodes = self._core.state().nodes
+        known = nodes if told is None else told
+        if node not in known or node not in nodes:
+            near = did_you_mean(node, [name for name in known if not is_own(name)])
+            raise RmpaError(f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""))
+        return node, nodes[node]

@@ -1,0 +1,566 @@
+"""Translates names between a peer's graph and the local one: pure functions of the ``[[peer]]`` rules.
+
+*Wire* names are those that cross: topics and services as the module has them that publishes or provides them. ::
+
+    their graph   wire            our graph
+    /odom  ─────► /odom  ──in───► /robot1/odom      prefix = "/robot1"
+    /cmd_vel ◄─── /cmd_vel ◄─out─ /robot1/cmd_vel
+
+The first rule that fits renames a name, once; the result is not renamed again. Only a relay offers the proxies of
+other modules, and never to the module that they came from, so no rule can make a message loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Protocol
+from weakref import WeakValueDictionary
+
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.config import limits
+from rmpa.config.peer_rules import PEER
+from rmpa.config.rules import CLOCK
+from rmpa.core.counters import remedy
+from rmpa.core.errors import RmpaError, StartError
+from rmpa.core.identity import Guid, Identity, matches
+from rmpa.ros.environment import is_loopback
+from rmpa.ros.node.listeners import SharedListener
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage
+from rmpa.runtime.loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Collection, Hashable, Iterable, Iterator
+
+    from rmpa.bridge.messages import Origin
+    from rmpa.config.settings import PeerRule
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.publication import Publication
+
+
+class PeerNames:
+    """The names of one peer.
+
+    Args:
+        peer: The peer's name.
+        rules: All ``[[peer]]`` tables, in the order of the file; those for other peers are ignored.
+    """
+
+    def __init__(self, peer: str, rules: Iterable[PeerRule] = ()) -> None:
+        mine = [rule for rule in rules if matches(rule.name, peer)]
+        prefix = next((rule.prefix for rule in mine if rule.prefix), "").replace(PEER, peer)
+        self._in = [_filled(each, peer) for rule in mine for each in rule.remap_in]
+        self._out = [_filled(each, peer) for rule in mine for each in rule.remap_out]
+        self.prefix: Final = prefix
+        """The prefix of the peer's names in the local graph, such as ``/robot1``, or empty."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether no rule renames anything of this peer."""
+        return not (self.prefix or self._in or self._out)
+
+    def local_name(self, wire: str) -> str:
+        """The local name of a peer's topic or service."""
+        if wire == CLOCK:
+            return wire  # nodes read the time from no other topic
+        for source, target in self._in:
+            if (new := _renamed(wire, source, target)) is not None:
+                return new
+        return self.prefix + wire
+
+    def wire_name(self, local: str) -> str:
+        """The wire name, for this peer, of a local topic or service."""
+        if local == CLOCK:
+            return local
+        for source, target in self._out:
+            if (new := _renamed(local, source, target)) is not None:
+                return new
+        if self.prefix and local.startswith(self.prefix + "/"):
+            return local[len(self.prefix) :]
+        return local
+
+    def wires_of(self, local: str) -> tuple[str, ...]:
+        """The wire names that become this local name, best first."""
+        names = [old for source, target in self._in if (old := _undone(local, source, target)) is not None]
+        names.append(local if not self.prefix else local.removeprefix(self.prefix))
+        return tuple(n for n in dict.fromkeys(names) if n and self.local_name(n) == local)
+
+    def locals_of(self, wire: str) -> tuple[str, ...]:
+        """The local names that become this wire name, best first."""
+        names = [old for source, target in self._out if (old := _undone(wire, source, target)) is not None]
+        names += [self.prefix + wire, wire]
+        return tuple(n for n in dict.fromkeys(names) if self.wire_name(n) == wire)
+
+
+class Names:
+    """The names of all peers; one immutable set of rules for all parts, replaced when the rules change.
+
+    Args:
+        rules: All ``[[peer]]`` tables, in the order of the file.
+    """
+
+    def __init__(self, rules: tuple[PeerRule, ...] = ()) -> None:
+        self._rules = rules
+        self._known: dict[str, PeerNames] = {}
+
+    def of(self, peer: str) -> PeerNames:
+        """The names of one peer, by the peer's name."""
+        known = self._known.get(peer)
+        if known is None:
+            if len(self._known) >= limits.NAMES_REMEMBERED:
+                self._known.clear()
+            known = self._known[peer] = PeerNames(peer, self._rules)
+        return known
+
+    def local_name(self, peer: str, wire: str) -> str:
+        """The local name of a peer's topic or service."""
+        return self.of(peer).local_name(wire)
+
+    def wire_name(self, peer: str, local: str) -> str:
+        """The wire name of a local topic or service for a peer."""
+        return self.of(peer).wire_name(local)
+
+
+def _filled(renaming: tuple[str, str], peer: str) -> tuple[str, str]:
+    source, target = renaming
+    return source.replace(PEER, peer), target.replace(PEER, peer)
+
+
+def _undone(name: str, source: str, target: str) -> str | None:
+    """The name that a rule turns into ``name``; ``None`` if there is none."""
+    if not target.endswith("/**"):
+        return source if name == target and not source.endswith("/**") else None
+    stem = target[:-3]
+    if name != stem and not name.startswith(stem + "/"):
+        return None
+    return source[:-3] + name[len(stem) :] or None
+
+
+def _renamed(name: str, source: str, target: str) -> str | None:
+    """The name as one rule renames it; ``None`` if the rule does not fit."""
+    if not source.endswith("/**"):
+        return target if name == source else None
+    stem = source[:-3]
+    if name != stem and not name.startswith(stem + "/"):
+        return None
+    return target[:-3] + name[len(stem) :] or None
+
+
+# The names of proxies in the local graph.
+
+
+def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
+    """The namespace of one peer's proxies: ``/rmpa/<name>``.
+
+    Args:
+        peer: The peer.
+        taken: Prefixes of other modules. Two modules of one name must not share a prefix, or their proxies would
+            replace each other in the graph.
+    """
+    prefix = f"{OWN_NODE}/{peer.name}"
+    if prefix in taken:
+        address, port = peer.guid.endpoint
+        prefix = f"{prefix}_{address.replace('.', '_')}_{port}"
+    return prefix
+
+
+def proxy_name(prefix: str, node: str) -> str:
+    """The name of a node's proxy: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
+    return prefix + node
+
+
+def proxied_node(name: str) -> tuple[str, str] | None:
+    """The peer's name and the node that a proxy stands for; ``None`` for a node of this module."""
+    if not name.startswith(OWN_NODE + "/"):
+        return None
+    peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
+    return (peer, slash + node) if node else None
+
+
+def proxied_peer(name: str) -> str | None:
+    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
+    proxy = proxied_node(name)
+    return proxy[0] if proxy is not None else None
+
+
+# Makes the proxy nodes; where possible, all of them share one pair of listening sockets.
+
+
+_log = logging.getLogger(__name__)
+_SOCKETS: Final = 2
+"""The listening sockets of one node: XML-RPC and TCPROS."""
+
+
+class ProxyNodes:
+    """Makes proxies, and owns the listener that they share.
+
+    On loopback all proxies share a listener, and each has an address of its own. Where nodes of other machines must
+    reach them, or this machine does not allow it, each has two listening sockets.
+
+    Args:
+        core: The local core.
+        counters: Where refusals at the proxies' ports are counted.
+    """
+
+    def __init__(self, core: Core, counters: Counters | None = None) -> None:
+        self._core = core
+        self._counters = counters
+        self._listener: SharedListener | None = None
+        self._made: WeakValueDictionary[str, SlaveNode] = WeakValueDictionary()
+        """The last node of each name."""
+        self.listening = ""
+        """How the proxies listen, as text: at which ports, or why each has two sockets of its own."""
+
+    def sockets(self, proxies: int) -> int:
+        """The number of listening sockets for a number of proxies."""
+        return _SOCKETS if self._listener is not None else _SOCKETS * proxies
+
+    async def start(self) -> None:
+        """Open the shared listener, if this host allows it."""
+        host = self._core.node_host
+        if not is_loopback(host):
+            self.listening = f"two for each: nodes of other machines reach them, at {self._core.node_address}"
+            return
+        listener = SharedListener(self._core.uri, counters=self._counters)
+        try:
+            await listener.start()
+        except StartError as error:
+            self.listening = f"two for each, at {host}: all cannot share two ({error.problem})"
+            _log.info("= proxies listen by sockets of their own, %s", self.listening)
+            return
+        self._listener = listener
+        xmlrpc, tcpros = listener.ports
+        self.listening = f"two for all, ports {xmlrpc} and {tcpros}, and an address 127.a.b.c for each"
+
+    async def close(self) -> None:
+        """Close the shared listener; call it after all proxies are closed."""
+        if self._listener is not None:
+            await self._listener.close()
+            self._listener = None
+
+    def make(self, name: str, on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None) -> SlaveNode:
+        """Make a proxy, which is not started.
+
+        Args:
+            name: Its name in the local graph.
+            on_kill: ``(caller id, reason) -> reply``: called when it is asked to end (``rosnode kill``).
+
+        Raises:
+            OSError: It would have sockets of its own, and too few file descriptors are left (``EMFILE``).
+        """
+        if self._listener is None:
+            with DESCRIPTORS.open_socket(Use.PROXY, what=f"the proxy {name}"):
+                pass  # only checks that there is room for its sockets, and for connections to them
+        node = self._made[name] = SlaveNode(
+            name,
+            self._core.node_host,
+            self._core.uri,
+            advertised_host=self._core.node_address,
+            listener=self._listener,
+            counters=self._counters,
+            on_kill=on_kill,
+        )
+        return node
+
+    def publication(self, name: str, uri: str, topic: str) -> Publication | None:
+        """The topic of a proxy of this process, for subscribers of this process; ``None`` if there is none.
+
+        Args:
+            name: The proxy.
+            uri: Its slave API, which tells it from an earlier proxy of that name.
+            topic: The topic.
+        """
+        node = self._made.get(name)
+        return node.publication(topic) if node is not None and node.uri == uri else None
+
+
+# The nodes in the local graph that stand for the nodes of one peer.
+
+
+async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
+    return RosReply(0, f"{node} is a node of another module", 0)
+
+
+def _nothing(_node: SlaveNode) -> None:
+    """Does nothing: the user has nothing to remove from the proxy."""
+
+
+class ProxyUser(Protocol):
+    """What a topic or service does with its proxy."""
+
+    __slots__ = ()
+
+    def ready(self, node: SlaveNode) -> None:
+        """The proxy exists: register the topic or service there."""
+
+    def left(self, node: SlaveNode) -> None:
+        """Remove the topic or service from the proxy, which may be closed afterwards."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProxyCallbacks:
+    """A user of a proxy by functions, which get the proxy; see ``ProxyUser``."""
+
+    ready: Callable[[SlaveNode], None]
+    left: Callable[[SlaveNode], None] = _nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hold:
+    """A topic or service for which a proxy is kept.
+
+    Args:
+        node: The peer's node.
+        key: Identifies the topic or service among those of its node.
+        user: The topic or service.
+    """
+
+    node: str
+    key: Hashable
+    user: ProxyUser
+
+
+@dataclass(frozen=True, slots=True)
+class _Release:
+    """A request to remove a topic or service from its proxy."""
+
+    node: str
+    key: Hashable
+
+
+@dataclass(slots=True)
+class Proxy:
+    """The proxy of one node of a peer.
+
+    Args:
+        node: The local node that stands for it.
+        held: The topics and services for which it is kept, by key.
+    """
+
+    node: SlaveNode
+    held: dict[Hashable, _Hold] = field(default_factory=dict)
+
+
+class PeerProxies:
+    """The proxies of one peer; each exists while a topic or service holds it.
+
+    Making a proxy may bind sockets, which takes a turn of the loop. Therefore one task makes all changes of the
+    graph, in the order of the calls.
+
+    Args:
+        prefix: The namespace of this peer's proxies.
+        nodes: Makes the proxies.
+        on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this peer's node is asked to end.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        nodes: ProxyNodes,
+        on_kill: Callable[[str, str, str], Awaitable[RosReply]] = _refuse_to_end,
+    ) -> None:
+        self.prefix = prefix
+        self._nodes = nodes
+        self._on_kill = on_kill
+        self._proxies: dict[str, Proxy] = {}
+        self._holds: dict[tuple[str, Hashable], _Hold] = {}
+        self._jobs: deque[_Hold | _Release] | None = None
+        self._incomplete = False
+        """Whether a change of the graph failed, so that ``reconcile`` has something to mend."""
+        self.problems: dict[str, str] = {}
+        """Why the proxy of a node could not be made, as text by node; ``reconcile`` tries again."""
+        self.names: dict[str, str] = {}
+        """Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``."""
+        self._task: asyncio.Task[None] | None = None
+        """Carries out the queued changes; ``None`` while there are none."""
+
+    def __len__(self) -> int:
+        return len(self._proxies)
+
+    def __iter__(self) -> Iterator[tuple[str, Proxy]]:
+        """Each node of the peer that has a proxy, and the proxy."""
+        return iter(self._proxies.items())
+
+    def name(self, node: str) -> str:
+        """The name of the proxy of one of the peer's nodes."""
+        return self.names.get(node) or proxy_name(self.prefix, node)
+
+    def get(self, node: str) -> SlaveNode | None:
+        """The proxy of one of the peer's nodes; ``None`` if it does not exist."""
+        proxy = self._proxies.get(node)
+        return proxy.node if proxy is not None else None
+
+    def hold(
+        self,
+        node: str,
+        key: Hashable,
+        user: ProxyUser,
+    ) -> None:
+        """Keep a proxy for a node because of one topic or service, until ``release``.
+
+        Args:
+            node: In the peer's graph.
+            key: Identifies the topic or service for ``release``.
+            user: Its ``ready`` is called in a later turn of the loop, and after that its ``left``.
+        """
+        job = self._holds[node, key] = _Hold(node, key, user)
+        self._do(job)
+
+    def release(self, node: str, key: Hashable) -> None:
+        """Remove a topic or service from its proxy in a later turn of the loop; the last one closes the proxy."""
+        self._holds.pop((node, key), None)
+        self._do(_Release(node, key))
+
+    def reconcile(self) -> None:
+        """Try failed proxies again, and forget names and problems of nodes that have gone."""
+        if self._jobs:
+            return
+        if self.names or self.problems:
+            there = set(self._proxies)
+            there.update(node for node, _ in yielding_to_data(list(self._holds)))
+            self.names = {node: name for node, name in self.names.items() if node in there}
+            self.problems = {node: text for node, text in self.problems.items() if node in there}
+        if not self._incomplete:
+            return
+        self._incomplete = False
+        for hold in yielding_to_data(list(self._holds.values())):
+            proxy = self._proxies.get(hold.node)
+            if proxy is None or proxy.held.get(hold.key) is not hold:
+                self._do(hold)
+
+    async def close(self) -> None:
+        """Carry out the queued changes, then close all proxies."""
+        while self._task is not None:
+            await self._task
+        for node in list(self._proxies):
+            await self._close_proxy(node)
+
+    def _do(self, job: _Hold | _Release) -> None:
+        if self._jobs is None:
+            self._jobs = deque()
+        self._jobs.append(job)
+        if self._task is None:
+            self._task = asyncio.create_task(self._work(), name=f"proxies {self.prefix}")
+
+    async def _work(self) -> None:
+        while self._jobs:
+            job = self._jobs.popleft()
+            try:
+                await (self._hold(job) if isinstance(job, _Hold) else self._release(job))
+            except (RmpaError, OSError) as error:
+                self._failed(job.node, error)
+            except Exception:  # noqa: BLE001 - the task's top: one thing that fails must not stop the others
+                _log.exception("! %s: %s failed; the others go on", self.prefix, job)
+                self._incomplete = True
+        self._jobs = self._task = None
+
+    async def _hold(self, hold: _Hold) -> None:
+        if self._holds.get((hold.node, hold.key)) is not hold:
+            return  # released meanwhile
+        proxy = await self._proxy(hold.node)
+        if self._holds.get((hold.node, hold.key)) is not hold:
+            # Released while the proxy's sockets were being made: registering it now could change a topic's type.
+            if not proxy.held:
+                await self._close_proxy(hold.node)
+        elif (before := proxy.held.get(hold.key)) is not hold:
+            if before is not None:
+                before.user.left(proxy.node)
+            hold.user.ready(proxy.node)
+            proxy.held[hold.key] = hold
+
+    async def _release(self, job: _Release) -> None:
+        proxy = self._proxies.get(job.node)
+        if proxy is None:
+            return
+        hold = proxy.held.pop(job.key, None)
+        if hold is not None:
+            hold.user.left(proxy.node)
+        if not proxy.held:
+            await self._close_proxy(job.node)
+
+    async def _proxy(self, node: str) -> Proxy:
+        """Returns the proxy of a node, and makes it if necessary."""
+        proxy = self._proxies.get(node)
+        if proxy is None:
+            made = self._nodes.make(self.name(node), lambda caller, reason: self._on_kill(node, caller, reason))
+            await made.start()
+            self.problems.pop(node, None)
+            proxy = self._proxies[node] = Proxy(made)
+        return proxy
+
+    async def _close_proxy(self, node: str) -> None:
+        proxy = self._proxies.pop(node)
+        for hold in proxy.held.values():
+            hold.user.left(proxy.node)
+        await proxy.node.close()
+
+    def _failed(self, node: str, error: Exception) -> None:
+        """Log why a proxy could not be made, once for each reason; ``reconcile`` tries again."""
+        self._incomplete = True
+        text = (
+            f"no file descriptor is left for its proxy; {remedy(os.getpid())}" if is_shortage(error) else str(error)
+        )
+        if self.problems.get(node) != text:
+            self.problems[node] = text
+            level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is reported for the process
+            _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)
+
+
+# Names the proxies: one namespace for each module that has nodes in the local graph.
+
+
+class ProxyNamespaces:
+    """The namespaces of peers and of relayed modules; no two modules share one."""
+
+    def __init__(self) -> None:
+        self._linked: dict[int, tuple[str, str]] = {}
+        """The module's instance and its namespace, by the session's number."""
+        self._relayed: dict[str, str] = {}
+        """The namespace of each relayed module, by its instance."""
+        self._reserved: set[str] = set()
+        """The instances whose namespaces are kept while they have no proxy."""
+
+    def add(self, peer: int, identity: Identity) -> str:
+        """Return the namespace of a peer, which is reserved until ``remove``."""
+        instance = identity.instance.hex()
+        prefix = proxy_prefix(identity, self._taken(instance))
+        self._linked[peer] = (instance, prefix)
+        return prefix
+
+    def remove(self, peer: int) -> None:
+        """Release the namespace of a peer that is gone for good."""
+        self._linked.pop(peer, None)
+
+    def relayed_name(self, origin: Origin, *, reserve: bool = False) -> str:
+        """The name of a relayed node's proxy, made by the same rules as for linked modules.
+
+        Args:
+            origin: Its module and node.
+            reserve: Whether the namespace is kept for good.
+        """
+        if reserve:
+            self._reserved.add(origin.instance)
+        prefix = self._relayed.get(origin.instance)
+        if prefix is None:
+            module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
+            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._taken(origin.instance))
+        return proxy_name(prefix, origin.node)
+
+    def forget_unused(self, names: Collection[str]) -> None:
+        """Forget the relayed modules that have no proxy among ``names``."""
+        self._relayed = {
+            instance: prefix
+            for instance, prefix in self._relayed.items()
+            if instance in self._reserved or any(name.startswith(f"{prefix}/") for name in names)
+        }
+
+    def _taken(self, instance: str) -> set[str]:
+        """The namespaces that other modules have."""
+        linked = {prefix for other, prefix in self._linked.values() if other != instance}
+        return linked | {prefix for other, prefix in self._relayed.items() if other != instance}

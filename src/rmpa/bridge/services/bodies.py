@@ -1,0 +1,555 @@
+"""How requests and replies cross a link: small ones by the express lane, larger ones by the bulk lane in fragments.
+
+No part of a call may be dropped silently. ``Budget`` bounds what waits for a slow link, and a call that would exceed
+it fails with that reason.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.core import limits as core_limits
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError, RmpaError
+from rmpa.core.limits import KIB, MIB
+from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros import limits as ros_limits
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
+from rmpa.runtime.loop import yield_to_data
+
+if TYPE_CHECKING:
+    from rmpa.bridge.messages import Origin
+    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.ros.wire.tcpros import ServiceDescription
+    from rmpa.runtime.tls import Buffer
+
+_LENGTH: Final = 4
+_HEAD_MAX: Final = 1
+"""Bytes in front of a reply that state whether the call succeeded."""
+_PORTION: Final = 256 * KIB
+"""Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run."""
+_AHEAD: Final = 4 * MIB
+"""Bytes waiting on the bulk lane above which no further portion is copied to it."""
+_WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
+"""Bytes of a body, head included, up to which it is sent in one frame."""
+_PAUSE: Final = 0.005
+"""Seconds between two checks of how much waits on the bulk lane."""
+
+
+class Budget:
+    """Counts the bytes that the calls of one peer hold, and limits them.
+
+    Args:
+        limit: How many bytes may be held at once.
+    """
+
+    def __init__(self, limit: int = limits.SERVICE_BYTES) -> None:
+        self.limit = limit
+        self.used = 0
+
+    def take(self, size: int) -> bool:
+        """Reserve ``size`` bytes and return ``True``, if there is room; an empty budget has room for any size."""
+        if self.used and self.used + size > self.limit:
+            return False
+        self.used += size
+        return True
+
+    def give(self, size: int) -> None:
+        """Return ``size`` reserved bytes."""
+        self.used -= size
+
+
+class BodySender:
+    """Sends bodies on one route of a link.
+
+    Small bodies stay in order, and so do large ones; a small body may overtake a large one.
+
+    Args:
+        link: The link to the peer.
+        route: The route's number, chosen by the receiver.
+    """
+
+    def __init__(self, link: PeerLink, route: int) -> None:
+        self._link: PeerLink | None = link
+        self._route = route
+        self._large: deque[tuple[int, bytes, Buffer, Budget | None]] = deque()
+        self._task: asyncio.Task[None] | None = None
+        for lane in (link.express, link.bulk):
+            lane.set_terms(route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
+
+    def send(self, sequence: int, body: Buffer, head: bytes = b"", budget: Budget | None = None) -> bool:
+        """Send one body; return whether it takes the bulk lane. After ``close`` it is dropped.
+
+        Args:
+            sequence: The number of the call.
+            body: The bytes; they must not change until they were sent.
+            head: Bytes in front of the body.
+            budget: Gets the body's bytes back when they were handed to the link, or dropped.
+        """
+        link = self._link
+        size = len(head) + len(body)
+        if link is None or size <= mesh_limits.EXPRESS_MESSAGE_MAX:
+            if link is not None:
+                framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))
+                link.express.send(self._route, sequence, time.time_ns(), framed)
+            if budget is not None:
+                budget.give(len(body))
+            return False
+        self._large.append((sequence, head, body, budget))
+        if self._task is None:
+            if size <= _WHOLE:
+                self._send_whole(link.bulk)
+            else:
+                self._task = asyncio.get_running_loop().create_task(self._drain(), name=f"bodies {self._route}")
+        return True
+
+    def close(self) -> None:
+        """Send nothing more, and drop what waits."""
+        link, self._link = self._link, None
+        while self._large:
+            self._left()
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        if link is not None:
+            link.close_route(self._route)
+
+    def _left(self) -> None:
+        _, _, body, budget = self._large.popleft()
+        if budget is not None:
+            budget.give(len(body))
+
+    def _send_whole(self, lane: LaneSender) -> None:
+        sequence, head, body, _ = self._large[0]
+        size = len(head) + len(body)
+        framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))
+        lane.send(self._route, sequence, time.time_ns(), framed)
+        self._left()
+
+    async def _drain(self) -> None:
+        """Send large bodies a portion at a time: copying 64 MiB at once would block the event loop for 30 ms."""
+        while self._large and self._link is not None:
+            lane = self._link.bulk
+            sequence, head, body, _ = self._large[0]
+            size = len(head) + len(body)
+            if size <= _WHOLE:
+                self._send_whole(lane)
+                continue
+            parcel = lane.open(self._route, _LENGTH + size, sequence, time.time_ns())
+            view = memoryview(body)
+            lane.extend(parcel, b"".join((size.to_bytes(_LENGTH, "little"), head, view[:_PORTION])))
+            for start in range(_PORTION, len(view), _PORTION):
+                yield_to_data()
+                await asyncio.sleep(0)
+                while lane.outbox.pending_bytes > _AHEAD and not (lane.ended or parcel.dropped):  # noqa: ASYNC110
+                    await asyncio.sleep(_PAUSE)
+                lane.extend(parcel, view[start : start + _PORTION])
+            self._left()
+        self._task = None
+
+
+class BodyReceiver:
+    """Reassembles the bodies that arrive on one route; a ``bridge.data.io.receiver.DataHandler``, for subclasses.
+
+    Args:
+        budget: Bounds the bytes of the peer's bodies while they are reassembled.
+        most: Bytes that a body may have.
+    """
+
+    def __init__(self, budget: Budget, most: int = ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX) -> None:
+        self._budget = budget
+        self._most = most
+        self._sequence: int | None = None
+        self._buffer: bytearray | None = None
+        self._size = 0
+        self._stamp_ns = 0
+        """When the present body was sent, by the peer's clock."""
+
+    def body(self, sequence: int, body: bytes | bytearray) -> None:
+        """Handle a complete body, which belongs to the callee; it no longer counts in the budget."""
+        raise NotImplementedError
+
+    def failed(self, sequence: int, reason: str) -> None:
+        """Handle the loss of a body whose first part had arrived."""
+        raise NotImplementedError
+
+    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
+        """Handle a body that arrived in one frame."""
+        self._stamp_ns = stamp_ns
+        self.body(sequence, bytes(framed[_LENGTH:]))
+
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """Handle a part of a large body.
+
+        Raises:
+            LimitExceeded: The body's stated size is above that of a service's message.
+            RemoteProtocolError: The size is missing, or the parts have more or fewer bytes than it states.
+        """
+        if flags & FIRST:
+            part = self._begin(sequence, part)
+        if sequence != self._sequence:
+            return
+        buffer = self._buffer
+        if flags & ABORT:
+            self.drop("its sender gave it up")
+            return
+        if buffer is not None:
+            if len(buffer) + len(part) > self._size:
+                raise RemoteProtocolError(f"a service's message of {self._size} bytes has more than that")
+            buffer += part
+        if flags & LAST:
+            self._stamp_ns = stamp_ns
+            self._sequence = self._buffer = None
+            if buffer is not None:
+                self._budget.give(self._size)
+                if len(buffer) != self._size:
+                    raise RemoteProtocolError(f"a service's message of {self._size} bytes has only {len(buffer)}")
+                self.body(sequence, buffer)
+
+    def drop(self, reason: str) -> None:
+        """Give up a body of which only parts have arrived, if there is one; ``failed`` gets the reason."""
+        sequence, self._sequence = self._sequence, None
+        buffer, self._buffer = self._buffer, None
+        if buffer is not None and sequence is not None:
+            self._budget.give(self._size)
+            self.failed(sequence, reason)
+
+    def _begin(self, sequence: int, part: memoryview) -> memoryview:
+        if len(part) < _LENGTH:
+            raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
+        self.drop("another one began before its end")
+        size = int.from_bytes(part[:_LENGTH], "little")
+        if size > self._most:
+            raise LimitExceeded("service message", size, self._most)
+        self._sequence, self._size = sequence, size
+        if self._budget.take(size):
+            self._buffer = bytearray()
+        else:
+            self._buffer = None  # its parts are not kept
+            text = f"large calls hold {self._budget.used >> 20} MiB already: at most {self._budget.limit >> 20}"
+            self.failed(sequence, text)
+        return part[_LENGTH:]
+
+
+# The actions that the two plans of services return to their driver, as frozen values.
+#
+# Like ``bridge.actions`` for topics. ``ExportAction`` has those of services of this module that peers call,
+# ``ImportAction`` those of peers' services that local nodes call. ``peer`` is the number of a peer's session.
+
+
+@dataclass(frozen=True, slots=True)
+class LocalService:
+    """A service's server in the local graph: its node, its ``rosrpc://`` address, and its origin if relayed."""
+
+    node: str
+    uri: str
+    origin: Origin | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceAbout:
+    """The type, MD5 sum, request type and response type of a service, as its server states them."""
+
+    type: str
+    md5: str
+    request_type: str = ""
+    response_type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Ask a local server for its ``ServiceAbout``; the answer goes to ``described`` or ``refused``."""
+
+    service: str
+    server: LocalService
+
+
+@dataclass(frozen=True, slots=True)
+class ServeRoute:
+    """Serve a peer's calls: requests come in on the route ``requests``, replies go out on ``route``.
+
+    Args:
+        peer: The number of the calling peer.
+        route: The route of replies; the calling peer has chosen its number.
+        requests: The route of requests; this module has chosen its number.
+        service: The service's local name.
+        server: The service's server in the local graph.
+        timeout: Seconds that the calling peer waits for each reply.
+    """
+
+    peer: int
+    route: int
+    requests: int
+    service: str
+    server: LocalService
+    timeout: float
+
+
+@dataclass(frozen=True, slots=True)
+class EndRoute:
+    """End an open route: no more requests come, and replies of calls under way are dropped."""
+
+    peer: int
+    route: int
+    requests: int
+
+
+@dataclass(frozen=True, slots=True)
+class ServerGone:
+    """The server of a service left or was replaced: close the connections to it."""
+
+    service: str
+
+
+ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
+
+
+@dataclass(frozen=True, slots=True)
+class Provide:
+    """Register a peer's service in the local graph, at the proxy of the node that provides it.
+
+    Args:
+        peer: The peer's number.
+        service: The service's name here.
+        node: Its node, in the peer's graph.
+    """
+
+    peer: int
+    service: str
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
+
+    peer: int
+    service: str
+    node: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedService:
+    """A service can be called: requests go out on ``requests``, replies come in on ``route``."""
+
+    peer: int
+    service: str
+    route: int
+    requests: int
+    about: ServiceAbout
+
+
+@dataclass(frozen=True, slots=True)
+class EndedService:
+    """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of its replies."""
+
+    peer: int
+    service: str
+    route: int
+    requests: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ForgetAbout:
+    """What is known of a shown service may no longer be true."""
+
+    peer: int
+    service: str
+
+
+ImportAction = Send | Warn | Provide | Withdraw | OpenedService | EndedService | ForgetAbout
+
+
+# Connections to one local server for the calls of all peers: a few are kept open, each with one call at a time.
+
+
+_log = logging.getLogger(__name__)
+
+Done = Callable[[bool, "Buffer"], None]
+"""Called with ``(ok, body)``: the response, or the text of the error."""
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """A call that waits for a free connection."""
+
+    body: Buffer
+    until: float
+    done: Done
+
+
+class ServicePool:
+    """Calls one local server over up to ``limits.SERVICE_POOL`` connections.
+
+    Args:
+        service: The service's name in the local graph.
+        server: Its server.
+        on_lost: Called when the server closed a connection, or does not answer at its address: it may be dead.
+    """
+
+    def __init__(self, service: str, server: LocalService, on_lost: Callable[[], None]) -> None:
+        self.service = service
+        self.server = server
+        self._on_lost = on_lost
+        self._loop = asyncio.get_running_loop()
+        self._idle: list[tuple[ServiceConnection, float]] = []
+        self._busy: set[ServiceConnection] = set()
+        self._opening: set[asyncio.Task[None]] = set()
+        self._queue: deque[_Waiting] = deque()
+        self._closed = False
+
+    @property
+    def size(self) -> int:
+        """The number of connections, including those that are being opened."""
+        return len(self._idle) + len(self._busy) + len(self._opening)
+
+    @property
+    def unused(self) -> bool:
+        """Whether there is no connection and no call waits."""
+        return not self.size and not self._queue
+
+    async def describe(self) -> ServiceDescription:
+        """Ask the server for its service's types and MD5 sum; the connection is kept for the first call.
+
+        Raises:
+            RmpaError: The server does not answer, or refuses.
+        """
+        try:
+            connection = await self._connect()
+        except RmpaError:
+            self._on_lost()
+            raise
+        if self._closed:
+            connection.close()
+        else:
+            self._free(connection)
+        return connection.description
+
+    def call(self, body: Buffer, timeout: float, done: Done) -> None:
+        """Make a call; ``done`` is called once, perhaps before this method returns.
+
+        Args:
+            body: The request; it must not change until the call is done.
+            timeout: Seconds until the caller gives up.
+            done: Called with the response or the error.
+        """
+        if len(self._queue) >= limits.SERVICE_QUEUE:
+            text = f"service [{self.service}]: {len(self._queue)} calls wait for its server already"
+            done(False, text.encode())
+            return
+        self._take(_Waiting(body, self._loop.time() + timeout, done))
+
+    def close_idle(self, before: float) -> None:
+        """Close the connections that were not used since ``before`` (``loop.time()``)."""
+        kept = []
+        for connection, since in self._idle:
+            if since < before or connection.closed:
+                connection.close()
+            else:
+                kept.append((connection, since))
+        self._idle = kept
+
+    def close(self, reason: str) -> None:
+        """Close all connections; the calls under way and those that wait fail with the reason."""
+        self._closed = True
+        text = f"service [{self.service}]: {reason}".encode()
+        for task in self._opening:
+            task.cancel()
+        for connection in [*(connection for connection, _ in self._idle), *self._busy]:
+            connection.close()
+        self._idle.clear()
+        while self._queue:
+            self._queue.popleft().done(False, text)
+
+    async def closed(self) -> None:
+        """Wait until attempts to connect have ended; call after ``close``."""
+        await asyncio.gather(*self._opening, return_exceptions=True)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _take(self, call: _Waiting) -> None:
+        while self._idle:
+            connection, _ = self._idle.pop()
+            if self._request(connection, call):
+                return
+        self._queue.append(call)
+        self._open_more()
+
+    def _open_more(self) -> None:
+        """Open a connection for each call that waits, up to ``limits.SERVICE_POOL`` in all."""
+        while len(self._opening) < len(self._queue) and self.size < limits.SERVICE_POOL:
+            task = self._loop.create_task(self._open(), name=f"connect to {self.service}")
+            self._opening.add(task)
+            task.add_done_callback(self._opening.discard)
+
+    async def _open(self) -> None:
+        try:
+            connection = await self._connect()
+        except RmpaError as error:
+            # The waiting calls would fail as this attempt did; the next call makes a new attempt.
+            self._on_lost()
+            while self._queue and not self._busy:
+                self._queue.popleft().done(False, str(error).encode(errors="replace"))
+            return
+        self._free(connection)
+
+    async def _connect(self) -> ServiceConnection:
+        return await ServiceConnection.open(self.server.uri, self.service, OWN_NODE, on_closed=self._on_lost)
+
+    def _request(self, connection: ServiceConnection, call: _Waiting) -> bool:
+        """Send a call's request; ``False`` if the connection was closed already, and nothing was sent."""
+        rest = call.until - self._loop.time()
+        try:
+            connection.request(call.body, partial(self._answered, connection, call.done), rest)
+        except (ServiceFailed, LocalProtocolError) as error:
+            if isinstance(error, ServiceFailed) and not connection.closed:
+                self._free(connection)
+                call.done(False, str(error).encode(errors="replace"))
+                return True
+            connection.close()
+            return False
+        self._busy.add(connection)
+        return True
+
+    def _answered(
+        self, connection: ServiceConnection, done: Done, result: tuple[bool, bytes | bytearray] | ServiceFailed
+    ) -> None:
+        self._busy.discard(connection)
+        if isinstance(result, ServiceFailed):
+            connection.close()
+            done(False, str(result).encode(errors="replace"))
+            if not self._closed:
+                self._on_lost()
+                self._open_more()
+            return
+        done(*result)
+        if self._closed:
+            connection.close()
+        else:
+            self._free(connection)
+
+    def _free(self, connection: ServiceConnection) -> None:
+        """Give a connection that has become free to the next waiting call, or keep it."""
+        while self._queue:
+            call = self._queue.popleft()
+            if call.until <= self._loop.time():
+                call.done(False, f"service [{self.service}]: its server had no time for this call".encode())
+                continue
+            if not self._request(connection, call):
+                self._queue.appendleft(call)
+                self._open_more()
+            return
+        if not connection.closed:
+            self._idle.append((connection, self._loop.time()))

@@ -1,0 +1,504 @@
+"""Both ends of an open service: ``Caller`` at the clients' module, ``Server`` at the server's module."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import OrderedDict
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.services.bodies import (
+    BodyReceiver,
+    BodySender,
+    Budget,
+    EndRoute,
+    ExportAction,
+    LocalService,
+    Probe,
+    ServerGone,
+    ServeRoute,
+    ServiceAbout,
+    ServicePool,
+)
+from rmpa.core.counters import SampleRing
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.identity import SERIAL_MASK, is_type_name
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.core.liveness import listening_ports
+from rmpa.ros.http.rpc import is_own_name
+from rmpa.ros.node.listeners import local_addresses
+from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
+from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Coroutine, Mapping
+
+    from rmpa.bridge.data.reception import LinkTime
+    from rmpa.bridge.services.exports import ServiceExports
+    from rmpa.bridge.sessions import PeerSessions
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.runtime.tls import Buffer
+
+_OK: Final = b"\x01"
+_FAILED: Final = b"\x00"
+_RECENT: Final = 64
+"""How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave
+within a link's lease, so only the latest can be lost."""
+
+
+def description_of(about: ServiceAbout) -> ServiceDescription:
+    """The types that a peer tells of its service, as clients get them."""
+    return ServiceDescription(about.type, about.md5, about.request_type, about.response_type)
+
+
+def _text(body: Buffer) -> str:
+    """The text of an error in a reply, up to ``limits.CONTROL_TEXT_MAX`` bytes."""
+    return bytes(body[: limits.CONTROL_TEXT_MAX]).decode(errors="replace")
+
+
+class Budgets:
+    """Bounds the bytes that the calls of one link hold, each way.
+
+    ``outgoing`` counts requests and replies that this module sends; ``incoming`` counts those that are reassembled
+    here, and requests that are being served.
+    """
+
+    def __init__(self) -> None:
+        self.outgoing = Budget()
+        self.incoming = Budget()
+
+
+class CallStats:
+    """Counts and latencies of the calls of one service, shared by all sessions."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.failed = 0
+        self.active = 0
+        self.problem = ""
+        """The error of the last call that failed, or empty."""
+        self.latencies = SampleRing(limits.SERVICE_LATENCIES)
+        """Seconds from request to reply, of calls that succeeded."""
+
+    def fail(self, problem: str) -> None:
+        """Count a failed call, and store its error."""
+        self.failed += 1
+        self.problem = problem[: limits.CONTROL_TEXT_MAX]
+
+
+class Caller(BodyReceiver):
+    """Calls one service of a peer, for all clients of this module.
+
+    Args:
+        link: The link to the peer.
+        requests: The route of requests; the peer has chosen its number.
+        what: The service and its peer, for texts.
+        budgets: The budgets of the peer's link.
+        stats: The counts of the service.
+        description: Its types, as its server told them when it was opened.
+    """
+
+    def __init__(
+        self,
+        link: PeerLink,
+        requests: int,
+        what: str,
+        budgets: Budgets,
+        stats: CallStats,
+        description: ServiceDescription,
+    ) -> None:
+        super().__init__(budgets.incoming)
+        self.description: Final = description
+        self._sender = BodySender(link, requests)
+        self._what = what
+        self._outgoing = budgets.outgoing
+        self._stats = stats
+        self._loop = asyncio.get_running_loop()
+        self._serial = 0
+        self._pending: dict[int, tuple[ServiceCall, float, bool]] = {}
+        self.used_at = self._loop.time()
+        """When a call was last begun or answered, in the event loop's seconds."""
+
+    @property
+    def active(self) -> int:
+        """The number of calls under way."""
+        return len(self._pending)
+
+    def call(self, call: ServiceCall) -> None:
+        """Send a call's request; the call ends with the reply, or with an error."""
+        stats = self._stats
+        stats.calls += 1
+        size = len(call.request)
+        if not self._outgoing.take(size):
+            text = f"{self._what}: more than {self._outgoing.limit >> 20} MiB of calls are under way; try again later"
+            stats.fail(text)
+            call.fail(text)
+            return
+        stats.active += 1
+        self._serial = serial = self._serial + 1 & SERIAL_MASK
+        call.on_gone = partial(self._gone, serial)
+        now = self.used_at = self._loop.time()
+        self._pending[serial] = (call, now, size > mesh_limits.EXPRESS_MESSAGE_MAX)
+        self._sender.send(serial, call.request)
+
+    def body(self, sequence: int, body: bytes | bytearray) -> None:
+        """Handle a reply; it is dropped if its call has ended already."""
+        call, began, _ = self._pending.pop(sequence, (None, 0.0, False))
+        if call is None:
+            return
+        now = self.used_at = self._loop.time()
+        ok = body[:1] == _OK
+        self._ended(call)
+        if ok:
+            self._stats.latencies.add(now - began)
+        else:
+            self._stats.fail(_text(memoryview(body)[1:]))
+        if isinstance(body, bytearray):
+            del body[:1]  # costs nothing; a copy of a large one would
+            call.reply(ok, body)
+        else:
+            call.reply(ok, memoryview(body)[1:])
+
+    def failed(self, sequence: int, reason: str) -> None:
+        """Fail the call of a reply whose rest was lost."""
+        self._fail(sequence, f"{self._what}: its reply was lost on the way: {reason}")
+
+    def lane_lost(self) -> None:
+        """Fail the calls with large requests, and drop a reply in parts: the bulk lane's connection is gone.
+
+        It is unknown what was lost with it.
+        """
+        self.drop("the connection for large messages was lost")
+        for sequence, (_, _, bulk) in list(self._pending.items()):
+            if bulk:
+                self._fail(
+                    sequence, f"{self._what}: the connection for large messages was lost in the middle of the call"
+                )
+
+    def close(self, reason: str) -> None:
+        """Fail the calls under way with this reason, and send nothing more."""
+        self._sequence = None
+        if self._buffer is not None:
+            self._buffer = None
+            self._budget.give(self._size)
+        for sequence in list(self._pending):
+            self._fail(sequence, f"{self._what}: {reason}")
+        self._sender.close()
+
+    def _fail(self, sequence: int, text: str) -> None:
+        call, _, _ = self._pending.pop(sequence, (None, 0.0, False))
+        if call is not None:
+            self._ended(call)
+            self._stats.fail(text)
+            call.fail(text)
+
+    def _gone(self, sequence: int) -> None:
+        """End a call whose client has left, or whose deadline is over."""
+        call, _, _ = self._pending.pop(sequence, (None, 0.0, False))
+        if call is not None:
+            self._ended(call)
+            late = self._loop.time() >= call.deadline
+            self._stats.fail("no answer in time" if late else "the client left in the middle of the call")
+
+    def _ended(self, call: ServiceCall) -> None:
+        self._stats.active -= 1
+        self._outgoing.give(len(call.request))
+
+
+class Server(BodyReceiver):
+    """Serves one service of this module to one peer.
+
+    Args:
+        link: The link to the peer.
+        route: The route of replies; the peer has chosen its number.
+        pool: The connections to the server.
+        timeout: Seconds that the peer waits for a reply.
+        budgets: The budgets of the peer's link.
+        stats: The counts of the service.
+        link_time: The peer's clock.
+    """
+
+    def __init__(
+        self,
+        link: PeerLink,
+        route: int,
+        pool: ServicePool,
+        timeout: float,
+        budgets: Budgets,
+        stats: CallStats,
+        link_time: LinkTime,
+    ) -> None:
+        super().__init__(budgets.incoming)
+        self._link = link
+        self._time = link_time
+        self._sender: BodySender | None = BodySender(link, route)
+        self._pool = pool
+        self._timeout = timeout
+        self._outgoing = budgets.outgoing
+        self._stats = stats
+        self._loop = asyncio.get_running_loop()
+        self._recent: OrderedDict[int, None] = OrderedDict()
+
+    def body(self, sequence: int, body: bytes | bytearray) -> None:
+        """Pass a request to the server, unless its caller has given it up: it must not act then."""
+        stats, size = self._stats, len(body)
+        stats.calls += 1
+        if late := self._late():
+            self._reply_failed(sequence, late)
+            return
+        if not self._budget.take(size):
+            self._reply_failed(sequence, f"more than {self._budget.limit >> 20} MiB of requests are being served")
+            return
+        stats.active += 1
+        timeout = self._timeout + limits.SERVICE_GRACE
+        self._pool.call(body, timeout, partial(self._answered, sequence, size, self._loop.time()))
+
+    def _late(self) -> str:
+        """Why the caller waits no longer for the present request; empty while it may."""
+        if self._link.abandoned:
+            return "this agent was stopped when the request came, and the caller has given it up"
+        error = self._time.error_ns
+        age = time.time_ns() - self._stamp_ns + self._time.ahead_ns
+        if error is not None and age - error > self._timeout * 1e9:
+            return f"the request came {age / 1e9:.1f} s late; the caller waits for {self._timeout:g} s"
+        return ""
+
+    def failed(self, sequence: int, reason: str) -> None:
+        """Reply with an error to a request whose rest was lost."""
+        self._stats.calls += 1
+        self._reply_failed(sequence, f"the request was lost on its way: {reason}")
+
+    def lane_lost(self) -> None:
+        """Send an error for each call whose reply may have been lost with the bulk lane's connection."""
+        self.drop("the connection for large messages was lost")
+        for sequence in self._recent:
+            self._send(sequence, False, b"the connection for large messages was lost behind the call")
+        self._recent.clear()
+
+    def close(self) -> None:
+        """Send nothing more: the replies of calls that are being served are dropped."""
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+        if self._buffer is not None:
+            self._sequence = self._buffer = None
+            self._budget.give(self._size)
+
+    def _answered(self, sequence: int, size: int, began: float, ok: bool, body: Buffer) -> None:
+        self._budget.give(size)
+        stats = self._stats
+        stats.active -= 1
+        if ok:
+            stats.latencies.add(self._loop.time() - began)
+        else:
+            stats.fail(_text(body))
+        if not self._outgoing.take(len(body)):
+            self._reply_failed(sequence, f"more than {self._outgoing.limit >> 20} MiB of replies wait for the link")
+        elif not self._send(sequence, ok, body, self._outgoing):
+            self._recent[sequence] = None
+            if len(self._recent) > _RECENT:
+                self._recent.popitem(last=False)
+
+    def _reply_failed(self, sequence: int, reason: str) -> None:
+        text = f"service [{self._pool.service}]: {reason}"
+        self._stats.fail(text)
+        self._send(sequence, False, text.encode())
+
+    def _send(self, sequence: int, ok: bool, body: Buffer, budget: Budget | None = None) -> bool:
+        """Send a reply; return whether it took the express lane, or was dropped after ``close``.
+
+        Args:
+            sequence: The number of the call.
+            ok: Whether the call succeeded.
+            body: The response, or the text of the error.
+            budget: Gets the body's bytes back when they were sent or dropped.
+        """
+        if self._sender is not None:
+            return not self._sender.send(sequence, body, _OK if ok else _FAILED, budget)
+        if budget is not None:
+            budget.give(len(body))
+        return True
+
+
+# Serves services of this module to peers: a pool of connections to each server, and checks that servers live.
+
+
+_MD5_LENGTH: Final = 32
+_LOOK_SHARE: Final = 50
+"""The checks of the servers' ports take at most one in this many seconds of processor time."""
+
+
+class Serving:
+    """Carries out the actions of the outbound plan.
+
+    Args:
+        core: The local core.
+        exports: The outbound plan; it gets the servers' answers.
+        sessions: The peers' sessions.
+        budgets: The budgets of the links, by peer number.
+        act: Carries out the actions that the plan returns for a server's answer.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        exports: ServiceExports,
+        sessions: PeerSessions,
+        budgets: Mapping[int, Budgets],
+        act: Callable[[list[ExportAction]], None],
+    ) -> None:
+        self._core = core
+        self._exports = exports
+        self._sessions = sessions
+        self._budgets = budgets
+        self._act = act
+        self.stats: dict[str, CallStats] = {}
+        self._servers: dict[tuple[int, int], Server] = {}
+        self._pools: dict[str, ServicePool] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._offering = asyncio.Event()
+
+    def start(self) -> None:
+        """Begin to check that servers live."""
+        self._spawn(self._look_after(), "servers' liveness")
+
+    async def close(self) -> None:
+        """End all calls and all connections to servers."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        pools, self._pools = list(self._pools.values()), {}
+        for pool in pools:
+            pool.close("the agent ends")
+            await pool.closed()
+
+    def changed(self) -> None:
+        """Begin with the checks again, if services are offered now."""
+        if self._exports.offered:
+            self._offering.set()
+
+    def do(self, action: ExportAction) -> None:
+        """Carry out one action."""
+        self.changed()
+        match action:
+            case Probe():
+                self._spawn(self._ask_server(action), f"describe {action.service}")
+            case ServeRoute():
+                self._serve(action)
+            case EndRoute():
+                server = self._servers.pop((action.peer, action.requests), None)
+                if server is not None:
+                    server.close()
+                session = self._sessions.get(action.peer)
+                if session is not None:
+                    session.handlers.pop(action.requests, None)
+            case ServerGone():
+                pool = self._pools.pop(action.service, None)
+                if pool is not None:
+                    pool.close("its server has gone")
+
+    def lane_lost(self, peer: int) -> None:
+        """Report the calls whose replies may be lost: the bulk lane's connection to a peer is gone."""
+        for (owner, _), server in list(self._servers.items()):
+            if owner == peer:
+                server.lane_lost()
+
+    def close_idle(self, before: float) -> None:
+        """Close the connections to servers that were not used since ``before`` (``loop.time()``).
+
+        The counts of services that have left the local graph are dropped too.
+        """
+        for service, pool in list(self._pools.items()):
+            pool.close_idle(before)
+            if pool.unused and not self._exports.callers(service):
+                del self._pools[service]
+        for service in [one for one in self.stats if one not in self._exports.seen]:
+            del self.stats[service]
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _pool(self, service: str, server: LocalService) -> ServicePool:
+        pool = self._pools.get(service)
+        if pool is None or pool.server != server:
+            if pool is not None:
+                pool.close("its server has restarted")
+            pool = ServicePool(service, server, lambda: self._core.suspect(server.node))
+            self._pools[service] = pool
+        return pool
+
+    async def _ask_server(self, action: Probe) -> None:
+        try:
+            told = await self._pool(action.service, action.server).describe()
+        except RmpaError as error:
+            self._act(self._exports.refused(action.service, action.server, str(error)))
+            return
+        if not is_type_name(told.type) or len(told.md5sum) != _MD5_LENGTH:
+            text = f"service [{action.service}]: its server says neither type nor md5 sum (but {told})"
+            self._act(self._exports.refused(action.service, action.server, text))
+            return
+        about = ServiceAbout(told.type, told.md5sum, told.request_type, told.response_type)
+        self._act(self._exports.described(action.service, action.server, about))
+
+    def _serve(self, action: ServeRoute) -> None:
+        session = self._sessions.get(action.peer)
+        if session is None or not session.linked:
+            return
+        server = Server(
+            session.link,
+            action.route,
+            self._pool(action.service, action.server),
+            action.timeout,
+            self._budgets[action.peer],
+            self.stats.setdefault(action.service, CallStats()),
+            session.time,
+        )
+        self._servers[action.peer, action.requests] = server
+        session.handlers[action.requests] = server
+
+    async def _look_after(self) -> None:
+        """Find killed servers: a node with an offered service whose port has no listener is suspected."""
+        while True:
+            if not self._exports.offered:
+                self._offering.clear()
+                await self._offering.wait()
+            servers = dict(self._exports.offered)
+            ports, here, cost = await asyncio.to_thread(_listening)
+            for service, server in yielding_to_data(list(servers.items())):
+                if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
+                    self._core.suspect(server.node)
+            await sleep_to_tick(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
+
+
+def _listening() -> tuple[set[int] | None, frozenset[str], float]:
+    """Returns the listening ports, this machine's addresses, and the processor seconds that it took; for a thread.
+
+    The ports are ``None`` if the kernel cannot be asked.
+    """
+    began = time.thread_time()
+    try:
+        ports, here = listening_ports(), frozenset(local_addresses())
+    except OSError:  # no file descriptor is left to ask the kernel; the next check may succeed
+        ports, here = None, frozenset()
+    return ports, here, time.thread_time() - began
+
+
+def _is_deaf(server: LocalService, ports: set[int] | None, here: Collection[str]) -> bool:
+    """Whether a server on this machine does not listen.
+
+    ``False`` for servers on other machines, and when the ports are unknown.
+    """
+    try:
+        host, port = parse_service_uri(server.uri)
+    except ConfigError:
+        return False
+    local = is_own_name(host) or host.startswith("127.") or host in here
+    return local and ports is not None and port not in ports

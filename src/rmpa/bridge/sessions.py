@@ -1,0 +1,448 @@
+"""The sessions of all peers: each begins with a link, and is kept while a part waits for the next one."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import limits
+from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
+from rmpa.core.counters import logged_failure
+from rmpa.mesh import limits as mesh_limits
+from rmpa.runtime.loop import MachineTimer, yield_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from contextlib import AbstractContextManager
+
+    from rmpa.bridge.data.reception import DataHandler, DataReceiver
+    from rmpa.bridge.messages import Message, Origin
+    from rmpa.bridge.proxies import ProxyNodes
+    from rmpa.config.settings import Settings
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+
+# The state that the bridge keeps for one run of a peer, across its links.
+
+
+class PeerState(Enum):
+    """The state of a session.
+
+    ::
+
+    LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
+      ▲  ├──closed in order──────────────────►  │
+      ├──┼────────────── a new link ────────────┘   (from SILENT, too)
+    """
+
+    LINKED = auto()
+    """The peer has a link."""
+    SILENT = auto()
+    """Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``."""
+    AWAY = auto()
+    """It has no link, and a part of the bridge keeps something for it."""
+
+
+@dataclass(slots=True, eq=False)
+class PeerSession:
+    """One run of a peer.
+
+    Args:
+        peer: Its number in this agent; never used again for another run.
+        link: Its link, or the last one while it has none.
+        proxies: The nodes that stand for its nodes in the local graph.
+        handlers: The handler of each open route's data, by the route's id; the parts fill it.
+        time: The time base of its link: the offset between its clock and the local one.
+        state: Whether it has a link.
+        away_since: When its last link ended, monotonic seconds.
+        wait: Seconds from ``away_since`` to ``due``; ``None`` while it has a link.
+    """
+
+    peer: int
+    link: PeerLink
+    proxies: PeerProxies
+    handlers: dict[int, DataHandler] = field(default_factory=dict)
+    time: LinkTime = field(default_factory=LinkTime)
+    state: PeerState = PeerState.LINKED
+    away_since: float = 0.0
+    wait: float | None = None
+
+    @property
+    def linked(self) -> bool:
+        """Whether the peer has a link now."""
+        return self.state is PeerState.LINKED
+
+    @property
+    def same_machine(self) -> bool:
+        """Whether the peer's agent runs on this machine, so that both modules share its loopback device."""
+        return self.link.local_address == self.link.remote_endpoint[0]
+
+    @property
+    def address(self) -> str:
+        """The address at which the peer's nodes are reached: that of its link, or loopback on this machine."""
+        return "127.0.0.1" if self.same_machine else self.link.remote_endpoint[0]
+
+    @property
+    def own_address(self) -> str:
+        """The address at which the peer reaches the nodes of this module; see ``address``."""
+        return "127.0.0.1" if self.same_machine else self.link.local_address
+
+    @property
+    def due(self) -> float | None:
+        """When something kept for the absent peer expires next, monotonic seconds; ``None``: nothing does."""
+        return None if self.wait is None else self.away_since + self.wait
+
+
+# Whether a comparison of all names with the local graph would find anything.
+
+
+class UnchangedGraph:
+    """Remembers the graph of the last comparison; pure.
+
+    A graph of 1,000 modules has tens of thousands of names, and comparing them takes half a second of processor time.
+    A core returns the same object until something is registered, so an idle agent compares seldom.
+    """
+
+    __slots__ = ("_seen", "_skipped")
+
+    def __init__(self) -> None:
+        self._seen: GraphState | None = None
+        self._skipped = 0
+
+    def is_due(self, state: GraphState, *, steady: bool) -> bool:
+        """Whether to compare now: the graph is another one, or the last comparison is long ago.
+
+        Args:
+            state: The local graph.
+            steady: Whether nothing outside the graph, as a node's reachability, decides what a comparison finds.
+        """
+        if steady and state is self._seen and self._skipped < limits.RECONCILE_SKIPS:
+            self._skipped += 1
+            return False
+        self._seen, self._skipped = state, 0
+        return True
+
+
+# The base class of the bridge's parts: topics, services, parameters and others.
+
+
+_log = logging.getLogger(__name__)
+
+
+class Part:
+    """Ignores every event of the bridge; parts override the methods that they need.
+
+    All methods are called from the event loop.
+    """
+
+    advertisement = ""
+    """The ``op`` of the control messages that ``advertised`` gets unparsed; empty: none."""
+
+    def start(self) -> None:
+        """The bridge has started: the local core answers."""
+
+    async def close(self) -> None:
+        """Release everything; all sessions have ended, and the local core still answers."""
+
+    # --- sessions ----------------------------------------------------------------------------------------------
+
+    def link_up(self, session: PeerSession) -> None:
+        """A link is up, of a new peer or of one whose session waited (after ``link_down``)."""
+
+    def link_down(self, session: PeerSession) -> None:
+        """A link is gone; the peer may come back."""
+
+    def grace_over(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
+        """The peer is not back within ``mesh.limits.SILENT_GRACE``, or its link ended otherwise than by silence.
+
+        Returns:
+            Whether the part keeps something for the peer: then the session waits.
+        """
+        return False
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:  # noqa: ARG002 - likewise
+        """Drop everything that is kept for an absent peer for at most ``seconds``, the time that it has been away.
+
+        Returns:
+            The next shortest time in seconds, more than ``seconds``; ``None``: nothing is kept any more.
+        """
+        return None
+
+    def gone(self, session: PeerSession) -> None:
+        """The session ends for good: remove everything of the peer from the local graph."""
+
+    def lane_lost(self, session: PeerSession) -> None:
+        """A link lost its bulk lane, perhaps in the middle of a message in either direction."""
+
+    def depends(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
+        """Whether something here needs to know within a second that this linked peer is gone.
+
+        Open routes are known by the session's handlers; this is for what has no handler.
+        """
+        return False
+
+    # --- messages ----------------------------------------------------------------------------------------------
+
+    def message(self, session: PeerSession, message: Message) -> bool:  # noqa: ARG002 - for those that override it
+        """Handle a control message from a peer.
+
+        Returns:
+            Whether the message belongs to this part.
+
+        Raises:
+            RemoteProtocolError: The message is not allowed now; the link is closed.
+        """
+        return False
+
+    def advertised(self, session: PeerSession, payload: bytes) -> None:
+        """Handle a control message of the kind ``advertisement``, not parsed yet.
+
+        Raises:
+            LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``; the link is closed.
+        """
+
+    # --- the local graph ---------------------------------------------------------------------------------------
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Handle a registration in the local graph that was added, changed or removed."""
+
+    def param_update(self, key: str) -> bool:  # noqa: ARG002 - for those that override it
+        """Handle the change of a parameter that the agent's own node has subscribed to.
+
+        Args:
+            key: The changed key, without a slash at its end. The subscribed key may be this one, one below it or one
+                above it.
+
+        Returns:
+            Whether this part has subscribed to the parameter.
+        """
+        return False
+
+    def reload(self, settings: Settings) -> None:
+        """Take settings that were read again, as far as they can change in a running agent."""
+
+    def reconcile(self) -> None:
+        """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""
+
+
+def guarded(part: Part) -> AbstractContextManager[None]:
+    """Log a failure of one part; the next parts are called all the same."""
+    return logged_failure(_log, "%s failed; the other parts go on", type(part).__name__)
+
+
+class PeerSessions:
+    """The sessions of all peers; notifies the parts of the bridge when one begins, ends, or loses or gets a link.
+
+    Args:
+        parts: The parts, notified in this order; more may be added until the first link is up.
+        nodes: Makes the proxies.
+        receiver: Passes the data of links to the handlers of routes.
+        on_kill: ``(session, node, caller id, reason) -> reply``: called when a node's proxy is asked to end.
+        gate: Whether the mesh is secured.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        nodes: ProxyNodes,
+        receiver: DataReceiver,
+        on_kill: Callable[[PeerSession, str, str, str], Awaitable[RosReply]],
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        self._gate = gate
+        self._parts = parts
+        self._nodes = nodes
+        self._receiver = receiver
+        self._on_kill = on_kill
+        self._numbers = itertools.count(1)
+        self._by_number: dict[int, PeerSession] = {}
+        self._by_link: dict[PeerLink, PeerSession] = {}
+        self._namespaces = ProxyNamespaces()
+        self._closing: set[asyncio.Task[None]] = set()
+        self._timer = MachineTimer(self._next_timer, self._handle_timer)
+
+    def __iter__(self) -> Iterator[PeerSession]:
+        """Every session, with a link or waiting for one."""
+        return iter(list(self._by_number.values()))
+
+    def linked(self) -> Iterator[PeerSession]:
+        """The sessions that have a link."""
+        return (session for session in self if session.linked)
+
+    def get(self, peer: int) -> PeerSession | None:
+        """A session by its number."""
+        return self._by_number.get(peer)
+
+    def of(self, link: PeerLink) -> PeerSession | None:
+        """The session that a link belongs to; ``None`` once the link is gone."""
+        return self._by_link.get(link)
+
+    def proxy_name(self, session: PeerSession, node: str, origin: Origin | None) -> str:
+        """The name of the proxy of a peer's node, or, with ``origin``, of a node that the peer relays."""
+        if origin is not None:
+            session.proxies.names[node] = self._namespaces.relayed_name(origin)
+        return session.proxies.name(node)
+
+    def reserved_name(self, origin: Origin) -> str:
+        """The name of the proxy of a node that this module reaches outside the mesh; its namespace stays reserved."""
+        return self._namespaces.relayed_name(origin, reserve=True)
+
+    # --- links ---------------------------------------------------------------------------------------------------
+
+    def link_up(self, link: PeerLink) -> None:
+        """Attach a link to the session that waits for it, or begin a session."""
+        session = self._waiting_for(link)
+        if session is not None:
+            session.link, session.state, session.wait = link, PeerState.LINKED, None
+            self._timer.arm()
+        else:
+            session = self._begin(link)
+        session.time.resumed_at = lambda: link.resumed_at
+        self._by_link[link] = session
+        self._receiver.link_up(link, session.peer, session.handlers)
+        for part in self._parts:
+            with guarded(part):
+                part.link_up(session)
+
+    def _begin(self, link: PeerLink) -> PeerSession:
+        peer = next(self._numbers)
+        prefix = self._namespaces.add(peer, link.identity)
+        proxies = PeerProxies(
+            prefix, self._nodes, lambda node, caller, reason: self._on_kill(session, node, caller, reason)
+        )
+        session = self._by_number[peer] = PeerSession(peer, link, proxies)
+        return session
+
+    def _waiting_for(self, link: PeerLink) -> PeerSession | None:
+        """The waiting session of this run of the peer, if there is one; else ends that of an earlier run."""
+        waiting = [session for session in self if not session.linked]
+        for session in waiting:
+            if session.link.identity.is_same_run(link.identity):
+                return session
+        for session in waiting:
+            if session.link.identity.is_same_module(link.identity, secured=self._gate.on):
+                self._end(session)
+        return None
+
+    def link_down(self, link: PeerLink) -> None:
+        """Detach a link that is gone; after silence its session waits for ``mesh.limits.SILENT_GRACE``."""
+        session = self._by_link.pop(link, None)
+        if session is None:
+            return
+        self._receiver.link_down(link)
+        session.away_since = asyncio.get_running_loop().time()
+        session.state = PeerState.SILENT
+        for part in self._parts:
+            with guarded(part):
+                part.link_down(session)
+        session.handlers.clear()
+        if link.silent:
+            session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
+            self._timer.arm()
+        else:
+            self._grace_over(session)
+
+    def _grace_over(self, session: PeerSession) -> None:
+        """Asks the parts what they keep for a peer that is not back; ends the session if they keep nothing."""
+        session.state, session.wait = PeerState.AWAY, 0.0
+        waits = False
+        for part in self._parts:
+            with guarded(part):
+                waits |= part.grace_over(session)
+        if waits:
+            self._outlasted(session, asyncio.get_running_loop().time())
+        else:
+            self._end(session)
+
+    def _outlasted(self, session: PeerSession, now: float) -> None:
+        """Lets the parts drop what has expired for an absent peer; ends the session if nothing is left."""
+        seconds = max(now - session.away_since, session.wait or 0.0)
+        waits: list[float | None] = []
+        for part in self._parts:
+            with guarded(part):
+                waits.append(part.outlasted(session, seconds))
+        session.wait = min((wait for wait in waits if wait is not None), default=None)
+        if session.wait is None:
+            self._end(session)
+        else:
+            self._timer.arm()
+
+    def _next_timer(self) -> float | None:
+        return min((due for session in self._by_number.values() if (due := session.due) is not None), default=None)
+
+    def _handle_timer(self, now: float) -> None:
+        for session in self:
+            due = session.due
+            if due is not None and due <= now:
+                if session.state is PeerState.SILENT:
+                    self._grace_over(session)
+                else:
+                    self._outlasted(session, now)
+
+    # --- the end -------------------------------------------------------------------------------------------------
+
+    def _end(self, session: PeerSession) -> None:
+        """Ends a session for good: the rest of the peer is removed from the local graph."""
+        session.wait = None
+        self._timer.arm()
+        self._by_number.pop(session.peer, None)
+        if self._by_link.pop(session.link, None) is not None:
+            self._receiver.link_down(session.link)
+            for part in self._parts:
+                with guarded(part):
+                    part.link_down(session)
+        for part in self._parts:
+            with guarded(part):
+                part.gone(session)
+        self._namespaces.remove(session.peer)
+        task = asyncio.create_task(session.proxies.close(), name=f"retract {session.proxies.prefix}")
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
+
+    async def close(self) -> None:
+        """End every session, and wait until all proxies are closed."""
+        self._timer.close()
+        for session in self:
+            self._end(session)
+        if self._closing:
+            await asyncio.gather(*self._closing, return_exceptions=True)
+
+    # --- the rest ------------------------------------------------------------------------------------------------
+
+    def lane_lost(self, link: PeerLink) -> None:
+        """Notify the parts that a link lost its bulk lane, perhaps in the middle of a message."""
+        session = self._by_link.get(link)
+        if session is not None:
+            for part in self._parts:
+                with guarded(part):
+                    part.lane_lost(session)
+
+    def clock(self, link: PeerLink) -> None:
+        """Take a link's new estimate of its peer's clock."""
+        session = self._by_link.get(link)
+        if session is not None:
+            session.time.set(link.clock_offset, link.clock_error)
+
+    def _depends(self, session: PeerSession) -> bool:
+        """Whether anything of this module needs to know within a second that a peer is gone."""
+        return any(session.handlers) or any(part.depends(session) for part in self._parts)
+
+    def reconcile(self) -> None:
+        """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""
+        now = asyncio.get_running_loop().time()
+        for session in self.linked():
+            yield_to_data()
+            if session.linked and now - session.link.touched_at >= mesh_limits.REST_AFTER:
+                session.link.need(needed=self._depends(session))
+        for session in self:
+            yield_to_data()
+            session.proxies.reconcile()
+        self._namespaces.forget_unused({name for session in self for name in session.proxies.names.values()})

@@ -1,1 +1,0 @@
-"""Carries out the plans of ``bridge.topics``: publications, subscriptions, routes and reports."""

@@ -1,0 +1,326 @@
+"""Topics whose publisher checks the names of its listeners, not only whether there are any.
+
+An actionlib client accepts a server (``wait_for_server``, ``waitForServer``) when the node that publishes the status
+also listens to the client's goals and cancellations. It compares the caller ids of the connections. Over the mesh,
+one connection of the agent stands for all listeners of a module. For these topics, therefore, the listeners' names
+cross, and the publisher's agent opens one more connection for each, under the listener's name in the publisher's
+graph.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.actions import Send
+from rmpa.bridge.messages import Audience, Mismatch, encode, is_crossing_name
+from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, PermissionGate
+from rmpa.bridge.proxies import proxied_node, proxy_name
+from rmpa.bridge.topics.routes import RouteState
+from rmpa.config.peer_rules import Access
+from rmpa.ros.node.subscription import PublisherConnection
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from rmpa.bridge.actions import Action
+    from rmpa.bridge.messages import Message, Source
+    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.topics.peer_topics import PeerTopics
+    from rmpa.core.counters import RefusalLog
+
+_GOAL: Final = "ActionGoal"
+_CANCEL: Final = "actionlib_msgs/GoalID"
+_STATUS: Final = "actionlib_msgs/GoalStatusArray"
+_ANSWERS: Final = ("ActionResult", "ActionFeedback")
+
+
+def is_watched(type_name: str) -> bool:
+    """Whether publishers of this type check their listeners' names; judged by type, as topics can be remapped."""
+    return type_name.endswith(_GOAL) or type_name == _CANCEL
+
+
+def compares_names(type_name: str) -> bool:
+    """Whether a topic is of an action, whose client compares the names in the headers of all five topics.
+
+    rospy's client wants one name as listener of goals and cancellations, and as publisher of status, result and
+    feedback; roscpp's leaves the last two out. So all have to come by the agents, which give a remote node one name.
+    """
+    return is_watched(type_name) or type_name == _STATUS or type_name.endswith(_ANSWERS)
+
+
+def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
+    """The listeners to name to a publisher: sorted, without the agent itself, at most ``limits.AUDIENCE_MAX``.
+
+    Proxies are included: they listen to proxies only in a relay, and name listeners of the modules beyond it.
+    """
+    names = {name for name in caller_ids if is_crossing_name(name) and name != OWN_NODE}
+    return tuple(sorted(names)[: limits.AUDIENCE_MAX])
+
+
+# Subscribers whose type or definition does not fit a source, for ``rmpa topic info`` and the diagnostics.
+
+
+class Mismatches:
+    """Texts by source and subscriber.
+
+    A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
+    """
+
+    def __init__(self) -> None:
+        self._texts: dict[Source, dict[str, str]] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._texts)
+
+    def texts(self, source: Source) -> tuple[str, ...]:
+        """The texts about one source."""
+        return tuple(self._texts.get(source, {}).values())
+
+    def add(self, source: Source, subscriber: str, text: str) -> None:
+        """Remember a mismatch, or replace its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
+        known = self._texts.setdefault(source, {})
+        if subscriber in known or len(known) < limits.MISMATCHES_MAX:
+            known[subscriber] = text
+
+    def mended(self, source: Source, subscriber: str) -> bool:
+        """Forget a subscriber that fits now or has gone; return whether it was remembered."""
+        return self._texts.get(source, {}).pop(subscriber, None) is not None
+
+    def peer_gone(self, name: str) -> None:
+        """Forget all subscribers at a peer that is gone."""
+        for known in self._texts.values():
+            for subscriber in [one for one in known if one == name or one.startswith(name + "/")]:
+                del known[subscriber]
+
+    def keep(self, wanted: Callable[[Source], bool]) -> None:
+        """Forget the sources for which ``wanted`` is false."""
+        for source in [source for source in self._texts if not wanted(source)]:
+            del self._texts[source]
+
+
+# Reports subscribers whose type or definition does not fit a source, here and to the agent at the other end.
+
+
+class MismatchReports:
+    """The mismatches of local subscribers with peers' sources, and of peers' subscribers with local sources.
+
+    Args:
+        exports: Finds the local source that a peer means.
+        imports: Makes the message for the peer of a source; knows the peers that have a source.
+        act: Carries out actions.
+        on_warning: ``(counter, where, text)``: logs and counts a mismatch that a peer reports.
+    """
+
+    def __init__(
+        self,
+        exports: Exports,
+        imports: Imports,
+        act: Callable[[Sequence[Action]], None],
+        on_warning: Callable[[str, str, str], None],
+    ) -> None:
+        self._exports = exports
+        self._imports = imports
+        self._act = act
+        self._on_warning = on_warning
+        self._mismatches = Mismatches()
+
+    def texts(self, source: Source) -> tuple[str, ...]:
+        """Texts about subscribers, here or at peers, whose definition does not fit a source's."""
+        return self._mismatches.texts(source)
+
+    def refused(self, peer: int, source: Source, subscriber: str, text: str) -> None:
+        """A local subscriber does not fit a peer's source: remember it, and tell the peer."""
+        self._mismatches.add(source, subscriber, text)
+        self._act(self._imports.mismatched(peer, source, subscriber, text))
+
+    def reported(self, peer: int, name: str, message: Mismatch) -> None:
+        """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
+        source = self._exports.local(peer, message.source)
+        if source is None:
+            return  # it went meanwhile
+        subscriber = f"{name}{message.subscriber}"
+        if not message.text:
+            self._mismatches.mended(source, subscriber)
+            return
+        self._mismatches.add(source, subscriber, message.text)
+        where = f"{name}: {source}"
+        self._on_warning("mismatch.remote", where, f"{where}: {message.text}")
+
+    def registration_changed(self, topic: str, subscriber: str) -> None:
+        """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
+        if not self._mismatches:
+            return
+        for peer, source in list(self._imports.at(topic)):
+            if self._mismatches.mended(source, subscriber):
+                self._act([Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
+
+    def peer_gone(self, name: str) -> None:
+        """Forget all subscribers at a peer that is gone."""
+        self._mismatches.peer_gone(name)
+
+    def forget_gone(self) -> None:
+        """Forget the mismatches of sources that are gone."""
+        if self._mismatches:
+            self._mismatches.keep(lambda source: source in self._exports.offered or self._imports.knows(source))
+
+
+# Names local subscribers to the publishing peer, and connects to local publishers for a peer's subscribers.
+#
+# See ``bridge.topics.audience`` for the topics that need it.
+
+
+_log = logging.getLogger(__name__)
+
+
+def _ignore(_: memoryview) -> None:
+    """Drops a message: the bridge gets it by its own connection."""
+
+
+class _IgnoreParts:
+    """Drops messages that come in parts."""
+
+    def begin(self, size: int) -> None:
+        """A message of ``size`` bytes begins."""
+
+    def part(self, part: memoryview) -> None:
+        """A part of it."""
+
+    def abort(self) -> None:
+        """The rest does not come."""
+
+
+class RemoteSubscribers:
+    """The names of listeners, sent and received, for all peers.
+
+    Args:
+        exports: Finds the source of a peer's route.
+        imports: Finds the route of a peer's source.
+        sessions: The peers.
+        topics: The peers' topics in the local graph, by the numbers of their sessions.
+        refusals: Logs and counts ``audience.too_many``.
+        gate: Decides which modules behind a relay may listen.
+    """
+
+    def __init__(
+        self,
+        exports: Exports,
+        imports: Imports,
+        sessions: PeerSessions,
+        topics: Mapping[int, PeerTopics],
+        refusals: RefusalLog,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        self._gate = gate
+        self._exports = exports
+        self._imports = imports
+        self._sessions = sessions
+        self._topics = topics
+        self._refusals = refusals
+        self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
+        """Route id and listeners as they were last sent to each peer, by source."""
+        self._changed: dict[tuple[int, Source], None] = {}
+        self._soon: asyncio.Handle | None = None
+        self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
+        """The connections that stand for a peer's listeners, by the listeners' local names."""
+
+    def shown(self, peer: int, source: Source) -> tuple[str, ...]:
+        """The names under which a peer's listeners are connected to a local publisher."""
+        return tuple(sorted(self._shown.get((peer, source), ())))
+
+    # --- our listeners, to the peer that publishes ------------------------------------------------------------------
+
+    def changed(self, peer: int, source: Source) -> None:
+        """Send the listeners of a peer's source again soon: they have changed, or its route was opened."""
+        entry = self._imports.get(peer, source)
+        if entry is None or not is_watched(entry.type):
+            return
+        self._changed[peer, source] = None
+        if self._soon is None:
+            # In the next turn: several changes become one message, and a listener's header is answered first.
+            self._soon = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._soon = None
+        changed, self._changed = self._changed, {}
+        for peer, source in changed:
+            session, entry = self._sessions.get(peer), self._imports.get(peer, source)
+            if session is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
+                self._told.pop((peer, source), None)
+                continue
+            publication = self._topics[peer].publication(source)
+            names = audience(publication.listeners) if publication is not None else ()
+            before, known = self._told.get((peer, source), (0, ()))
+            if names != (known if before == entry.route else ()):
+                self._told[peer, source] = (entry.route, names)
+                session.link.send_control(encode(Audience(entry.route, names)))
+
+    # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
+
+    def message(self, session: PeerSession, message: Message) -> bool:
+        """Takes the listeners that a peer names for a route; ignored if the route was closed meanwhile."""
+        if not isinstance(message, Audience):
+            return False
+        source = self._exports.source(session.peer, message.route)
+        local = self._exports.offered.get(source) if source is not None else None
+        if source is None or local is None or not is_watched(local.type):
+            return True
+        if self._exports.description(source) is None:
+            return True  # its publisher is not connected
+        names = {name for node in message.nodes if (name := self._name(session, node, source.topic))}
+        shown = self._shown.setdefault((session.peer, source), {})
+        for name in shown.keys() - names:
+            shown.pop(name).close()
+        for name in sorted(names - shown.keys()):
+            if self._count(session.peer) >= limits.AUDIENCES_MAX:
+                text = f"{session.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
+                now = asyncio.get_running_loop().time()
+                self._refusals.refuse(now, "audience.too_many", session.link.name, text)
+                break
+            shown[name] = self._connect(source, local.uri, name)
+        if not shown:
+            del self._shown[session.peer, source]
+        return True
+
+    def _name(self, session: PeerSession, node: str, topic: str) -> str:
+        """The local name of a peer's listener; empty for a proxy of a module that the peer may not speak for."""
+        whose = proxied_node(node)
+        if whose is None:
+            return proxy_name(session.proxies.prefix, node)
+        relay = session.link.name
+        if not any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways):
+            return ""
+        return node if self._gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
+
+    def _count(self, peer: int) -> int:
+        return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)
+
+    def _connect(self, source: Source, uri: str, name: str) -> PublisherConnection:
+        _log.debug("> %s: %s listens", source, name)
+        connection = PublisherConnection(source.topic, uri, name, on_message=_ignore, on_parts=_IgnoreParts())
+        connection.start()
+        return connection
+
+    def route_over(self, peer: int, source: Source) -> None:
+        """Close the connections for a source's listeners at a peer, since its route has ended."""
+        for connection in self._shown.pop((peer, source), {}).values():
+            connection.close()
+
+    def link_down(self, peer: int) -> None:
+        """Close the connections for all listeners of a peer whose link is gone."""
+        for owner, source in [key for key in self._shown if key[0] == peer]:
+            self.route_over(owner, source)
+        for key in [key for key in self._told if key[0] == peer]:
+            del self._told[key]
+
+    def close(self) -> None:
+        """Close all connections."""
+        if self._soon is not None:
+            self._soon.cancel()
+        for peer, source in list(self._shown):
+            self.route_over(peer, source)
