@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from rmpa.agent import core_choice
+from rmpa.agent import agent as core_choice
 from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError
 from rmpa.ros.core.embedded import RosCore

@@ -13,8 +13,7 @@ from unittest import mock
 
 import pytest
 
-from rmpa.agent.agent import Agent
-from rmpa.agent.permission_notes import permission_notes
+from rmpa.agent.agent import Agent, permission_notes
 from rmpa.bridge.nodes import INFO, KILL, LIST, PING
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.sessions import PeerSession

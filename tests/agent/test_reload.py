@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.agent import reload
-from rmpa.agent.reload import Reloader, SighupHandler
+from rmpa.agent import process as reload
+from rmpa.agent.process import Reloader, SighupHandler
 from rmpa.config.peer_rules import ModuleGroup, PermissionRule
 from rmpa.config.read import Loaded, load_settings
 from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings, TrustSettings

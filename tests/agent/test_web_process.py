@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.agent import limits
-from rmpa.agent.web_process import WebProcess, web_command, web_environment
+from rmpa.agent import process as limits
+from rmpa.agent.process import WebProcess, web_command, web_environment
 from rmpa.config.settings import Settings, WebSettings
 
 if TYPE_CHECKING:

@@ -1,16 +1,22 @@
-"""The process of an agent: its signals, its readiness, and the limits that it sets for itself."""
+"""Limits of what an agent runs beside itself. Seconds."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import os
 import signal
+import subprocess
 import sys
-from typing import TYPE_CHECKING
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.agent.reload import SighupHandler
-from rmpa.core.counters import remedy
-from rmpa.core.errors import StartError
+from rmpa.config.settings import SETTINGS
+from rmpa.core.counters import Backoff, remedy
+from rmpa.core.errors import ConfigError, StartError
+from rmpa.observe.reload_reply import ReloadReply
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
 from rmpa.runtime.accept import is_shortage, raise_file_limit
@@ -18,12 +24,312 @@ from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.process import notify_service_manager
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine
+    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 
-    from rmpa.agent.reload import Reloader
+    from rmpa.config.read import Loaded
+    from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
 
+WEB_RESTART_FIRST: Final = 0.5
+"""Until rmpa web is started anew after it ended; each further time it is twice as long."""
+WEB_RESTART_CAP: Final = 30.0
+"""The longest such time."""
+WEB_STEADY: Final = 60.0
+"""After a run of this length the next wait is the first one again."""
+WEB_END_TIMEOUT: Final = 5.0
+"""For rmpa web to end when the agent ends; then it is killed."""
+
+
+# Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``).
+
+
 _log = logging.getLogger(__name__)
+
+LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
+"""The fields of ``Settings`` that a running agent takes; all others need a restart."""
+_VALUE_SHOWN: Final = 60
+"""The most characters of a value in a text for the user."""
+
+
+class Reloader:
+    """Reads the settings again; requests are served one after the other.
+
+    Args:
+        settings: Those that the agent runs with.
+        load: Reads all sources again; may take long and raise ``ConfigError``.
+        apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
+    """
+
+    def __init__(
+        self, settings: Settings, load: Callable[[], Loaded] | None, apply: Callable[[Settings], None]
+    ) -> None:
+        self._settings = settings
+        self._load = load
+        self._apply = apply
+        self._one = asyncio.Lock()
+        self.waiting: tuple[str, ...] = ()
+        """The settings that need a restart to take effect, as of the last reload."""
+
+    async def reload(self, *, check: bool = False) -> ReloadReply:
+        """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
+
+        Args:
+            check: Whether to report only what would change, and to apply nothing.
+
+        Raises:
+            ConfigError: This agent was started from a program, without a file to read again.
+        """
+        if self._load is None:
+            raise ConfigError("the settings", "this agent was given them by a program", "change them there")
+        async with self._one:
+            try:
+                # In a thread: reading a long file takes long, and finding the line of an error takes longer.
+                loaded = await asyncio.to_thread(self._load)
+            except ConfigError as error:
+                if not check:
+                    _log.error("! the settings stay as they are: %s", error)
+                return ReloadReply(problem=str(error))
+            reply = self._compare(loaded)
+            if not check:
+                self._take(loaded.settings, reply)
+            return reply
+
+    def _compare(self, loaded: Loaded) -> ReloadReply:
+        differences = list(_differences(self._settings, loaded.settings))
+        return ReloadReply(
+            file=str(loaded.settings.config_file or ""),
+            changed=tuple(setting.title for setting, _, _ in differences if setting.live),
+            restart=tuple(
+                f"{setting.title} ({_shown(new)} instead of {_shown(old)})"
+                for setting, old, new in differences
+                if not setting.live
+            ),
+            notes=loaded.notes,
+        )
+
+    def _take(self, settings: Settings, reply: ReloadReply) -> None:
+        tables = {name: _taken(name, getattr(self._settings, name), getattr(settings, name)) for name in LIVE}
+        self._settings = replace(self._settings, config_file=settings.config_file, **tables)
+        self.waiting = reply.restart
+        if reply.changed:
+            self._apply(self._settings)
+        _log.info("= settings read again: %s", ", ".join(reply.changed) if reply.changed else "nothing has changed")
+        for note in reply.notes:
+            _log.warning("%s", note)
+        for key in reply.restart:
+            _log.warning("! %s only holds after a restart", key)
+
+
+class SighupHandler:
+    """Reads the settings again at SIGHUP; ends the agent if its terminal was closed, as that ends any program.
+
+    Args:
+        reloader: Reads them.
+        stop: Ends the agent.
+    """
+
+    def __init__(self, reloader: Reloader, stop: Callable[[], object]) -> None:
+        self._reloader = reloader
+        self._stop = stop
+        self._had_terminal = _has_terminal()
+        self._running: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Handle the signal from now on, unless it is ignored (``nohup``)."""
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_signal)
+
+    async def close(self) -> None:
+        """Stop handling the signal."""
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+
+    def _on_signal(self) -> None:
+        if self._had_terminal and not _has_terminal():
+            _log.info("= the terminal is gone")
+            self._stop()
+            return
+        task = asyncio.create_task(self._reload(), name="read the settings again")
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    async def _reload(self) -> None:
+        notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        try:
+            await self._reloader.reload()
+        except ConfigError as error:
+            _log.error("! the settings stay as they are: %s", error)
+        except Exception:  # noqa: BLE001 - the task's top
+            _log.exception("! the settings could not be read again")
+        finally:
+            notify_service_manager("READY=1")
+
+
+def _has_terminal() -> bool:
+    """Whether this process has a controlling terminal that is still there."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_CLOEXEC))
+    except OSError:
+        return False
+    return True
+
+
+def _differences(old: Settings, new: Settings) -> Iterator[tuple[Setting, object, object]]:
+    """``(setting, old value, new value)`` of each that differs."""
+    for setting in SETTINGS:
+        before, after = setting.value_in(old), setting.value_in(new)
+        if before != after:
+            yield setting, before, after
+
+
+def _taken(name: str, old: Any, new: Any) -> Any:
+    """A field of ``Settings`` as it holds from now on: of a table, what is not live stays as it was."""
+    kept = [setting.path[1] for setting in SETTINGS if setting.path[0] == name and not setting.live]
+    return replace(new, **{key: getattr(old, key) for key in kept}) if kept else new
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        text = "[" + ", ".join(map(str, value)) + "]"
+    else:
+        text = str(value).lower() if isinstance(value, bool) else str(value) or "nothing"
+    return text if len(text) <= _VALUE_SHOWN else text[: _VALUE_SHOWN - 3] + "..."
+
+
+# Runs ``rmpa web`` as a child process of the agent, which does not depend on it.
+#
+# The child's standard input is a pipe from the agent: its end tells the child that the agent has ended, however it
+# did.
+
+
+_USAGE: Final = 2
+"""The exit code of a command that cannot run as it is written: another start would end alike."""
+
+
+def web_command(settings: Settings) -> list[str]:
+    """The command line of the child: all that the agent's own options may have changed is given."""
+    web = settings.web
+    command = [sys.executable, "-m", "rmpa.cli.main", "web", "--with-agent", "--agent", settings.name]
+    command += ["--port", str(web.port), "--listen", web.listen]
+    if web.token_file:
+        command += ["--token-file", web.token_file]
+    if settings.config_file is not None:
+        command += ["--config", str(settings.config_file)]
+    return command
+
+
+def web_environment(settings: Settings, environ: Mapping[str, str]) -> dict[str, str]:
+    """The environment of the child: the agent's, with its log's level and format."""
+    log = {"RMPA_LOG_LEVEL": settings.log_level, "RMPA_LOG_JSON": str(settings.log_json).lower()}
+    return {**environ, **log}
+
+
+class WebProcess:
+    """The child, started again with a growing delay whenever it ends.
+
+    Args:
+        command: Its command line.
+        rng: Uniform numbers in [0, 1), for the delays.
+        environ: Its environment; ``None``: the agent's.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        rng: Callable[[], float],
+        *,
+        environ: Mapping[str, str] | None = None,
+    ) -> None:
+        self._command = command
+        self._environ = environ
+        self._backoff = Backoff(WEB_RESTART_FIRST, WEB_RESTART_CAP, rng)
+        self._task: asyncio.Task[None] | None = None
+        self.pid: int | None = None
+        """The child's process id, while it runs."""
+
+    def start(self) -> None:
+        """Start the child, and look after it until ``close()``."""
+        self._task = asyncio.create_task(self._supervise(), name="rmpa web")
+
+    def reload(self) -> None:
+        """Have the child read its settings again; one that is not there reads them when it starts."""
+        if self.pid is not None:
+            with contextlib.suppress(OSError):
+                os.kill(self.pid, signal.SIGHUP)
+
+    async def close(self) -> None:
+        """End the child, and wait until it has ended."""
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+            self._task = None
+
+    async def _supervise(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            began = loop.time()
+            try:
+                code = await self._run()
+            except OSError as error:
+                _log.warning("! rmpa web cannot be started: %s", error)
+                code = 1
+            if code == _USAGE:
+                _log.warning("! rmpa web cannot run with these settings (see above); it is not started again")
+                return
+            if loop.time() - began >= WEB_STEADY:
+                self._backoff.reset()
+            delay = self._backoff.delay()
+            _log.warning("! rmpa web ended with code %d; it is started again in %.1f s", code, delay)
+            await asyncio.sleep(delay)
+
+    async def _run(self) -> int:
+        process = await asyncio.to_thread(self._spawn)
+        try:
+            self.pid = process.pid
+            await _ended(process.pid)
+        except asyncio.CancelledError:
+            await self._end(process)
+            raise
+        finally:
+            self.pid = None
+            if process.stdin is not None:
+                process.stdin.close()
+        return process.wait()
+
+    def _spawn(self) -> subprocess.Popen[bytes]:
+        # In a session of its own Ctrl-C does not reach it: it ends with the agent, and not before.
+        return subprocess.Popen(  # noqa: S603 - our own program
+            self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environ
+        )
+
+    async def _end(self, process: subprocess.Popen[bytes]) -> None:
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            async with asyncio.timeout(WEB_END_TIMEOUT):
+                await _ended(process.pid)
+        except TimeoutError:
+            process.kill()
+        process.wait()
+
+
+async def _ended(pid: int) -> None:
+    """Wait until a child process has ended, without a thread; it remains to be waited for."""
+    descriptor = os.pidfd_open(pid)
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    try:
+        loop.add_reader(descriptor, ended.set)
+        await ended.wait()
+    finally:
+        loop.remove_reader(descriptor)
+        os.close(descriptor)
+
+
+# The process of an agent: its signals, its readiness, and the limits that it sets for itself.
 
 
 async def serve(
