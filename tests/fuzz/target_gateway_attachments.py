@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.sites.attachment import SiteAttachment
+from rmpa.gateway.ros2.format import Ros2Attachment
+from rmpa.gateway.sites.keys import SiteAttachment
 from rmpa.gateway.sites.services import read_description, write_description
 from rmpa.ros.wire.tcpros import ServiceDescription
 

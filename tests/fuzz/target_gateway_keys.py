@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.gateway.ros2 import tokens as ros2_tokens
+from rmpa.gateway.ros2 import format as ros2_tokens
+from rmpa.gateway.ros2.format import Ros2Endpoint
 from rmpa.gateway.ros2.graph import Ros2Graph
-from rmpa.gateway.ros2.tokens import Ros2Endpoint
 from rmpa.gateway.sites import keys as site_keys
 from rmpa.gateway.sites.services import asked_type
 

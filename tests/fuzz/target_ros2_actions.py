@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
-from rmpa.gateway.ros2.action_messages import (
+from rmpa.gateway.ros2.actions import GoalsToRos1
+from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.mapping import (
+    ActionRule,
     GoalId,
     GoalState,
     Ros1Status,
@@ -18,10 +21,7 @@ from rmpa.gateway.ros2.action_messages import (
     ros2_states,
     with_uuid,
 )
-from rmpa.gateway.ros2.action_pair import ActionPair
-from rmpa.gateway.ros2.io.offered_action import GoalsToRos1
-from rmpa.gateway.ros2.io.shown_action import GoalsToRos2
-from rmpa.gateway.ros2.mapping import ActionRule
+from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock

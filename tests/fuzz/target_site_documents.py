@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.gateway.sites.topic_header import TopicHeader
+from rmpa.gateway.sites.exported_topic import TopicHeader
 from rmpa.gateway.sites.why import WhyQuestion, parse_ways
 from rmpa.observe.check import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from rmpa.config.peer_rules import PolicySettings, ServiceRule
 from rmpa.config.settings import ServiceSettings, Settings
-from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.own_policy import OwnPolicy
+from rmpa.gateway.neighbour import OwnPolicy, SourceKind
 
 POLICY = OwnPolicy(
     Settings(

@@ -6,7 +6,7 @@ from rmpa.bridge.policy import PermissionGate
 from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.gateway.site_permissions import SitePermissions
+from rmpa.gateway.neighbour import SitePermissions
 from rmpa.trust.documents import Permissions
 
 

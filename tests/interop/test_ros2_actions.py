@@ -9,7 +9,7 @@ import pytest
 
 from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import eventually
-from rmpa.gateway.ros2.action_pair import ActionPair
+from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.mapping import ActionRule
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType

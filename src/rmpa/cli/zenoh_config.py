@@ -40,6 +40,6 @@ def zenoh_config(**options: object) -> None:
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())
     for note in loaded.notes:
         warn(note)
-    from rmpa.gateway.zenoh.trust import zenohd_config
+    from rmpa.gateway.zenoh.access import zenohd_config
 
     click.echo(zenohd_config(loaded.settings), nl=False)

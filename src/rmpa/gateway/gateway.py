@@ -14,8 +14,8 @@ from rmpa.agent.process import run_process, serve
 from rmpa.core.counters import Backoff
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
-from rmpa.gateway.graph.own_graph import AgentGraph
-from rmpa.gateway.zenoh.trust import open_trusted_session
+from rmpa.gateway.own_graph import AgentGraph
+from rmpa.gateway.zenoh.access import open_trusted_session
 from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:
@@ -258,11 +258,11 @@ def _make_neighbours(graph: AgentGraph, session: OpenSession, settings: Settings
     neighbours: dict[str, Neighbour] = {}
     gateway = settings.gateway
     if gateway.site:
-        from rmpa.gateway.sites.io.joining import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
+        from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
 
         neighbours["sites"] = make_site_neighbour(graph, session, settings)
     if gateway.ros2.enabled:
-        from rmpa.gateway.ros2.io.joining import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
+        from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
 
         neighbours["ros2"] = make_ros2_neighbour(graph, session, settings)
     return neighbours

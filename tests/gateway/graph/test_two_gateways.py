@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
-from rmpa.gateway.graph.origins import foreign_origin, site_instance
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
+from rmpa.gateway.own_graph import foreign_origin, site_instance
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.test_agent import Sink, node, settings, until
 from tests.agent.test_services import connect, provider, serving

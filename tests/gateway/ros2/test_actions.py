@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.action_messages import (
+from rmpa.gateway.ros2.actions import GoalsToRos1
+from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
+from rmpa.gateway.ros2.mapping import (
     ALL_GOALS,
+    ActionRule,
     GoalId,
     GoalState,
     Ros1Status,
     Ros2Status,
+    TypeMapping,
     cancel_request,
     cancel_response,
     parse_outcome,
@@ -25,10 +29,7 @@ from rmpa.gateway.ros2.action_messages import (
     send_goal_response,
     with_uuid,
 )
-from rmpa.gateway.ros2.action_pair import CANCEL_TYPE, ActionPair
-from rmpa.gateway.ros2.io.offered_action import GoalsToRos1
-from rmpa.gateway.ros2.io.shown_action import GoalsToRos2
-from rmpa.gateway.ros2.mapping import ActionRule, TypeMapping
+from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.ros2.format import Ros2Attachment
 
 GOLDEN = bytes.fromhex("0700000000000000 15cd5b0700000000 10 000102030405060708090a0b0c0d0e0f")
 ATTACHMENT = Ros2Attachment(7, 123456789, bytes(range(16)))

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.gateway import limits
+from rmpa.gateway.ros2.format import EntityKind, Ros2Endpoint, Ros2Node, Ros2Qos
 from rmpa.gateway.ros2.graph import Ros2Graph, valid_name
-from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node
 
 if TYPE_CHECKING:
     import pytest

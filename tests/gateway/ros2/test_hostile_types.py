@@ -20,8 +20,7 @@ from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.transcoder import Items, Number, Side, Text, Transcoder
-from rmpa.gateway.ros2.type_description import parse_type_response
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, parse_type_response
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.ros2.type_descriptions import respond
 

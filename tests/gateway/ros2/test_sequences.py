@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.sequences import Ros2Sequences
+from rmpa.gateway.ros2.format import Ros2Attachment
+from rmpa.gateway.ros2.types import Ros2Sequences
 
 if TYPE_CHECKING:
     import pytest

@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
-from rmpa.gateway.ros2.service_pair import ServicePair, ros1_without_use, ros2_without_use, type_by_name
+from rmpa.gateway.ros2.services import ServicePair, ros1_without_use, ros2_without_use, type_by_name
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.installed import ServiceType, known_services
 

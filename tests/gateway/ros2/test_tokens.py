@@ -10,11 +10,15 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Liveliness, Ros2Qos, Ros2Reliability
-from rmpa.gateway.ros2.tokens import (
+from rmpa.gateway.ros2.format import (
     EntityKind,
+    Ros2Durability,
     Ros2Endpoint,
+    Ros2History,
+    Ros2Liveliness,
     Ros2Node,
+    Ros2Qos,
+    Ros2Reliability,
     data_key,
     dds_type,
     graph_key,

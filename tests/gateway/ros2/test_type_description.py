@@ -13,8 +13,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.pairs import Ros2Pairs
-from rmpa.gateway.ros2.type_description import parse_type_response, type_request
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, parse_type_response, type_request
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.ros2.type_descriptions import respond, response
 

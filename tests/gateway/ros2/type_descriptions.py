@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Nodetype
 
-from rmpa.gateway.ros2 import type_description
+from rmpa.gateway.ros2 import types as type_description
 from rmpa.gateway.ros2.types import embedded
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.gateway.zenoh_api import ZenohPriority, ZenohReply
+from rmpa.gateway.neighbour import ZenohPriority, ZenohReply
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.core.contract import Contracts
 from rmpa.gateway.neighbour import MeshSource, SourceKind
-from rmpa.gateway.sites.io.neighbour import SiteNeighbour
-from rmpa.gateway.sites.io.topic_part import SiteTopics
+from rmpa.gateway.sites.catalogue import CrossingRules
+from rmpa.gateway.sites.imported_topic import SiteTopics
 from rmpa.gateway.sites.keys import SiteGateway
-from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.loop import SystemClock
 from tests.gateway.memory_graph import MemoryGraph, MemoryTap, MemoryTopic

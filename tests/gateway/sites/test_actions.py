@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.io.action_part import SiteActions
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.part import SiteExport, SiteImport
+from rmpa.gateway.sites.plans import SiteExport, SiteImport
+from rmpa.gateway.sites.services import SiteActions
 
 RUN = "0" * 32
 

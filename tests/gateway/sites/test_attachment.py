@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.sites.attachment import AttachmentReader, SiteAttachment
+from rmpa.gateway.sites.keys import AttachmentReader, SiteAttachment
 
 ATTACHMENT = SiteAttachment(
     7, 123456789, "992ce8a1687cec8c8bd883ec73ca41d1", "/talker", ("warehouse", "cloud"), latched=True

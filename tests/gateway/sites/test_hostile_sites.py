@@ -15,14 +15,19 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.sites.attachment import AttachmentReader, SiteAttachment
-from rmpa.gateway.sites.catalogue import SiteCatalogue
-from rmpa.gateway.sites.history import SiteHistory
-from rmpa.gateway.sites.imports import SiteImports
-from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
+from rmpa.gateway.sites.catalogue import CrossingRules, SiteCatalogue
+from rmpa.gateway.sites.exported_topic import TopicHeader
+from rmpa.gateway.sites.keys import (
+    AttachmentReader,
+    SiteAttachment,
+    SiteGateway,
+    SiteHistory,
+    SiteModule,
+    SiteSource,
+    parse_token,
+)
 from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
-from rmpa.gateway.sites.rules import CrossingRules
-from rmpa.gateway.sites.topic_header import TopicHeader
+from rmpa.gateway.sites.plans import SiteImports
 from rmpa.gateway.sites.why import parse_ways
 
 if TYPE_CHECKING:

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core.contract import Contracts
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.gateway.sites.attachment import SiteAttachment
-from rmpa.gateway.sites.io.topic_part import SiteTopics
-from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.part import SiteImport
-from rmpa.gateway.sites.rules import CrossingRules
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway.neighbour import ForeignSource, SourceKind, ZenohQos
+from rmpa.gateway.sites.catalogue import CrossingRules
+from rmpa.gateway.sites.imported_topic import SiteTopics
+from rmpa.gateway.sites.keys import SiteAttachment, SiteModule, SiteSource
+from rmpa.gateway.sites.plans import SiteImport
 from rmpa.runtime.loop import SystemClock
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryZenoh, eventually

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
+from rmpa.gateway.sites.catalogue import Leader
 from rmpa.gateway.sites.keys import SiteGateway
-from rmpa.gateway.sites.leader import Leader
 
 PATIENCE = 1.0
 

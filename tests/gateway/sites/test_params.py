@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.gateway.sites.io.param_exports import SiteParamExports
-from rmpa.gateway.sites.io.param_imports import SiteParamImports
 from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamQuestion,
     SiteAsker,
+    SiteParamExports,
+    SiteParamImports,
     from_json,
     param_key,
     parse_param_key,

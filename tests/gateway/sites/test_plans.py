@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.exports import SiteExports
-from rmpa.gateway.sites.imports import ImportChange, SiteImports
+from rmpa.gateway.sites.catalogue import CrossingRules
 from rmpa.gateway.sites.keys import SiteModule, SiteSource, parse_token
-from rmpa.gateway.sites.part import SiteExport
-from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.gateway.sites.plans import ImportChange, SiteExport, SiteExports, SiteImports
 
 if TYPE_CHECKING:
     import pytest

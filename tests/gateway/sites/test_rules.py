@@ -7,9 +7,8 @@ from rmpa.config.peer_rules import Access, PermissionRule, PolicySettings
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.site_permissions import SitePermissions
-from rmpa.gateway.sites.rules import CrossingDecision, CrossingRules
+from rmpa.gateway.neighbour import SitePermissions, SourceKind
+from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
 from rmpa.trust.documents import Permissions
 
 T = SourceKind.TOPIC

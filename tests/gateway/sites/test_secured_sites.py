@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.rules import Crossing, CrossingRule
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway.neighbour import ZenohQos
 from tests.gateway.sites.site_bed import SiteBed, described
 from tests.gateway.zenoh_bed import ZenohBed, until
 from tests.gateway.zenoh_fleet import Fleet, allow

@@ -12,11 +12,15 @@ from hypothesis import strategies as st
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.io.service_exports import SiteServiceExports
-from rmpa.gateway.sites.io.service_imports import SiteServiceImports
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.part import SiteExport, SiteImport
-from rmpa.gateway.sites.services import asked_type, read_description, write_description
+from rmpa.gateway.sites.plans import SiteExport, SiteImport
+from rmpa.gateway.sites.services import (
+    SiteServiceExports,
+    SiteServiceImports,
+    asked_type,
+    read_description,
+    write_description,
+)
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.gateway.sites.loopback_session import LoopbackSession
 

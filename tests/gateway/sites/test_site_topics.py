@@ -10,7 +10,7 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.contract import ContractRule
 from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import token_keys
-from rmpa.gateway.zenoh.sending import QueuedPublisher
+from rmpa.gateway.zenoh.threads import QueuedPublisher
 from tests.gateway.sites.site_bed import MD5, SiteBed, described, site_bed
 from tests.gateway.zenoh_bed import until
 
@@ -328,7 +328,7 @@ async def test_a_message_without_a_true_attachment_is_counted_and_dropped() -> N
         yard, hall = await bed.pair()
         yard.graph.add("/scan", described())
         topic = await hall.subscribed("/scan")
-        from rmpa.gateway.zenoh_api import ZenohQos
+        from rmpa.gateway.neighbour import ZenohQos
 
         stranger = await bed.zenoh.session()
         publisher = stranger.publisher("rmpa/1/yard/arm/t/odd_msgs%Odd/scan", ZenohQos(), lambda _there: None)

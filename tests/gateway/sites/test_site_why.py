@@ -15,14 +15,12 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.site_permissions import SitePermissions
-from rmpa.gateway.sites.history import SiteHistory
-from rmpa.gateway.sites.io.site_answers import SiteAnswers
-from rmpa.gateway.sites.io.site_why import SiteWhy
-from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
-from rmpa.gateway.sites.rules import CrossingRules
+from rmpa.gateway.neighbour import SitePermissions, SourceKind
+from rmpa.gateway.sites.answers import SiteAnswers
+from rmpa.gateway.sites.catalogue import CrossingRules
+from rmpa.gateway.sites.keys import SiteGateway, SiteHistory, SiteModule, SiteSource
 from rmpa.gateway.sites.why import (
+    SiteWhy,
     SourceHere,
     WhyQuestion,
     here_stages,

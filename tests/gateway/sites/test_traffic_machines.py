@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.sites.sequence import SequenceCounter
-from rmpa.gateway.sites.topic_header import TopicHeader
-from rmpa.gateway.sites.topic_limits import TopicLimits
-from rmpa.gateway.sites.topic_qos import qos_of
-from rmpa.gateway.sites.traffic import SiteTraffic
-from rmpa.gateway.zenoh_api import ZenohPriority
+from rmpa.gateway.neighbour import ZenohPriority
+from rmpa.gateway.sites.catalogue import SiteTraffic
+from rmpa.gateway.sites.exported_topic import SequenceCounter, TopicHeader, TopicLimits, qos_of
 from rmpa.ros.wire.tcpros import TopicDescription
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"

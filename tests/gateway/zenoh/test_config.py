@@ -6,7 +6,7 @@ import pytest
 
 from rmpa.config.rules import GatewaySettings
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import limits
+from rmpa.gateway import limits
 from rmpa.gateway.zenoh.config import MeshCertificates, ZenohMode, gateway_config, zenohd_entries
 
 FILES = MeshCertificates("ca.crt", "module.crt", "module.key")

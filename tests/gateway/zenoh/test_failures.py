@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.zenoh import limits
-from rmpa.gateway.zenoh_api import ZenohPriority, ZenohQos
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.gateway.zenoh import limits
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ZenohQos
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
 
 zenoh = pytest.importorskip("zenoh")
@@ -125,7 +125,7 @@ async def test_giant_keys_are_dropped_and_counted(net: ZenohBed, eve: Any) -> No
     victim = await net.session()
     tokens: list[str] = []
     victim.watch_tokens("rmpa/1/**", lambda key, _: tokens.append(key))
-    long = "rmpa/1/" + "a" * 2 * limits.KEY_MAX
+    long = "rmpa/1/" + "a" * 2 * limits.ZENOH_KEY_MAX
     held = [eve.liveliness().declare_token(key) for key in (long, "rmpa/1/hall/arm/up/00")]
     await until(lambda: tokens)
     assert tokens == ["rmpa/1/hall/arm/up/00"]

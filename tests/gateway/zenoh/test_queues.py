@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals
-from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway.neighbour import ZenohQos
+from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane
 from tests.gateway.zenoh_bed import until
 
 if TYPE_CHECKING:

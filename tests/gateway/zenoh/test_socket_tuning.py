@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.zenoh.socket_tuning import SocketTuning
+from rmpa.gateway.zenoh.config import SocketTuning
 from tests.gateway.zenoh_bed import bed, until
 
 if TYPE_CHECKING:

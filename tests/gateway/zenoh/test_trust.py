@@ -14,11 +14,11 @@ import pytest
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import trust
+from rmpa.gateway.neighbour import ZenohQos
+from rmpa.gateway.zenoh import access as trust
+from rmpa.gateway.zenoh.access import open_trusted_session, revoked_modules, zenohd_config
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.gateway.zenoh.trust import open_trusted_session, revoked_modules, zenohd_config
-from rmpa.gateway.zenoh_api import ZenohQos
 from rmpa.trust.documents import DenyList
 from tests.gateway.zenoh_bed import until
 from tests.gateway.zenoh_fleet import Fleet, allow, deny
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.config.peer_rules import PermissionRule
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
 
 zenoh = pytest.importorskip("zenoh")

@@ -1,10 +1,4 @@
-"""Conversion of messages between ROS 1's serialization and ROS 2's CDR.
-
-Where the fields that both types have are in one order and of one size, the bytes are converted without making
-objects (``transcoder``). Else each field goes to the one of the same name, or as a mapping file says; numbers are
-checked for their range. A field that only one side has, as ``seq`` of a header, is 0 or empty there. As in
-ros1_bridge, two types of which *each* has fields that the other lacks are no pair: a rule must say what goes where.
-"""
+"""An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions."""
 
 from __future__ import annotations
 
@@ -16,17 +10,136 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.base import normalize_fieldname
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.gateway.ros2.layout import HEADER, TIMES, Layouts, name2_of
-from rmpa.gateway.ros2.transcoder import Transcoder
-from rmpa.gateway.ros2.type_size import check_ros1_size
-from rmpa.gateway.ros2.types import ros2_name, snake_case
+from rmpa.gateway.ros2.transcoder import Items, Number, Part, Side, Text, Transcoder, on_side
+from rmpa.gateway.ros2.types import check_ros1_size, ros2_name, snake_case
+from rmpa.ros.types.definitions import Specification
+from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from rmpa.gateway.ros2.mapping import FieldPaths
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from rmpa.gateway.ros2.mapping import ActionRule, FieldPaths
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.ros.types.definitions import Field
-    from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
+
+
+# The layout of a pair of types: what their messages are made of, in order, for the transcoder.
+
+
+HEADER: Final = "std_msgs/msg/Header"
+TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
+"""ROS 1's primitive times, and the messages of ROS 2 that have the same 8 bytes."""
+_TIME_LAYOUT: Final = Number(4, 2)
+_SIZES: Final = {
+    **dict.fromkeys(("bool", "byte", "char", "int8", "uint8", "octet"), 1),
+    **dict.fromkeys(("int16", "uint16"), 2),
+    **dict.fromkeys(("int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("int64", "uint64", "float64"), 8),
+}
+"""Bytes of the numbers of both sides, and their alignment in CDR."""
+_BYTES: Final = dict.fromkeys(("byte", "char", "int8", "uint8", "octet"), "byte")
+"""Numbers of one byte mean the same under each of these names; other numbers have to have one name."""
+
+
+class Layouts:
+    """Finds the layouts of pairs of types.
+
+    Args:
+        ros1: The fields of ROS 1's types by name.
+        ros2: The fields of ROS 2's types by name, as rosbags has them.
+    """
+
+    def __init__(self, ros1: Mapping[str, Specification], ros2: Mapping[str, Any]) -> None:
+        self._ros1 = ros1
+        self._ros2 = ros2
+
+    def of(self, name1: str, name2: str) -> tuple[Part, ...] | None:
+        """The parts of a message of both types; ``None`` if order or size of their common fields differ."""
+        fields2 = dict(self._ros2[name2][1])
+        if ros2_name(name1) == name2 == HEADER:
+            return (Number(4, side=Side.ROS1), _TIME_LAYOUT, Text())  # seq, stamp, frame_id
+        ones = {name2_of(field.name, fields2): field for field in self._ros1[name1].fields}
+        if [name for name in ones if name in fields2] != [name for name in fields2 if name in ones]:
+            return None
+        parts: list[Part] = []
+        waiting = list(fields2.items())
+        for name, field in ones.items():
+            if name not in fields2:
+                parts += on_side(self._only1(field), Side.ROS1)
+                continue
+            while waiting[0][0] != name:
+                parts += on_side(self._only2(waiting.pop(0)[1]), Side.ROS2)
+            both = self._field(field, waiting.pop(0)[1])
+            if both is None:
+                return None
+            parts += both
+        for _, desc in waiting:
+            parts += on_side(self._only2(desc), Side.ROS2)
+        return tuple(parts)
+
+    def _field(self, field: Field, desc: Any) -> tuple[Part, ...] | None:
+        """The parts of a field that both sides have."""
+        if not field.array:
+            return self._scalar(field, desc)
+        if desc[0] != (Nodetype.SEQUENCE if field.size is None else Nodetype.ARRAY):
+            return None
+        inner, count = desc[1]
+        parts = self._scalar(field, inner)
+        if parts is None or (field.size is not None and field.size != count):
+            return None
+        return (_array(parts, field.size, count if field.size is None else 0, field.name),)
+
+    def _scalar(self, field: Field, desc: Any) -> tuple[Part, ...] | None:
+        if desc[0] == Nodetype.NAME:
+            if field.primitive:
+                return (_TIME_LAYOUT,) if TIMES.get(field.type) == desc[1] else None
+            return self.of(field.type, desc[1])
+        if desc[0] != Nodetype.BASE or not field.primitive:
+            return None
+        base, bound = desc[1]
+        if field.type == base == "string":
+            return (Text(bound=bound, name=field.name),)
+        same = _BYTES.get(field.type, field.type) == _BYTES.get(base, base)
+        return (Number(_SIZES[base]),) if same and base in _SIZES else None
+
+    def _only1(self, field: Field) -> tuple[Part, ...]:
+        if field.primitive:
+            number = _TIME_LAYOUT if field.type in TIMES else Number(_SIZES.get(field.type, 0))
+            parts: tuple[Part, ...] = (Text() if field.type == "string" else number,)
+        else:
+            parts = tuple(part for each in self._ros1[field.type].fields for part in self._only1(each))
+        return (_array(parts, field.size),) if field.array else parts
+
+    def _only2(self, desc: Any) -> tuple[Part, ...]:
+        if desc[0] == Nodetype.NAME:
+            return tuple(part for _, each in self._ros2[desc[1]][1] for part in self._only2(each))
+        if desc[0] == Nodetype.BASE:
+            return (Text(),) if desc[1][0] == "string" else (Number(_SIZES[desc[1][0]]),)
+        inner, count = desc[1]
+        return (_array(self._only2(inner), count if desc[0] == Nodetype.ARRAY else None),)
+
+
+def name2_of(name: str, fields2: Iterable[str]) -> str:
+    """ROS 2's name of a field of ROS 1."""
+    return name if name in fields2 else snake_case(name)
+
+
+def _array(parts: tuple[Part, ...], count: int | None, bound: int = 0, name: str = "") -> Part:
+    """An array; one of a fixed number of numbers is numbers, so that it is copied with its neighbours."""
+    if count is not None and len(parts) == 1 and isinstance(parts[0], Number):
+        return Number(parts[0].size, parts[0].count * count, parts[0].side)
+    return Items(parts, count, Side.BOTH, bound, name)
+
+
+# Conversion of messages between ROS 1's serialization and ROS 2's CDR.
+#
+# Where the fields that both types have are in one order and of one size, the bytes are converted without making
+# objects (``transcoder``). Else each field goes to the one of the same name, or as a mapping file says; numbers are
+# checked for their range. A field that only one side has, as ``seq`` of a header, is 0 or empty there. As in
+# ros1_bridge, two types of which *each* has fields that the other lacks are no pair: a rule must say what goes
+# where.
+
 
 _EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
 _UNSIGNED: Final = ("uint8", "char")
@@ -353,3 +466,96 @@ _ERRORS: Final = (
     OverflowError,
 )
 """What rosbags raises for bytes that are not a message; it does not check everything itself."""
+
+
+PART: Final = "/_action/"
+"""Stands between an action's name and those of its services and topics in ROS 2."""
+CANCEL_TYPE: Final = "action_msgs/srv/CancelGoal"
+STATUS_TYPE: Final = "action_msgs/msg/GoalStatusArray"
+_UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
+_TIME: Final = ("stamp", (Nodetype.NAME, "builtin_interfaces/msg/Time"))
+_INFO: Final = (Nodetype.NAME, "action_msgs/msg/GoalInfo")
+
+
+class ActionPair:
+    """Converts goals, results and feedback of one action type.
+
+    Args:
+        kinds: ROS 1's goal, result and feedback, without their wrapping.
+        rule: Its counterpart, ``package/action/Name``, and the fields if a mapping file lists them.
+        types: ROS 2's types; the action's are learnt from ROS 1's fields if they are not known.
+
+    Raises:
+        NoConversion: The types are no pair.
+    """
+
+    def __init__(self, kinds: Sequence[MessageType], rule: ActionRule, types: Ros2Types) -> None:
+        goal, result, feedback = kinds
+        self.name: Final = rule.name
+        """``package/action/Name`` of ROS 2."""
+        self.ros1: Final = goal.name.removesuffix("Goal")
+        """``package/Name`` of ROS 1."""
+        if rule.has_fields and f"{rule.name}_Goal" not in types:
+            raise NoConversion(
+                f"the rule of {self.ros1} maps fields to {rule.name}, whose definition is not known here"
+            )
+        for part, kind in zip(("Goal", "Result", "Feedback"), kinds, strict=True):
+            types.learn({name: each for name, each in kind.specifications.items() if name != kind.name})
+            types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
+        self.types: Final = _define(rule.name, types)
+        """The type of each service and topic in ROS 2, and its hash."""
+        self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.goal)
+        """Converts goals, without the id."""
+        self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.feedback)
+        """Converts feedback, without the id."""
+        self.result: Final = result
+        """ROS 1's result."""
+        wrapped = f"{self.ros1}GetResultResponse"
+        both = Specification.parse(wrapped, f"int8 status\n{result.name} result\n")
+        paths = rule.result and {"status": "status", **{f"result.{a}": f"result.{b}" for a, b in rule.result.items()}}
+        known = {**result.specifications, wrapped: both}
+        self._result = Conversion(MessageType(wrapped, known), f"{rule.name}_GetResult_Response", types, paths)
+        self.no_result: Final = result.serialize(result.make(None))
+        """A result of ROS 1 without values, for goals that have none."""
+
+    def result_to_ros2(self, status: int, result: bytes) -> bytes:
+        """``GetResult_Response``.
+
+        Raises:
+            ConversionError: The result does not fit ROS 2's type.
+        """
+        return self._result.to_ros2(bytes((status,)) + result)
+
+    def result_to_ros1(self, raw: bytes) -> tuple[int, bytes]:
+        """Status and result of a ``GetResult_Response``.
+
+        Raises:
+            ConversionError: The bytes are no such response.
+        """
+        made = self._result.to_ros1(raw)
+        return made[0], made[1:]
+
+
+def _define(name: str, types: Ros2Types) -> dict[str, tuple[str, str]]:
+    """Define the types of one action of ROS 2, as rosidl_parser does."""
+    own: dict[str, Any] = {part: (Nodetype.NAME, f"{name}_{part}") for part in ("Goal", "Result", "Feedback")}
+    number = (Nodetype.BASE, ("int8", 0))
+    sent = [("accepted", (Nodetype.BASE, ("bool", 0))), _TIME]
+    types.define_service(f"{name}_SendGoal", [_UUID, ("goal", own["Goal"])], sent)
+    types.define_service(f"{name}_GetResult", [_UUID], [("status", number), ("result", own["Result"])])
+    types.define(f"{name}_FeedbackMessage", [_UUID, ("feedback", own["Feedback"])])
+    cancelled = [("return_code", number), ("goals_canceling", (Nodetype.SEQUENCE, (_INFO, 0)))]
+    types.define_service(CANCEL_TYPE, [("goal_info", _INFO)], cancelled)
+    kinds = {
+        "send_goal": f"{name}_SendGoal",
+        "get_result": f"{name}_GetResult",
+        "cancel_goal": CANCEL_TYPE,
+        "feedback": f"{name}_FeedbackMessage",
+        "status": STATUS_TYPE,
+    }
+    return {part: (kind, types.type_hash(kind)) for part, kind in kinds.items()}
+
+
+def action_name(type_name: str, part: str) -> str:
+    """``package/Name`` of the action that has a topic of this type of ROS 1; empty for none."""
+    return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""

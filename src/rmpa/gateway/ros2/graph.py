@@ -1,21 +1,105 @@
-"""The graph of a ROS 2 domain, read from liveliness tokens. A machine without I/O.
-
-Tokens are declared by any program that reaches the router. What is malformed, has an impossible name or is more than
-``limits`` allow is ignored and counted; so are the tokens of gateways, this one's included.
-"""
+"""Which sources cross between the mesh and ROS 2, and under which names, by ``[[gateway.rule]]``."""
 
 from __future__ import annotations
 
+import asyncio
 import re
+import time
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_token
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.ros2.conversion import NoConversion
+from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, parse_token
+from rmpa.gateway.ros2.pairs import described_types
+from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
+from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
+from rmpa.observe.check import FAIL, OK, WARN, Check
+from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from rmpa.config.rules import CrossingRule
+    from rmpa.gateway.ros2.format import Ros2Qos
+    from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
+
+SITE: Final = "ros2"
+"""The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too."""
+PLUMBING: Final = frozenset(("/rosout", "/parameter_events"))
+"""Topics that each node of ROS 2 has; they do not cross unless a rule names them as they are."""
+
+
+class Ros2Crossing:
+    """Judges sources by the rules; the first that fits holds, and without one everything crosses.
+
+    Args:
+        rules: The tables ``[[gateway.rule]]``, in order.
+    """
+
+    def __init__(self, rules: Sequence[CrossingRule] = ()) -> None:
+        self._rules = tuple(rules)
+        self._crossing = CrossingRules(rules)
+
+    def outgoing(self, module: str, name: str) -> CrossingDecision:
+        """Decide whether a source of a module crosses to ROS 2, by its name in its module."""
+        return self._crossing.outgoing_to(SITE, module, name)
+
+    def incoming(self, kind: SourceKind, name: str, type_name: str, node: str) -> CrossingDecision:
+        """Decide whether a topic or service of ROS 2 is shown here, and under which name."""
+        if name in PLUMBING and not any(name in rule.names for rule in self._rules):
+            return CrossingDecision(
+                False, f"{name} is of each ROS 2 node; a gateway.rule that names it lets it cross"
+            )
+        return self._crossing.incoming(kind, SITE, SITE, name, type_name, node)
+
+    def name_here(self, name: str) -> str | None:
+        """The name here of a service of ROS 2; ``None`` if it does not cross."""
+        decision = self.incoming(SourceKind.SERVICE, name, "*", "")
+        return decision.name if decision.allowed else None
+
+
+# Two endpoints of one name that do not hear each other, as their keys differ: ROS 2 itself says nothing.
+
+
+def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
+    """Why a ROS 2 endpoint does not hear a publisher of ours of the same name; empty if it does.
+
+    Args:
+        own: Our publisher.
+        other: The ROS 2 node's publisher or subscription.
+        distribution: ``gateway.ros2.distribution``.
+    """
+    does = "subscribes to" if other.kind is EntityKind.SUBSCRIPTION else "publishes"
+    if other.type != own.type:
+        return (
+            f"the node {does} {other.type}; {own.node.name} publishes {own.type}: messages cannot pass between them. "
+            "Rename one of the topics, or map the ROS 1 type to the other one (gateway.ros2.mapping)"
+        )
+    if other.type_hash == own.type_hash:
+        return ""
+    head = f"the node {does} {other.type} with the type hash {other.type_hash}, {own.node.name} has {own.type_hash}"
+    if NO_HASH in (other.type_hash, own.type_hash):
+        older = "it" if other.type_hash == NO_HASH else "the gateway"
+        return (
+            f"{head}: {older} speaks as ROS 2 Humble or older. Messages cannot pass; gateway.ros2.distribution is "
+            f"{distribution!r}"
+        )
+    return (
+        f"{head}: their definitions differ, so messages cannot pass. Use the same definition on both sides; for "
+        f"types of ROS 2 itself set gateway.ros2.distribution, which is {distribution!r}"
+    )
+
+
+# The graph of a ROS 2 domain, read from liveliness tokens. A machine without I/O.
+#
+# Tokens are declared by any program that reaches the router. What is malformed, has an impossible name or is more
+# than
+# ``limits`` allow is ignored and counted; so are the tokens of gateways, this one's included.
+
 
 OWN_NAMESPACE: Final = "/rmpa/"
 """The namespace of the nodes that gateways declare: ``/rmpa/<module>/<node>``, as in the graphs of ROS 1. No ROS 2
@@ -162,3 +246,306 @@ def valid_name(name: str) -> bool:
 
 def _valid(name: str) -> bool:
     return len(name) <= limits.ROS2_NAME_MAX and _NAME.fullmatch(name) is not None
+
+
+# ``rmpa why`` between modules and ROS 2: the stages of a topic's way, from what the neighbour reports. Without I/O.
+#
+# ::
+#
+#     out: rule ─ type ─ heard (hashes) ─ demand ─ sent          in: rule ─ type ─ shown ─ demand ─ arrived
+
+
+_RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
+_LOST: Final = {
+    "lost": "were lost on the way, by their numbers",
+    "dropped": "were dropped by a full queue",
+    "limited": "were left out for the rule's rate or size",
+    "unconverted": "could not be converted",
+    "unheard": "came before a node subscribed",
+}
+
+
+def topic_ways(report: Mapping[str, Any], name: str, gateway: str, *, here_only: bool = False) -> list[Diagnosis]:
+    """The ways of a topic from ROS 2 to the modules, and from the modules to ROS 2.
+
+    Args:
+        report: What the neighbour reports.
+        name: The topic, by its name here; with ``here_only`` also by its name in ROS 2.
+        gateway: The gateway's name.
+        here_only: Whether only what comes from ROS 2 is meant.
+    """
+    problems: Mapping[str, str] = report["problems"]
+    ways: list[Diagnosis] = []
+    for row in report["topics"]:
+        coming = row["direction"] == "in"
+        if name != row["here"] and not (here_only and coming and name == row["topic"]):
+            continue
+        if coming:
+            stages = until_failure(_in_stages(row))
+            ways.append(Diagnosis.of(stages, name=row["here"], peer=SITE, to=gateway, node=row["node"]))
+        elif not here_only:
+            stages = until_failure(_out_stages(row, problems))
+            ways.append(Diagnosis.of(stages, name=name, peer=row["module"], to=SITE, node=row["node"]))
+    for what, why in report["topics_refused"].items():
+        topic, _, node = what.partition(" of ")
+        if topic == name:
+            from_ros2 = not node.startswith("/rmpa/")
+            if from_ros2 or not here_only:
+                ends = {"peer": SITE, "to": gateway} if from_ros2 else {"peer": gateway, "to": SITE}
+                ways.append(Diagnosis.of((Check("rule", FAIL, why, _RULES),), name=name, node=node, **ends))
+    return ways
+
+
+def _out_stages(row: Mapping[str, Any], problems: Mapping[str, str]) -> Iterator[Check]:
+    yield Check("rule", OK, row["rule"])
+    if row["problem"]:
+        yield Check("type", FAIL, row["problem"])
+    if not row["ros2_type"]:
+        yield Check("type", WARN, f"ROS 2 has no {row['type']}; its publisher is being asked for the definition")
+        return
+    kept = ", transient local" if row["latched"] else ""
+    yield Check("type", OK, f"it is {row['ros2_type']} in ROS 2{kept}")
+    deaf = [f"{what.partition(' of ')[2]}: {text}" for what, text in problems.items() if _is_end(what, row["here"])]
+    if deaf:
+        yield Check("heard", FAIL if not row["wanted"] else WARN, "; ".join(deaf))
+    if not row["wanted"]:
+        yield Check("demand", WARN, "no node of ROS 2 subscribes: nothing is sent")
+        return
+    yield Check("demand", OK, "a node of ROS 2 subscribes")
+    waiting = f", {row['waiting']} wait" if row["waiting"] else ""
+    yield _flow("sent", f"{row['sent']} messages were sent{waiting}", row, row["sent"])
+
+
+def _in_stages(row: Mapping[str, Any]) -> Iterator[Check]:
+    yield Check("rule", OK, row["rule"])
+    if row["problem"]:
+        yield Check("type", FAIL, row["problem"])
+    kept = ", transient local" if row["latched"] else ""
+    yield Check("type", OK, f"{row['ros2_type']} of ROS 2 is {row['type']} here{kept}")
+    was = f" (ROS 2's {row['topic']})" if row["topic"] != row["here"] else ""
+    yield Check("shown", OK, f"it is {row['here']} here{was}, at /rmpa/{SITE}{row['node']}")
+    if not row["wanted"]:
+        yield Check("demand", WARN, "no node of a module subscribes: it crosses once one does")
+        return
+    yield Check("demand", OK, "a node of a module subscribes")
+    yield _flow("arrived", f"{row['received']} messages have come", row, row["received"])
+
+
+def _flow(stage: str, text: str, row: Mapping[str, Any], messages: int) -> Check:
+    lost = [f"{row[key]} {words}" for key, words in _LOST.items() if row.get(key)]
+    return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)))
+
+
+def _is_end(what: str, name: str) -> bool:
+    """Whether a problem is one of a ROS 2 node with a topic of this name."""
+    topic, _, node = what.partition(" of ")
+    return topic == name and node.startswith("/") and not node.startswith("/rmpa/")
+
+
+# The nodes and endpoints that the gateway declares in ROS 2's graph, for the nodes of its modules.
+#
+# A module's node is ``/rmpa/<module>/<node>`` there, as its proxy is here. What the gateway itself subscribes to or
+# calls, for nodes and modules that want it, belongs to one node of its own, ``/rmpa/<name of the gateway>``.
+
+
+_NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_]")
+
+
+class OwnEndpoint:
+    """One endpoint with its token in ROS 2's graph.
+
+    Args:
+        nodes: The node's owner.
+        endpoint: The endpoint.
+        gid_bytes: The length of its GID.
+    """
+
+    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid_bytes: int) -> None:
+        self.endpoint = endpoint
+        self.gid = gid_of(endpoint.token(), gid_bytes)
+        """What its messages, requests or replies have in their attachment."""
+        self._nodes = nodes
+        self._token: Declaration | None = nodes.session.token(endpoint.token())
+
+    def close(self) -> None:
+        """Take its token back, and its node's if it was the last of it."""
+        if self._token is not None:
+            self._token.close()
+            self._token = None
+            self._nodes.release(self.endpoint.node)
+
+
+class OwnRos2Nodes:
+    """Declares nodes and endpoints; all numbers of a session are given here.
+
+    Args:
+        session: The Zenoh session.
+        domain: The ROS domain id.
+        name: The gateway's name.
+        gid_bytes: The length of a GID: 16, and 24 in ROS 2 Humble.
+    """
+
+    def __init__(self, session: OpenSession, domain: int, name: str, gid_bytes: int) -> None:
+        self.session = session
+        self.own_name = OWN_NAMESPACE + _NOT_IN_NAMES.sub("_", name)
+        """The node that subscribes and calls for all nodes of the mesh."""
+        self.gids: set[bytes] = set()
+        """The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own."""
+        self._domain = domain
+        self._gid_bytes = gid_bytes
+        self._next = 0
+        self._nodes: dict[str, tuple[Ros2Node, Declaration]] = {}
+        self._uses: dict[str, int] = {}
+
+    def declare(
+        self, node: str, kind: EntityKind, name: str, type_name: str, type_hash: str, qos: Ros2Qos
+    ) -> OwnEndpoint:
+        """Declare an endpoint, and its node if it is the first of it.
+
+        Args:
+            node: The node's full name, ``/rmpa/<module>/<node>`` or ``own_name``.
+            kind: What it is.
+            name: The topic or service, ``/like/this``.
+            type_name: ``package/msg/Name`` or ``package/srv/Name``.
+            type_hash: The hash of the type.
+            qos: Its QoS.
+        """
+        if node not in self._nodes:
+            made = Ros2Node(self._domain, self.session.zid, self._number(), node)
+            self._nodes[node] = (made, self.session.token(made.token()))
+        owner = self._nodes[node][0]
+        self._uses[node] = self._uses.get(node, 0) + 1
+        endpoint = Ros2Endpoint(owner, self._number(), kind, name, type_name, type_hash, qos)
+        declared = OwnEndpoint(self, endpoint, self._gid_bytes)
+        self.gids.add(declared.gid)
+        return declared
+
+    def release(self, node: Ros2Node) -> None:
+        """One endpoint of a node was taken back; the node's token goes with the last."""
+        self._uses[node.name] -= 1
+        if not self._uses[node.name]:
+            del self._uses[node.name]
+            self._nodes.pop(node.name)[1].close()
+
+    def _number(self) -> int:
+        self._next += 1
+        return self._next - 1
+
+
+def gid_of(token: str, size: int = 16) -> bytes:
+    """The GID of an endpoint: the XXH3-128 of its token, the low half first; longer ones have zeros behind."""
+    import xxhash  # noqa: PLC0415 - of the extra "zenoh"
+
+    return int(xxhash.xxh3_128_intdigest(token.encode())).to_bytes(16, "little").ljust(size, b"\0")
+
+
+# Asks nodes of ROS 2 for the fields of types that are not known here, by their service ``get_type_description``.
+
+
+class Ros2TypeAsker:
+    """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
+
+    Args:
+        session: The Zenoh session.
+        nodes: Our nodes in ROS 2's graph.
+        ros2: ROS 2's graph.
+        types: The types of ROS 2's distribution.
+    """
+
+    def __init__(self, session: OpenSession, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
+        self._session = session
+        self._nodes = nodes
+        self._ros2 = ros2
+        self._types = types
+        self._appeared = asyncio.Event()
+        self._learnt: dict[tuple[str, str], Mapping[str, Any]] = {}
+        self._asked = 0
+        self._asking = 0
+
+    def appeared(self) -> None:
+        """An endpoint is new in ROS 2's graph."""
+        if self._asking:
+            self._appeared.set()
+            self._appeared = asyncio.Event()
+
+    async def learn(self, *endpoints: tuple[str, EntityKind], of: Ros2Endpoint) -> dict[str, Any]:
+        """The fields of the types of some endpoints of one node, which waits for those that have not appeared yet.
+
+        Args:
+            endpoints: The names and kinds of the endpoints; none: the type of ``of`` itself is meant.
+            of: An endpoint of the node, which has appeared.
+
+        Returns:
+            The fields of the types and of all that they embed, in rosbags' form; each type has the hash of its key.
+
+        Raises:
+            NoConversion: The node does not describe them, or describes others.
+            RemoteProtocolError: Its answer is malformed.
+        """
+        found: dict[str, Any] = {}
+        if self._asking >= limits.ROS2_ASKS_MAX:
+            raise NoConversion(f"{self._asking} ROS 2 nodes are asked for types already; this one is not")
+        self._asking += 1
+        try:
+            for name, kind in endpoints or ((of.name, of.kind),):
+                endpoint = of if (name, kind) == (of.name, of.kind) else await self._wait(name, kind, of.node)
+                if endpoint is None:
+                    raise NoConversion(f"node {of.node.name} has no {name}")
+                found |= await self._fields(endpoint)
+        finally:
+            self._asking -= 1
+        return found
+
+    async def _fields(self, endpoint: Ros2Endpoint) -> Mapping[str, Any]:
+        key = endpoint.type, endpoint.type_hash
+        if key not in self._learnt:
+            fields = await self._ask(endpoint)
+            described_types(self._types, endpoint.type, endpoint.type_hash, fields)
+            if len(self._learnt) >= limits.ROS2_TYPES_MAX:
+                del self._learnt[next(iter(self._learnt))]
+            self._learnt[key] = fields
+        return self._learnt[key]
+
+    async def _ask(self, endpoint: Ros2Endpoint) -> dict[str, Any]:
+        server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)
+        if server is None:
+            raise NoConversion(self._unknown(endpoint))
+        self._asked += 1
+        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
+        replies = await self._session.get(
+            server.key(),
+            type_request(endpoint.type, endpoint.type_hash),
+            Ros2Attachment(self._asked, time.time_ns(), gid).serialize(),
+            timeout=limits.ROS2_SERVICE_WAIT,
+            all_complete=True,
+        )
+        answer = next((reply for reply in replies if reply.ok), None)
+        if answer is None:
+            raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
+        return parse_type_response(answer.payload)
+
+    async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
+        """An endpoint of a node, once it is there; ``None`` if it does not appear."""
+        try:
+            async with asyncio.timeout(limits.ROS2_SERVICE_WAIT):
+                while True:
+                    for found in self._ros2.at(name, kind):
+                        if found.node.name == node.name:
+                            return found
+                    await self._appeared.wait()
+        except TimeoutError:
+            return None
+
+    def _unknown(self, endpoint: Ros2Endpoint) -> str:
+        distribution = self._types.distribution
+        if endpoint.type in self._types:
+            return (
+                f"its type hash {endpoint.type_hash} is not that of {distribution}'s {endpoint.type}, and node "
+                f"{endpoint.node.name} offers no get_type_description: set gateway.ros2.distribution to the one of "
+                "that node, or start it with the parameter start_type_description_service"
+            )
+        return (
+            f"the fields of {endpoint.type} are not known, and node {endpoint.node.name} offers no "
+            "get_type_description: start the node with the parameter start_type_description_service, or source a "
+            "ROS 1 workspace that has the type, with the same fields, where the gateway runs"
+        )

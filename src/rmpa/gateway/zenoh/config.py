@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import queue
+import socket
+import stat
+import threading
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import limits
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ZenohReply
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    import asyncio
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from rmpa.config.rules import GatewaySettings
+    from rmpa.ros.wire.tcpros import Buffer
 
 _ENCRYPTED: Final = ("tls", "quic")
 """Protocols of endpoints that are encrypted, and that certificates are checked at."""
@@ -174,3 +184,300 @@ def _problem(endpoint: str, certificates: MeshCertificates | None) -> tuple[str,
 def _is_loopback(address: str) -> bool:
     host = address.rpartition(":")[0]
     return host in ("localhost", "[::1]") or host.startswith("127.")
+
+
+# Bounds what the kernel holds unsent of Zenoh's connections, so that priorities hold on a slow line too.
+#
+# Zenoh sends by priority, but what it has handed to the kernel goes first in, first out: on 1 Mbit/s that is
+# seconds.
+# Zenoh has an option for the whole send buffer alone, which would have to fit each line. TCP_NOTSENT_LOWAT bounds
+# the
+# part that is not on the line yet, whatever the line carries; Zenoh has no option for it, so its sockets are
+# looked for
+# in this process.
+
+
+_log = logging.getLogger(__name__)
+_FILES: Final = Path("/proc/self/fd")
+_STREAMS: Final = frozenset({"tcp", "tls", "ws"})
+
+
+class SocketTuning:
+    """Tunes the sockets of Zenoh's connections, each once.
+
+    Args:
+        unsent: Bytes that the kernel may hold unsent of one connection.
+    """
+
+    def __init__(self, unsent: int = limits.UNSENT_BYTES) -> None:
+        self._unsent = unsent
+        self._tuned: frozenset[str] = frozenset()
+
+    def look(self, endpoints: Collection[str]) -> int:
+        """Tune the connections to these endpoints, if some are new.
+
+        Args:
+            endpoints: Those of the other side of each connection that is up, such as ``tcp/192.0.2.1:7447``.
+
+        Returns:
+            The number of sockets that were tuned.
+        """
+        there = frozenset(endpoints)
+        if there == self._tuned:
+            return 0
+        wanted = {found for each in there - self._tuned if (found := _address(each)) is not None}
+        self._tuned = there
+        count = sum(self._tune(number, wanted) for number in _sockets()) if wanted else 0
+        _log.debug("= %d of Zenoh's sockets hold at most %d bytes unsent", count, self._unsent)
+        return count
+
+    def _tune(self, number: int, wanted: Collection[tuple[str, int]]) -> bool:
+        try:
+            found = socket.socket(fileno=os.dup(number))
+        except OSError:
+            return False  # closed meanwhile
+        with found:
+            try:
+                if found.family not in (socket.AF_INET, socket.AF_INET6) or found.type != socket.SOCK_STREAM:
+                    return False
+                address, port = found.getpeername()[:2]
+                if (address.removeprefix("::ffff:"), port) not in wanted:
+                    return False
+                found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, self._unsent)
+            except OSError:
+                return False  # not connected, or no TCP
+        return True
+
+
+def _sockets() -> Iterator[int]:
+    """The numbers of this process's open sockets."""
+    try:
+        names = [entry.name for entry in _FILES.iterdir()]
+    except OSError:
+        return  # no /proc, or no file descriptor is left
+    for name in names:
+        try:
+            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                yield int(name)
+        except OSError:
+            continue
+
+
+def _address(endpoint: str) -> tuple[str, int] | None:
+    """Address and port of an endpoint; ``None`` if it is no TCP connection."""
+    protocol, _, place = endpoint.partition("/")
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    if protocol not in _STREAMS or not port.isdigit():
+        return None
+    return host.strip("[]").removeprefix("::ffff:"), int(port)
+
+
+# A thread that does what may block: Zenoh's declarations, queries and replies wait for a full transport.
+
+
+class SerialWorker:
+    """Runs functions one after the other in a daemon thread, in the order in which they were given.
+
+    Args:
+        name: The thread's name.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
+        self._discard = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, job: Callable[[], object]) -> None:
+        """Run ``job`` after all that was given before; its errors are logged."""
+        self._jobs.put(job)
+
+    def stop(self, *, discard: bool = False) -> None:
+        """End the thread once all that was given has run.
+
+        Args:
+            discard: What has not begun is not run.
+        """
+        self._discard = discard
+        self._jobs.put(None)
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread's end, which ``stop`` asks for.
+
+        Args:
+            timeout: Seconds.
+
+        Returns:
+            Whether it has ended.
+        """
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                if not self._discard:
+                    job()
+            except Exception as error:  # noqa: BLE001 - one declaration that fails must not stop the others
+                if not self._discard:
+                    _log.warning("zenoh: %s", error)
+            del job
+
+
+# Queries in both directions: those that came and wait for their answers, and those that were asked.
+
+
+_BUSY: Final = "too many answers wait at this gateway; ask again later"
+
+
+def content(data: Any) -> bytes:
+    """The bytes of a payload or an attachment of Zenoh; empty for none."""
+    return b"" if data is None else bytes(data.to_bytes())
+
+
+class AnswerBudget:
+    """What waits in memory for Zenoh to take it: a client that does not read its answers holds them all up.
+
+    Args:
+        refuse: Counts an answer that found no room, by its reason; called from any thread.
+    """
+
+    def __init__(self, refuse: Callable[[str], None]) -> None:
+        self._refuse = refuse
+        self._lock = threading.Lock()
+        self._answers = self._bytes = 0
+
+    def take(self, size: int) -> bool:
+        """Reserve room for an answer of ``size`` bytes; one alone always has it."""
+        with self._lock:
+            full = self._answers >= limits.ANSWERS_WAITING_MAX or self._bytes + size > limits.ANSWER_BYTES_MAX
+            if not (self._answers and full):
+                self._answers += 1
+                self._bytes += size
+                return True
+        self._refuse("zenoh.answer.limit")
+        return False
+
+    def free(self, size: int) -> None:
+        """Give the room back, once Zenoh has the answer."""
+        with self._lock:
+            self._answers -= 1
+            self._bytes -= size
+
+
+class ArrivedQuery:
+    """A query that has come, and whose answers go out by a thread.
+
+    Args:
+        query: Zenoh's query.
+        worker: The thread that answers.
+        budget: Room for the answers that wait.
+    """
+
+    def __init__(self, query: Any, worker: SerialWorker, budget: AnswerBudget) -> None:
+        self._query: Any = query
+        self._worker = worker
+        self._budget = budget
+        self.key = str(query.key_expr)
+        self.parameters = str(query.parameters)
+        self.payload = content(query.payload)
+        self.attachment = content(query.attachment)
+
+    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
+        """Give one answer; more may follow until ``finish``."""
+        query = self._query
+        if query is None:
+            return
+        if not self._budget.take(len(payload)):
+            self.reply_error(_BUSY)
+            return
+        body = payload if isinstance(payload, bytes) else bytes(payload)
+        self._worker.submit(lambda: self._give(query, key, body, attachment))
+
+    def _give(self, query: Any, key: str, body: bytes, attachment: bytes) -> None:
+        try:
+            query.reply(key, body, attachment=attachment or None)
+        finally:
+            self._budget.free(len(body))
+
+    def reply_error(self, text: str) -> None:
+        """Answer with an error, and finish."""
+        query = self._query
+        if query is not None:
+            self._worker.submit(lambda: query.reply_err(text))
+            self.finish()
+
+    def finish(self) -> None:
+        """Say that no more answers come."""
+        query, self._query = self._query, None
+        if query is not None:
+            self._worker.submit(query.drop)
+
+
+class PendingGet:
+    """A query that was asked; collects its answers in Zenoh's threads, within ``limits.REPLIES_MAX``.
+
+    Args:
+        done: Resolved in the event loop with all answers, as soon as there are too many.
+        call_loop: Calls a function in the event loop, from any thread.
+        refuse: Counts an answer that is dropped, by its reason; called from any thread.
+    """
+
+    def __init__(
+        self,
+        done: asyncio.Future[list[ZenohReply]],
+        call_loop: Callable[[Callable[[], None]], None],
+        refuse: Callable[[str], None],
+    ) -> None:
+        self._done = done
+        self._call_loop = call_loop
+        self._refuse = refuse
+        self._lock = threading.Lock()
+        self._replies: list[ZenohReply] = []
+        self._bytes = 0
+        self._full = False
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether it was resolved because there were too many answers, and more may come."""
+        return self._full
+
+    def add(self, reply: Any) -> None:
+        """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""
+        if self._full:
+            self._refuse("zenoh.reply.limit")
+            return
+        sample = reply.ok
+        if sample is not None:
+            if sample.attachment is not None and len(sample.attachment) > limits.ATTACHMENT_MAX:
+                self._refuse("zenoh.attachment.long")
+                return
+            answer = ZenohReply(str(sample.key_expr), content(sample.payload), content(sample.attachment), ok=True)
+        elif reply.replier_id is None or not reply.replier_id.eid:
+            return  # no queryable has the entity id 0
+        else:
+            answer = ZenohReply("", content(reply.err.payload), b"", ok=False)
+        size = len(answer.payload) + len(answer.attachment) + len(answer.key)
+        with self._lock:
+            self._full = bool(self._replies) and (
+                len(self._replies) >= limits.REPLIES_MAX or self._bytes + size > limits.REPLY_BYTES_MAX
+            )
+            if not self._full:
+                self._bytes += size
+                self._replies.append(answer)
+                return
+        self._refuse("zenoh.reply.limit")
+        self.finish()
+
+    def finish(self) -> None:
+        """Resolve with what has come; called from any thread, and again without effect."""
+        self._call_loop(self._settle)
+
+    def collected(self) -> list[ZenohReply]:
+        """The answers up to now."""
+        with self._lock:
+            return list(self._replies)
+
+    def _settle(self) -> None:
+        if not self._done.done():
+            self._done.set_result(self.collected())

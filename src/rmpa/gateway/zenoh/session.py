@@ -15,21 +15,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import limits
-from rmpa.gateway.zenoh.arrivals import ArrivalQueue, Arrivals, keep_thread_state
-from rmpa.gateway.zenoh.queries import AnswerBudget, ArrivedQuery, PendingGet, content
-from rmpa.gateway.zenoh.sending import QueuedPublisher, SendingLane
-from rmpa.gateway.zenoh.socket_tuning import SocketTuning
-from rmpa.gateway.zenoh.worker import SerialWorker
-from rmpa.gateway.zenoh_api import ZenohPriority, ZenohSample
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ZenohPriority, ZenohSample
+from rmpa.gateway.zenoh.config import AnswerBudget, ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
+from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, keep_thread_state
 from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.policy import Needs
+    from rmpa.gateway.neighbour import ZenohQos, ZenohReply
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh_api import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
@@ -375,7 +372,7 @@ class OpenSession:
 
     def _short(self, text: str) -> bool:
         """Whether a key, or a query's parameters, may be kept."""
-        if len(text) <= limits.KEY_MAX:
+        if len(text) <= limits.ZENOH_KEY_MAX:
             return True
         self._arrivals.refuse("zenoh.key.long")
         return False

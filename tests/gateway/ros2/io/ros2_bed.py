@@ -6,12 +6,10 @@ import contextlib
 from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.config.rules import GatewaySettings, Ros2Settings
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.io.own_nodes import gid_of
-from rmpa.gateway.ros2.io.topics import Ros2Topics
-from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_token
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
+from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.ros2 import Ros2Neighbour
+from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
@@ -22,8 +20,8 @@ if TYPE_CHECKING:
 
     from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import Contracts
-    from rmpa.gateway.ros2.io.part import Ros2Context
-    from rmpa.gateway.zenoh_api import ZenohSample
+    from rmpa.gateway.neighbour import ZenohSample
+    from rmpa.gateway.ros2.services import Ros2Context
 
 STRING = MessageType("std_msgs/String")
 
@@ -71,7 +69,7 @@ class Ros2Publisher:
 
 
 def zenoh_qos(qos: Ros2Qos) -> Any:
-    from rmpa.gateway.zenoh_api import ZenohQos
+    from rmpa.gateway.neighbour import ZenohQos
 
     return ZenohQos(cache=qos.depth if qos.latched else 0)
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.gateway.ros2.io.answers import Ros2Answers
+from rmpa.gateway.ros2.ros2 import Ros2Answers
 from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
 from rmpa.observe.sites import SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually

@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.config.rules import GatewaySettings
-from rmpa.gateway.ros2.action_messages import parse_outcome
-from rmpa.gateway.ros2.action_pair import ActionPair
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.io.actions import Ros2Actions
-from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.mapping import ActionRule
-from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, data_key, parse_token
-from rmpa.gateway.ros2.type_description import SERVICE_TYPE
-from rmpa.gateway.ros2.types import Ros2Types
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway.neighbour import ZenohQos
+from rmpa.gateway.ros2.actions import Ros2Actions
+from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.format import (
+    EntityKind,
+    Ros2Attachment,
+    Ros2Endpoint,
+    Ros2Node,
+    Ros2Qos,
+    data_key,
+    parse_token,
+)
+from rmpa.gateway.ros2.mapping import ActionRule, parse_outcome
+from rmpa.gateway.ros2.ros2 import Ros2Neighbour
+from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.config.rules import GatewaySettings
-from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
+from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string

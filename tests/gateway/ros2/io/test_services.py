@@ -10,14 +10,11 @@ import pytest
 from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.ros2.attachment import Ros2Attachment
-from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.io.own_nodes import gid_of
-from rmpa.gateway.ros2.io.services import Ros2Services
-from rmpa.gateway.ros2.qos import Ros2Qos
-from rmpa.gateway.ros2.tokens import EntityKind, Ros2Endpoint, Ros2Node, parse_token
-from rmpa.gateway.ros2.type_description import SERVICE_TYPE
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
+from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.ros2 import Ros2Neighbour
+from rmpa.gateway.ros2.services import Ros2Services
+from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
 from tests.gateway.memory_graph import MemoryGraph

@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING, Any, cast
 from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.core.contract import ContractRule, Contracts, History, Reliability
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.attachment import Ros2Attachment
+from rmpa.gateway.neighbour import ZenohQos
 from rmpa.gateway.ros2.conversion import Conversion
-from rmpa.gateway.ros2.io.neighbour import Ros2Neighbour
-from rmpa.gateway.ros2.io.own_nodes import gid_of
-from rmpa.gateway.ros2.qos import Ros2Durability, Ros2History, Ros2Qos, Ros2Reliability
-from rmpa.gateway.ros2.tokens import NO_HASH, EntityKind
-from rmpa.gateway.ros2.type_description import SERVICE_TYPE
-from rmpa.gateway.ros2.types import Ros2Types
-from rmpa.gateway.zenoh_api import ZenohQos
+from rmpa.gateway.ros2.format import (
+    NO_HASH,
+    EntityKind,
+    Ros2Attachment,
+    Ros2Durability,
+    Ros2History,
+    Ros2Qos,
+    Ros2Reliability,
+)
+from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.ros2 import Ros2Neighbour
+from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string, topic_bed
@@ -24,7 +29,7 @@ from tests.gateway.ros2.type_descriptions import response
 if TYPE_CHECKING:
     import pytest
 
-    from rmpa.gateway.zenoh_api import ZenohSample
+    from rmpa.gateway.neighbour import ZenohSample
 
 LATCHED = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id"

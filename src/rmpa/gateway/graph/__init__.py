@@ -1,1 +1,0 @@
-"""The gateway's own graph, as its neighbours use it."""

@@ -1,0 +1,485 @@
+"""The attachment of each message, request and reply of ROS 2 over Zenoh.
+
+33 bytes, little-endian; rmw_zenoh_cpp writes it with zenoh's serializer::
+
+     0 sequence   8 bytes   counts the messages of a publisher, or the requests of a client, from 1; signed
+     8 stamp      8 bytes   the source's wall clock, nanoseconds since 1970; signed
+    16 length     1 byte    of the GID: 16 since ROS 2 Jazzy
+    17 gid       16 bytes   which publisher or client it is
+
+A reply repeats sequence and GID of its request, and has a stamp of its own.
+
+Up to rmw_zenoh_cpp 0.2.3 of Jazzy each of the three has its name in front, with a length of one byte:
+``sequence_number``, ``source_timestamp``, ``source_gid`` (ros2/rmw_zenoh#605). That is read too, and not written.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rmpa.core.contract import Durability, History, Liveliness, Priority, Reliability
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.limits import ROUTE_QUEUE_MESSAGES
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ZenohPriority, ZenohQos
+
+if TYPE_CHECKING:
+    from rmpa.core.contract import Contract, Contracts
+    from rmpa.ros.wire.tcpros import Buffer
+
+GID_BYTES: Final = 16
+"""Bytes of a GID since ROS 2 Jazzy."""
+_HEAD: Final = struct.Struct("<qqB")
+_LABELS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
+_NUMBER: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Attachment:
+    """What goes with a message of ROS 2.
+
+    Args:
+        sequence: The number of the message or request at its source, from 1.
+        stamp: When it was published, in nanoseconds since 1970.
+        gid: The source's GID, 16 bytes.
+    """
+
+    sequence: int
+    stamp: int
+    gid: bytes
+
+    def serialize(self) -> bytes:
+        """The bytes of the attachment."""
+        return _HEAD.pack(self.sequence, self.stamp, len(self.gid)) + self.gid
+
+    @classmethod
+    def parse(cls, data: Buffer) -> Ros2Attachment:
+        """Read an attachment; bytes behind the GID are ignored, so that later versions may add to it.
+
+        Raises:
+            RemoteProtocolError: It is shorter than it says.
+        """
+        raw = memoryview(data)
+        if bytes(raw[: len(_LABELS[0])]) == _LABELS[0]:
+            raw = _without_labels(raw)
+        if len(raw) < _HEAD.size:
+            raise RemoteProtocolError(f"an attachment of ROS 2 has {len(raw)} bytes; the least are {_HEAD.size}")
+        sequence, stamp, length = _HEAD.unpack_from(raw)
+        gid = bytes(raw[_HEAD.size : _HEAD.size + length])
+        if len(gid) < length or length > limits.GID_MAX:
+            raise RemoteProtocolError(f"an attachment of ROS 2 has {len(gid)} bytes of a GID of {length}")
+        return cls(sequence, stamp, gid)
+
+
+def _without_labels(raw: memoryview) -> memoryview:
+    """The older form without the names."""
+    made = b""
+    for label in _LABELS:
+        if bytes(raw[: len(label)]) != label:
+            raise RemoteProtocolError(f"an attachment of ROS 2 has no {label[1:].decode()} where it should be")
+        raw = raw[len(label) :]
+        if label is not _LABELS[-1]:
+            made += bytes(raw[:_NUMBER])
+            raw = raw[_NUMBER:]
+    return memoryview(made + bytes(raw))
+
+
+# The QoS of a ROS 2 endpoint, and its text in a liveliness token.
+#
+# The text is ``reliability:durability:history,depth:deadline:lifespan:liveliness,lease``, where a duration is
+# ``seconds,nanoseconds``. A value that is rmw's default is left out, but for the depth of *keep last*: a publisher
+# with the default QoS has ``::,10:,:,:,,``, a latched one ``:1:,1:,:,:,,``. The numbers are those of
+# rmw/types.h.
+
+
+INFINITE: Final = 2**63 - 1
+"""A duration that never ends, in nanoseconds: the default of all durations (RMW_DURATION_INFINITE)."""
+_NANO: Final = 1_000_000_000
+_PARTS: Final = 6
+DEFAULT_DEPTH: Final = 10
+"""Messages that *keep last* keeps by default."""
+
+
+class Ros2Reliability(IntEnum):
+    """Whether a message that is lost on the way is sent again."""
+
+    RELIABLE = 1
+    BEST_EFFORT = 2
+
+
+class Ros2Durability(IntEnum):
+    """Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched."""
+
+    TRANSIENT_LOCAL = 1
+    VOLATILE = 2
+
+
+class Ros2History(IntEnum):
+    """How many messages an endpoint keeps."""
+
+    KEEP_LAST = 1
+    KEEP_ALL = 2
+
+
+class Ros2Liveliness(IntEnum):
+    """How a publisher shows that it is alive."""
+
+    AUTOMATIC = 1
+    MANUAL_BY_NODE = 2
+    MANUAL_BY_TOPIC = 3
+
+
+_Kind = TypeVar("_Kind", bound=IntEnum)
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Qos:
+    """The QoS of one endpoint; the defaults are rmw's for topics.
+
+    Args:
+        reliability: See :class:`Ros2Reliability`.
+        durability: See :class:`Ros2Durability`.
+        history: See :class:`Ros2History`.
+        depth: Messages that *keep last* keeps.
+        deadline: The longest time between two messages, in nanoseconds.
+        lifespan: How long a message is of use, in nanoseconds.
+        liveliness: See :class:`Ros2Liveliness`.
+        lease: Silence after which a publisher counts as dead, in nanoseconds.
+    """
+
+    reliability: Ros2Reliability = Ros2Reliability.RELIABLE
+    durability: Ros2Durability = Ros2Durability.VOLATILE
+    history: Ros2History = Ros2History.KEEP_LAST
+    depth: int = DEFAULT_DEPTH
+    deadline: int = INFINITE
+    lifespan: int = INFINITE
+    liveliness: Ros2Liveliness = Ros2Liveliness.AUTOMATIC
+    lease: int = INFINITE
+
+    @property
+    def latched(self) -> bool:
+        """Whether a later subscriber gets the last messages, as of a latched publisher of ROS 1."""
+        return self.durability is Ros2Durability.TRANSIENT_LOCAL
+
+    def serialize(self) -> str:
+        """The text in a liveliness token."""
+        default = Ros2Qos()
+        kinds = (
+            ("" if value is usual else str(int(value)))
+            for value, usual in (
+                (self.reliability, default.reliability),
+                (self.durability, default.durability),
+                (self.history, default.history),
+                (self.liveliness, default.liveliness),
+            )
+        )
+        reliability, durability, history, liveliness = kinds
+        times = f"{_duration(self.deadline)}:{_duration(self.lifespan)}:{liveliness},{_duration(self.lease)}"
+        return f"{reliability}:{durability}:{history},{self.depth}:{times}"
+
+    @classmethod
+    def parse(cls, text: str) -> Ros2Qos:
+        """Read the text of a token. A value that this version does not know counts as the default.
+
+        Raises:
+            RemoteProtocolError: The text has another form.
+        """
+        parts = text.split(":")
+        if len(parts) < _PARTS:
+            raise RemoteProtocolError(f"the QoS {text[:80]!r} has {len(parts)} parts instead of {_PARTS}")
+        default = cls()
+        history, _, depth = parts[2].partition(",")
+        liveliness, _, lease = parts[5].partition(",")
+        return cls(
+            _kind(Ros2Reliability, parts[0], default.reliability),
+            _kind(Ros2Durability, parts[1], default.durability),
+            _kind(Ros2History, history, default.history),
+            _number(depth, DEFAULT_DEPTH),
+            _duration_nanoseconds(parts[3]),
+            _duration_nanoseconds(parts[4]),
+            _kind(Ros2Liveliness, liveliness, default.liveliness),
+            _duration_nanoseconds(lease),
+        )
+
+
+def _duration(nanoseconds: int) -> str:
+    return "," if nanoseconds == INFINITE else "{},{}".format(*divmod(nanoseconds, _NANO))
+
+
+def _duration_nanoseconds(text: str) -> int:
+    seconds, _, nanoseconds = text.partition(",")
+    if not seconds and not nanoseconds:
+        return INFINITE
+    return min(_number(seconds, 0) * _NANO + _number(nanoseconds, 0), INFINITE)
+
+
+def _number(text: str, default: int) -> int:
+    if not text:
+        return default
+    # int() also takes "+1", "1_0" and digits of other scripts.
+    if not (text.isascii() and text.isdigit() and len(text) <= len(str(limits.QOS_NUMBER_MAX))):
+        raise RemoteProtocolError(f"{text[:40]!r} in a QoS is not a number")
+    return min(int(text), limits.QOS_NUMBER_MAX)
+
+
+def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
+    number = _number(text, int(default))
+    try:
+        return kind(number)
+    except ValueError:
+        return default  # 0 is the system's default, and rmw has more kinds than these
+
+
+# The QoS of a topic that goes out to ROS 2: its contract in ROS 2's words, and in Zenoh's.
+
+
+_PRIORITIES: Final = {
+    Priority.HIGH: ZenohPriority.REAL_TIME,
+    Priority.NORMAL: ZenohPriority.DATA,
+    Priority.LOW: ZenohPriority.DATA_LOW,
+}
+
+
+def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool) -> Ros2Qos:
+    """The QoS of a topic's publisher in ROS 2's graph.
+
+    A topic whose contract no rule makes *best effort* is reliable, as TCPROS is and as ROS 2's default has it.
+
+    Args:
+        contracts: The rules.
+        topic: The topic.
+        type_name: ``package/Name`` of ROS 1.
+        latching: Whether its publisher latches: then it is transient local with a depth of 1.
+    """
+    contract = contracts.of(topic, type_name)
+    best_effort = _best_effort(contracts, topic, type_name)
+    kept = latching or contract.durability is Durability.TRANSIENT_LOCAL
+    manual = contract.liveliness is Liveliness.MANUAL_BY_TOPIC
+    return Ros2Qos(
+        Ros2Reliability.BEST_EFFORT if best_effort else Ros2Reliability.RELIABLE,
+        Ros2Durability.TRANSIENT_LOCAL if kept else Ros2Durability.VOLATILE,
+        Ros2History.KEEP_ALL if contract.history is History.KEEP_ALL else Ros2History.KEEP_LAST,
+        contract.kept if kept else DEFAULT_DEPTH if contract.depth == ROUTE_QUEUE_MESSAGES else contract.depth,
+        _nanoseconds(contract.deadline),
+        _nanoseconds(contract.lifespan),
+        Ros2Liveliness.MANUAL_BY_TOPIC if manual else Ros2Liveliness.AUTOMATIC,
+        _nanoseconds(contract.liveliness_lease),
+    )
+
+
+def zenoh_qos(contract: Contract, qos: Ros2Qos) -> ZenohQos:
+    """The QoS of its Zenoh publisher, and the bounds of its queue.
+
+    Args:
+        contract: The contract.
+        qos: What ``ros2_qos`` made of it. What is reliable waits for slow receivers (``BLOCK``), in its queue.
+    """
+    reliable = qos.reliability is Ros2Reliability.RELIABLE
+    return ZenohQos(
+        reliable=reliable,
+        block=reliable,
+        priority=_PRIORITIES[contract.priority],
+        messages=contract.depth,
+        cache=qos.depth if qos.latched else 0,
+    )
+
+
+def _best_effort(contracts: Contracts, topic: str, type_name: str) -> bool:
+    value, origin = contracts.explain(topic, type_name)["reliability"]
+    return value is Reliability.BEST_EFFORT and origin != "default"
+
+
+def _nanoseconds(seconds: float | None) -> int:
+    return INFINITE if seconds is None else round(seconds * 1e9)
+
+
+# Liveliness tokens of ROS 2 over Zenoh: the graph of nodes and endpoints.
+#
+# Each node and each endpoint of ROS 2 declares a token; what declares none is not seen by ``ros2 topic list``::
+#
+#     @ros2_lv/<domain>/<zid>/<node id>/<node id>/NN/<enclave>/<namespace>/<node>
+#     @ros2_lv/<domain>/<zid>/<node id>/<id>/MP|MS|SS|SC/<enclave>/<namespace>/<node>/<name>/<type>/<hash>/<QoS>
+#
+# ``zid`` is the Zenoh session. Within a part ``/`` is written as ``%``, and an empty part is ``%``. Data, and
+# calls of
+# services, go by the key ``<domain>/<name>/<type>/<hash>``. A subscriber whose type has another hash listens at
+# another
+# key: it hears nothing, and is told nothing.
+
+
+ADMIN_SPACE: Final = "@ros2_lv"
+"""The first chunk of each token; ``**`` does not match it, as it begins with ``@``."""
+NO_HASH: Final = "TypeHashNotSupported"
+"""The type hash of ROS 2 Humble, which has none."""
+_EMPTY: Final = "%"
+_NODE_PARTS: Final = 9
+_ENDPOINT_PARTS: Final = 13
+_WILD: Final = frozenset("*$?#")
+_SEPARATOR: Final = "::"
+_DDS: Final = "dds_"
+
+
+class EntityKind(StrEnum):
+    """What a token stands for; the value is its mark in the token."""
+
+    NODE = "NN"
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+    SERVICE = "SS"
+    CLIENT = "SC"
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Node:
+    """A node of ROS 2.
+
+    Args:
+        domain: Its ROS domain id.
+        zid: Its Zenoh session, in hexadecimal digits as Zenoh writes it.
+        number: Its number in that session.
+        name: Its full name, ``/namespace/node``.
+        enclave: Its enclave of SROS 2; empty for none.
+    """
+
+    domain: int
+    zid: str
+    number: int
+    name: str
+    enclave: str = ""
+
+    def token(self) -> str:
+        """The node's liveliness token."""
+        return f"{self._head(self.number, EntityKind.NODE)}"
+
+    def _head(self, number: int, kind: EntityKind) -> str:
+        namespace, _, name = self.name.rpartition("/")
+        parts = (self.domain, self.zid, self.number, number, kind, *map(_mangle, (self.enclave, namespace, name)))
+        return "/".join((ADMIN_SPACE, *map(str, parts)))
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Endpoint:
+    """A publisher, a subscription, a service's server or its client.
+
+    Args:
+        node: Its node.
+        number: Its number in the node's session.
+        kind: What it is.
+        name: The topic's or service's full name, ``/like/this``.
+        type: Its type, ``package/msg/Name`` or ``package/srv/Name``.
+        type_hash: The hash of its type, ``RIHS01_`` and 64 hexadecimal digits (REP 2016).
+        qos: Its QoS.
+    """
+
+    node: Ros2Node
+    number: int
+    kind: EntityKind
+    name: str
+    type: str
+    type_hash: str
+    qos: Ros2Qos
+
+    def token(self) -> str:
+        """The endpoint's liveliness token."""
+        head = self.node._head(self.number, self.kind)  # noqa: SLF001 - the two are one format
+        return "/".join((head, _mangle(self.name), dds_type(self.type), self.type_hash, self.qos.serialize()))
+
+    def key(self) -> str:
+        """The key of its messages or calls."""
+        return data_key(self.node.domain, self.name, self.type, self.type_hash)
+
+
+def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
+    """The key of a topic's messages, or of a service's calls.
+
+    Args:
+        domain: The ROS domain id.
+        name: The full name, ``/like/this``.
+        type_name: ``package/msg/Name`` or ``package/srv/Name``.
+        type_hash: The hash of the type; ``*`` for each.
+    """
+    return f"{domain}/{name.strip('/')}/{dds_type(type_name)}/{type_hash}"
+
+
+def graph_key(domain: int) -> str:
+    """The key expression that all tokens of a ROS domain match."""
+    return f"{ADMIN_SPACE}/{domain}/**"
+
+
+def parse_token(key: str) -> Ros2Node | Ros2Endpoint:
+    """Read a liveliness token.
+
+    Raises:
+        RemoteProtocolError: It has another form. The parts behind those that are known are ignored.
+    """
+    if len(key) > limits.KEY_MAX:
+        raise RemoteProtocolError(f"a liveliness token has {len(key)} characters; at most {limits.KEY_MAX} are read")
+    parts = key.split("/")
+    if len(parts) < _NODE_PARTS or parts[0] != ADMIN_SPACE or not all(parts):
+        raise RemoteProtocolError(f"{_short(key)} is not a liveliness token of ROS 2")
+    if not _WILD.isdisjoint(key):
+        raise RemoteProtocolError(f"{_short(key)} is an expression, not a liveliness token")
+    try:
+        kind = EntityKind(parts[5])
+    except ValueError:
+        raise RemoteProtocolError(f"{_short(key)}: {parts[5][:20]!r} is no kind of entity") from None
+    domain = _token_number(parts[1], limits.DOMAIN_MAX, key)
+    enclave, namespace, name = (_demangle(part) for part in parts[6:9])
+    if not name or "/" in name:
+        raise RemoteProtocolError(f"{_short(key)} has no name of a node")
+    full = f"{_absolute(namespace)}/{name}" if namespace else f"/{name}"
+    node = Ros2Node(domain, parts[2], _token_number(parts[3], limits.ENTITY_ID_MAX, key), full, enclave)
+    if kind is EntityKind.NODE:
+        return node
+    if len(parts) < _ENDPOINT_PARTS:
+        raise RemoteProtocolError(f"{_short(key)} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
+    number = _token_number(parts[4], limits.ENTITY_ID_MAX, key)
+    name = _absolute(_demangle(parts[9]))
+    return Ros2Endpoint(node, number, kind, name, ros_type(parts[10]), parts[11], Ros2Qos.parse(parts[12]))
+
+
+def dds_type(name: str) -> str:
+    """The name of a type in keys: ``std_msgs/msg/String`` is ``std_msgs::msg::dds_::String_``.
+
+    Raises:
+        ValueError: The name has not three parts.
+    """
+    package, kind, base = name.split("/")
+    return _SEPARATOR.join((package, kind, _DDS, base + "_"))
+
+
+def ros_type(name: str) -> str:
+    """The ROS name of a type in a key; the inverse of :func:`dds_type`.
+
+    Raises:
+        RemoteProtocolError: It is no such name.
+    """
+    parts = name.split(_SEPARATOR)
+    if len(parts) != 4 or parts[2] != _DDS or not parts[3].endswith("_") or not all((*parts, parts[3][:-1])):
+        raise RemoteProtocolError(f"{name[:80]!r} is not the name of a type of ROS 2")
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+
+
+def _mangle(name: str) -> str:
+    return name.replace("/", _EMPTY) or _EMPTY
+
+
+def _demangle(part: str) -> str:
+    return "" if part == _EMPTY else part.replace(_EMPTY, "/")
+
+
+def _absolute(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
+
+
+def _token_number(text: str, largest: int, key: str) -> int:
+    if text.isascii() and text.isdigit() and len(text) <= len(str(largest)) and int(text) <= largest:
+        return int(text)
+    raise RemoteProtocolError(f"{_short(key)}: {text[:20]!r} is not a number up to {largest}")
+
+
+def _short(key: str) -> str:
+    return repr(key[:120])

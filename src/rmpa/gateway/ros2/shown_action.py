@@ -1,0 +1,528 @@
+"""What both directions of actions share: finding the types, and the way of messages to the goals."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.gateway import limits
+from rmpa.gateway.neighbour import ForeignSource, SourceKind
+from rmpa.gateway.ros2 import mapping as messages
+from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, NoConversion
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Qos
+from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.mapping import ActionRule, CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
+from rmpa.gateway.ros2.pairs import derive_ros1
+from rmpa.ros.types.definitions import Specification, known_specifications
+from rmpa.ros.types.find import find_message_type
+from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.loop import MachineTimer, SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rmpa.core.counters import Clock
+    from rmpa.gateway.foreign import ProxiedTopic, TopicTap
+    from rmpa.gateway.neighbour import MeshSource, ZenohSample
+    from rmpa.gateway.ros2.format import Ros2Endpoint
+    from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.ros2.services import Ros2Context
+    from rmpa.gateway.zenoh.session import Declaration
+    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+
+_PARTS: Final = ("Goal", "Result", "Feedback")
+
+
+class ActionGoals(Protocol):
+    """The goals of one action, in one direction."""
+
+    pair: ActionPair
+
+    def server_gone(self) -> None:
+        """The server is gone: all goals end as aborted."""
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None``: not."""
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due."""
+
+
+_Goals = TypeVar("_Goals", bound=ActionGoals)
+
+
+class JoinedAction(Generic[_Goals]):
+    """An action of one side, as that of a server at the other one.
+
+    Args:
+        context: What the parts share.
+        name: The action's name in ROS 2.
+        here: Its name in the gateway's graph.
+        server: The server's node in the gateway's graph or ROS 2's.
+        shown: The node that publishes its topics for ROS 1, below ``/rmpa/ros2``.
+    """
+
+    def __init__(self, context: Ros2Context, name: str, here: str, server: str, shown: str) -> None:
+        self.here = here
+        self._context = context
+        self._name = name
+        self._server = server
+        self._shown = shown
+        self._clock = SystemClock()
+        self._goals: _Goals | None = None
+        self._timer: MachineTimer | None = None
+        self._topics: dict[str, ProxiedTopic] = {}
+        self._declared: list[Declaration | OwnEndpoint] = []
+        self._sequence = 0
+        self._closed = False
+
+    def start(self) -> None:
+        """Find the types, and join it if they are a pair."""
+        self._context.spawn(self._join())
+
+    def close(self) -> None:
+        """The server is gone: goals under way end as aborted."""
+        self._closed = True
+        self._context.say(self.here, "")
+        if self._goals is not None:
+            self._goals.server_gone()
+        if self._timer is not None:
+            self._timer.close()
+        for each in self._declared:
+            each.close()
+
+    def tell_ros1(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 1."""
+        if topic in self._topics:
+            self._topics[topic].publish(message)
+
+    async def _join(self) -> None:
+        raise NotImplementedError
+
+    def _begin(self, goals: _Goals) -> None:
+        self._goals = goals
+        self._timer = MachineTimer(goals.next_timer, goals.handle_timer)
+
+    def _show(self, header: TopicDescription, part: str, on_demand: Callable[[bool], None]) -> None:
+        source = ForeignSource(SourceKind.TOPIC, SITE, "", self._shown, f"{self.here}/{part}", header.type)
+        self._topics[part] = self._context.graph.show_topic(source, on_demand)
+        self._topics[part].describe(header)
+
+    def _declare(self, node: str, kind: EntityKind, part: str, qos: Ros2Qos | None = None) -> OwnEndpoint:
+        assert self._goals is not None  # noqa: S101 - nothing is declared before
+        name, types = f"{self._name}{PART}{part}", self._goals.pair.types[part]
+        made = self._context.nodes.declare(node, kind, name, *types, qos or Ros2Qos())
+        self._declared.append(made)
+        return made
+
+    def _tap(self, source: Any, part: str, changed: Callable[[object], None]) -> TopicTap:
+        """Listen to a topic of ROS 1, as the node that publishes the others."""
+        listener = f"/rmpa/{SITE}{self._shown}"
+        return self._context.graph.tap(source, self._take(part), changed, changed, listener=listener)
+
+    def _take(self, part: str) -> Callable[[Any], None]:
+        """What takes the messages of a topic: the method of the goals with its name."""
+
+        def take(message: Any) -> None:
+            if self._goals is None or self._closed:
+                return
+            try:
+                getattr(self._goals, part)(message)
+            except RmpaError as error:
+                self._context.say(f"{self.here} (messages)", str(error))
+            self._arm()
+
+        return take
+
+    def _arm(self) -> None:
+        if self._timer is not None and not self._closed:
+            self._timer.arm()
+
+    def _attachment(self, gid: bytes) -> bytes:
+        self._sequence += 1
+        return Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize()
+
+
+async def find_parts(name: str) -> list[MessageType]:
+    """Find goal, result and feedback of ``package/Name``.
+
+    Raises:
+        RmpaError: A definition is missing.
+    """
+    return [await asyncio.to_thread(find_message_type, f"{name}{part}") for part in _PARTS]
+
+
+async def learn_action(
+    context: Ros2Context, server: Ros2Endpoint, ros1: str, rule: ActionRule, known: Sequence[MessageType] = ()
+) -> ActionPair:
+    """Make the pair of an action from what the node of its server in ROS 2 says of its types.
+
+    Args:
+        context: What the parts share.
+        server: The server's endpoint *send_goal*.
+        ros1: ``package/Name`` of ROS 1.
+        rule: ``package/action/Name`` of ROS 2, and fields if a mapping file lists them.
+        known: Goal, result and feedback of ROS 1 if this machine has them; else they are derived.
+
+    Raises:
+        RmpaError: The node does not describe them, or the types are no pair.
+    """
+    name = server.name.removesuffix(f"{PART}send_goal")
+    fields = await context.asker.learn(
+        (server.name, EntityKind.SERVICE),
+        (f"{name}{PART}get_result", EntityKind.SERVICE),
+        (f"{name}{PART}feedback", EntityKind.PUBLISHER),
+        of=server,
+    )
+    types = context.types.variant(fields)
+    own = {f"{rule.name}_{part}": f"{ros1}{part}" for part in _PARTS}
+    try:
+        kinds = known or [
+            derive_ros1(types.store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own
+        ]
+        return ActionPair(kinds, rule, types)
+    except KeyError as error:
+        raise NoConversion(f"{rule.name} has no form in ROS 1: {error}") from error
+
+
+async def find_headers(*kinds: str) -> list[TopicDescription]:
+    """The headers of topics of types that this machine knows.
+
+    Raises:
+        RmpaError: A definition is missing.
+    """
+    return [(await asyncio.to_thread(find_message_type, kind)).describe() for kind in kinds]
+
+
+async def outcome_headers(pair: ActionPair) -> list[TopicDescription]:
+    """The headers of an action's feedback and result; made where this machine has no definition."""
+    try:
+        return await find_headers(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
+    except RmpaError:
+        return [_wrapped(pair, "Feedback", pair.feedback.ros1), _wrapped(pair, "Result", pair.result)]
+
+
+def _wrapped(pair: ActionPair, part: str, kind: MessageType) -> TopicDescription:
+    """The message of actionlib around a feedback or result, as its genaction.py makes it."""
+    name = f"{pair.ros1}Action{part}"
+    text = f"Header header\nactionlib_msgs/GoalStatus status\n{kind.name} {part.lower()}\n"
+    known = {**known_specifications("std_msgs/Header"), **known_specifications("actionlib_msgs/GoalStatus")}
+    return MessageType(name, {**known, **kind.specifications, name: Specification.parse(name, text)}).describe()
+
+
+# An action server of ROS 2, as one of actionlib in the gateway's graph.
+
+
+@dataclass(slots=True)
+class _Goal:
+    id: GoalId
+    uuid: bytes
+    status: Ros1Status = Ros1Status.PENDING
+    text: str = ""
+    cancelled: bool = False
+    ended: float | None = None
+
+    @property
+    def state(self) -> GoalState:
+        return GoalState(self.id, self.status, self.text)
+
+
+class GoalsToRos2:
+    """The goals of one action.
+
+    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
+    that does not fit the other side's type.
+
+    Args:
+        pair: The action's types.
+        out: Asks the server, which ``answered`` and ``failed`` follow, and has what is told to clients published.
+        clock: Both clocks.
+    """
+
+    def __init__(self, pair: ActionPair, out: ShownAction, clock: Clock) -> None:
+        self.pair = pair
+        self._out = out
+        self._clock = clock
+        self._goals: dict[bytes, _Goal] = {}
+        self._next_status: float | None = None
+
+    # --- from the clients of ROS 1 -------------------------------------------------------------------------------
+
+    def goal(self, raw: Buffer) -> None:
+        """A client publishes an ``ActionGoal``."""
+        asked, body = messages.parse_goal(raw)
+        stamp = self._clock.wall_ns()
+        # A server makes up an id and a stamp that are missing, as actionlib's do.
+        name = asked.id or f"/rmpa-{len(self._goals)}-{stamp}"
+        asked = GoalId(name, *(divmod(stamp, 10**9) if asked.stamp == (0, 0) else asked.stamp))
+        uuid = hashlib.sha256(name.encode()).digest()[: messages.UUID_BYTES]
+        if uuid in self._goals:
+            return
+        goal = _Goal(asked, uuid)
+        if len(self._goals) >= limits.ROS2_GOALS_MAX:
+            self._end(goal, Ros1Status.REJECTED, f"{len(self._goals)} goals are known")
+            return
+        self._goals[uuid] = goal
+        try:
+            self._out.ask("send_goal", uuid, messages.with_uuid(uuid, self.pair.goal.to_ros2(body)))
+        except ConversionError as error:
+            self._end(goal, Ros1Status.REJECTED, str(error))
+
+    def cancel(self, raw: Buffer) -> None:
+        """A client publishes a ``GoalID``: one goal, all up to a stamp, or all (wiki.ros.org/actionlib)."""
+        asked = messages.parse_cancel(raw)
+        for goal in self._goals.values():
+            older = asked.stamp != (0, 0) and goal.id.stamp <= asked.stamp
+            if goal.ended is None and (goal.id.id == asked.id or older or asked == GoalId()) and not goal.cancelled:
+                goal.cancelled = True
+                if goal.status is not Ros1Status.PENDING:
+                    self._out.ask("cancel_goal", goal.uuid, messages.cancel_request(goal.uuid))
+
+    # --- from the server of ROS 2 --------------------------------------------------------------------------------
+
+    def answered(self, service: str, uuid: bytes, response: bytes) -> None:
+        """The server has answered ``send_goal``, ``get_result`` or ``cancel_goal``; late answers are ignored."""
+        goal = self._goals.get(uuid)
+        if goal is None or goal.ended is not None:
+            return
+        if service == "send_goal":
+            self._accepted(goal, accepted=messages.is_accepted(response))
+        elif service == "get_result":
+            self._result(goal, response)
+        elif messages.cancel_code(response) == CancelCode.NONE:
+            goal.status = Ros1Status.PREEMPTING
+            self._tell_states()
+        else:
+            goal.cancelled = False  # it may be cancelled again
+
+    def failed(self, service: str, uuid: bytes, text: str) -> None:
+        """The server did not answer: the goal ends, or may be cancelled again."""
+        goal = self._goals.get(uuid)
+        if goal is None or goal.ended is not None:
+            return
+        if service == "cancel_goal":
+            goal.cancelled = False
+        else:
+            self._end(goal, Ros1Status.ABORTED, text)
+
+    def server_gone(self) -> None:
+        """The server is gone: all goals end as aborted."""
+        for uuid in list(self._goals):
+            self.failed("", uuid, "the action server of ROS 2 is gone")
+
+    def feedback(self, raw: Buffer) -> None:
+        """The server publishes feedback."""
+        uuid, cdr = messages.split_uuid(raw)
+        goal = self._goals.get(uuid)
+        if goal is not None and goal.ended is None:
+            self._tell("feedback", goal, self.pair.feedback.to_ros1(cdr))
+
+    def status(self, raw: Buffer) -> None:
+        """The server publishes its status: of goals under way ROS 1 is told that they are being preempted."""
+        for uuid, status in messages.parse_ros2_states(raw):
+            goal = self._goals.get(uuid)
+            if status is Ros2Status.CANCELING and goal is not None and goal.status is Ros1Status.ACTIVE:
+                goal.status = Ros1Status.PREEMPTING
+                self._tell_states()
+
+    # --- time -----------------------------------------------------------------------------------------------------
+
+    def show_status(self, *, wanted: bool) -> None:
+        """Begin or stop to publish the status five times a second."""
+        self._next_status = self._clock.now() if wanted else None
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None``: not."""
+        return self._next_status
+
+    def handle_timer(self, now: float) -> None:
+        """Publish the status, and forget goals that ended a while ago."""
+        kept = limits.ROS2_GOAL_KEPT
+        for uuid in [u for u, goal in self._goals.items() if goal.ended is not None and goal.ended + kept <= now]:
+            del self._goals[uuid]
+        if self._next_status is not None and self._next_status <= now:
+            self._next_status = now + limits.ROS2_STATUS_PERIOD
+            self._tell_states()
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+
+    def _accepted(self, goal: _Goal, *, accepted: bool) -> None:
+        if not accepted:
+            self._end(goal, Ros1Status.REJECTED, "the server rejects the goal")
+            return
+        goal.status = Ros1Status.ACTIVE
+        self._tell_states()
+        self._out.ask("get_result", goal.uuid, messages.with_uuid(goal.uuid, b"\x00\x01\x00\x00"))
+        if goal.cancelled:
+            self._out.ask("cancel_goal", goal.uuid, messages.cancel_request(goal.uuid))
+
+    def _result(self, goal: _Goal, response: bytes) -> None:
+        try:
+            number, body = self.pair.result_to_ros1(response)
+            status = messages.TO_ROS1[Ros2Status(number)]
+        except (ConversionError, ValueError) as error:
+            self._end(goal, Ros1Status.ABORTED, str(error))
+            return
+        self._end(goal, Ros1Status.LOST if status in messages.UNDER_WAY else status, "", body)
+
+    def _tell_states(self) -> None:
+        states = (goal.state for goal in self._goals.values())
+        self._out.tell_ros1("status", messages.ros1_states(self._clock.wall_ns(), states))
+
+    def _end(self, goal: _Goal, status: Ros1Status, text: str, body: bytes | None = None) -> None:
+        goal.status, goal.text, goal.ended = status, text, self._clock.now()
+        self._tell_states()
+        self._tell("result", goal, self.pair.no_result if body is None else body)
+
+    def _tell(self, topic: str, goal: _Goal, body: bytes) -> None:
+        self._out.tell_ros1(topic, messages.ros1_message(self._clock.wall_ns(), goal.state.serialize(), body))
+
+
+class ShownAction(JoinedAction[GoalsToRos2]):
+    """Shows one action server of ROS 2 to actionlib's clients.
+
+    Args:
+        context: What the parts share.
+        server: The server's endpoint *send_goal*.
+        name: The action's name in ROS 2.
+        here: Its name in the gateway's graph.
+    """
+
+    def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
+        super().__init__(context, name, here, server.node.name, server.node.name)
+        self.server = server
+        self._clients: dict[MeshSource, TopicTap | None] = {}
+        self._subscribed = False
+        self._callers: dict[str, OwnEndpoint] = {}
+        self._leaving: asyncio.TimerHandle | None = None
+
+    def client(self, source: MeshSource, *, there: bool) -> None:
+        """A client's topic *goal* or *cancel* appeared or is gone."""
+        if there:
+            self._clients.setdefault(source, None)
+            self._listen()
+        elif (tap := self._clients.pop(source, None)) is not None:
+            tap.close()
+
+    def close(self) -> None:
+        """The server is gone: goals under way end as aborted, then the topics go."""
+        super().close()
+        for tap in self._clients.values():
+            if tap is not None:
+                tap.close()
+        self._clients.clear()
+        # The last results have to leave before their publishers.
+        self._leaving = asyncio.get_running_loop().call_later(limits.ROS2_LAST_RESULTS, self.finish)
+
+    def finish(self) -> None:
+        """Take its topics out of the graph, once it is closed; once."""
+        if self._leaving is not None:
+            self._leaving.cancel()
+        for topic in self._topics.values():
+            topic.close()
+        self._topics.clear()
+
+    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        """Call a service of the server, and tell the goals what comes of it."""
+        if not self._closed:
+            self._context.spawn(self._ask(service, uuid, request))
+
+    # --- inside ----------------------------------------------------------------------------------------------------
+
+    async def _join(self) -> None:
+        try:
+            pair = await self._find_pair()
+            headers = [*await find_headers("actionlib_msgs/GoalStatusArray"), *await outcome_headers(pair)]
+        except RmpaError as error:
+            text = f"the action of ROS 2's node {self._server} is not shown: {error}"
+            self._context.say(self.here, text)
+            return
+        if self._closed:
+            return
+        self._begin(GoalsToRos2(pair, self, self._clock))
+        for part, header in zip(("status", "feedback", "result"), headers, strict=True):
+            self._show(header, part, self._wanted if part == "status" else _ignore)
+        self._listen()
+
+    async def _find_pair(self) -> ActionPair:
+        """The types; the server's node is asked for what is not known here.
+
+        Raises:
+            RmpaError: The types are no pair, or ROS 2's are not known.
+        """
+        context, server = self._context, self.server
+        ros2 = server.type.removesuffix("_SendGoal")
+        ros1 = context.mapping.ros1_action(ros2)
+        rule = context.mapping.action(ros1)
+        if rule.name != ros2:
+            rule = ActionRule(ros2)
+        known: list[MessageType] = []
+        try:
+            known = await find_parts(ros1)
+            pair = ActionPair(known, rule, context.types)
+            if pair.types["send_goal"][1] == server.type_hash:
+                return pair
+            problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
+        except RmpaError as error:
+            problem = str(error)
+        try:
+            return await learn_action(context, server, ros1, rule, known)
+        except RmpaError as error:
+            raise NoConversion(f"{problem}; {error}") from error
+
+    def _wanted(self, wanted: bool) -> None:
+        if self._goals is not None and not self._closed:
+            self._goals.show_status(wanted=wanted)
+            self._arm()
+
+    def _listen(self) -> None:
+        """Listen to clients that are not listened to yet, and to the server from the first client on."""
+        if self._goals is None or self._closed:
+            return
+        for source, tap in self._clients.items():
+            if tap is None:
+                self._clients[source] = self._tap(source, source.here.rpartition("/")[2], _ignore)
+        if self._clients and not self._subscribed:
+            self._subscribed = True
+            for part in ("feedback", "status"):
+                endpoint = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
+                take = _payload_to(self._take(part))
+                self._declared.append(self._context.session.subscribe(endpoint.endpoint.key(), take))
+
+    async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        goals = self._goals
+        assert goals is not None  # noqa: S101 - they ask
+        try:
+            goals.answered(service, uuid, await self._call(service, request))
+        except RmpaError as error:
+            goals.failed(service, uuid, str(error))
+        self._arm()
+
+    async def _call(self, service: str, request: bytes) -> bytes:
+        if service not in self._callers:
+            nodes = self._context.nodes
+            self._callers[service] = self._declare(nodes.own_name, EntityKind.CLIENT, service)
+        caller = self._callers[service]
+        answers = await self._context.session.get(
+            caller.endpoint.key(),
+            request,
+            self._attachment(caller.gid),
+            timeout=limits.ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
+            all_complete=True,
+        )
+        for answer in answers:
+            if answer.ok:
+                return answer.payload
+        text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
+        raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
+
+
+def _payload_to(take: Callable[[bytes], None]) -> Callable[[ZenohSample], None]:
+    return lambda sample: take(sample.payload)
+
+
+def _ignore(_value: object) -> None:
+    """Nothing is to be done."""

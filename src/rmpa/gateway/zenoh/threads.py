@@ -1,0 +1,463 @@
+"""The way of what Zenoh delivers from its threads into the event loop.
+
+Zenoh calls back in threads of its own. Each subscriber has a queue there, and one wake-up of the loop is enough for
+all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.
+
+The loop and Zenoh's threads share the interpreter's lock. A loop that each message wakes would hand it over for each
+one, which costs 20 µs. So above ``limits.BUSY_MESSAGES`` in a period the loop is not woken: it looks once a period.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import threading
+import time
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+
+from rmpa.gateway import limits
+from rmpa.runtime.tls import CollectedSends
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable, Sequence
+
+    from rmpa.gateway.neighbour import ZenohQos
+    from rmpa.ros.wire.tcpros import Buffer
+
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+
+
+_threads = threading.local()
+
+
+def keep_thread_state() -> None:
+    """Keep the interpreter's state of this thread, which Zenoh's runtime has started, until the thread ends.
+
+    Without it each callback makes and removes such a state, with pages of memory: 15 µs instead of 2.
+    """
+    if not getattr(_threads, "kept", False):
+        _threads.kept = True
+        ctypes.pythonapi.PyGILState_Ensure()
+
+
+class ArrivalQueue(Generic[_T]):
+    """What arrived for one subscriber, and waits for the event loop.
+
+    Args:
+        arrivals: The loop's side.
+        deliver: Called in the loop with each item.
+        messages: Items that wait at most; above it the oldest is dropped.
+        size: Bytes that wait at most; one item always fits.
+        discard: Called in the loop with each item that was dropped.
+    """
+
+    def __init__(
+        self,
+        arrivals: Arrivals,
+        deliver: Callable[[_T], None],
+        messages: int,
+        size: int,
+        discard: Callable[[_T], None] | None = None,
+    ) -> None:
+        self._arrivals = arrivals
+        self._deliver = deliver
+        self._messages = messages
+        self._bytes = size
+        self._discard = discard
+        self._items: deque[tuple[_T, int]] = deque()
+        """Each with its size."""
+        self._waiting_bytes = 0
+        self._scheduled = False
+        self._closed = False
+        self.dropped = 0
+        """Items that found no room."""
+
+    def add(self, item: _T, size: int = 0) -> None:
+        """Queue one item of ``size`` bytes, from any thread."""
+        with self._arrivals.lock:
+            if self._closed:
+                return
+            self._items.append((item, size))
+            self._waiting_bytes += size
+            while len(self._items) > self._messages or (self._waiting_bytes > self._bytes and len(self._items) > 1):
+                old, old_size = self._items.popleft()
+                self._waiting_bytes -= old_size
+                self.dropped += 1
+                self._arrivals.refused["zenoh.arrival.dropped"] += 1
+                if self._discard is not None:
+                    self._arrivals.discarded.append((self._discard, old))
+            if not self._scheduled:
+                self._scheduled = True
+                self._arrivals.schedule(self)
+
+    def close(self) -> None:
+        """Forget what waits; nothing is delivered afterwards."""
+        with self._arrivals.lock:
+            self._closed = True
+            if self._discard is not None:
+                self._arrivals.discarded.extend((self._discard, item) for item, _ in self._items)
+                self._arrivals.wake()
+            self._items.clear()
+            self._waiting_bytes = 0
+
+    def take(self) -> tuple[_T, int] | None:
+        """Take the oldest item, and its size; ``None`` if none waits. The caller has the lock."""
+        if not self._items:
+            return None
+        item = self._items.popleft()
+        self._waiting_bytes -= item[1]
+        return item
+
+    def reschedule(self) -> None:
+        """Queue up for another turn if something waits. The caller has the lock."""
+        self._scheduled = bool(self._items)
+        if self._scheduled:
+            self._arrivals.schedule(self)
+
+    def deliver(self, item: _T) -> None:
+        """Hand one item to the subscriber; an error of the subscriber is logged."""
+        if self._closed:
+            if self._discard is not None:
+                self._discard(item)
+            return
+        try:
+            self._deliver(item)
+        except Exception:  # noqa: BLE001 - the last frame of the loop: others must get theirs
+            _log.exception("zenoh: what arrived could not be handled")
+
+
+class Arrivals:
+    """The loop's side of all queues of a session.
+
+    Args:
+        loop: The event loop that everything is delivered in.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self.lock = threading.Lock()
+        self.refused: Counter[str] = Counter()
+        """What was dropped or refused, by its reason; guarded by ``lock``."""
+        self.discarded: deque[tuple[Callable[..., None], object]] = deque()
+        """What was dropped, with the function that is told; guarded by ``lock``."""
+        self._ready: deque[ArrivalQueue[object]] = deque()
+        self._woken = False
+        self._closed = False
+        self._window_end = 0.0
+        self._in_window = 0
+
+    def refuse(self, reason: str) -> None:
+        """Count something that was refused, from any thread."""
+        with self.lock:
+            self.refused[reason] += 1
+
+    def schedule(self, queue: ArrivalQueue[_T]) -> None:
+        """Give a queue its turn. The caller has the lock."""
+        self._ready.append(queue)  # type: ignore[arg-type] # what it takes is what it delivers
+        self.wake()
+
+    def wake(self) -> None:
+        """Let the loop look at the queues. The caller has the lock."""
+        if not self._woken and not self._closed:
+            self._woken = True
+            try:
+                self._loop.call_soon_threadsafe(self._drain)
+            except RuntimeError:  # the loop was closed before the session
+                self._closed = True
+
+    def close(self) -> None:
+        """Deliver nothing more."""
+        with self.lock:
+            self._closed = True
+            self._ready.clear()
+
+    def _drain(self) -> None:
+        taken = self._deliver()
+        now = self._loop.time()
+        if now >= self._window_end:
+            self._window_end = now + limits.BUSY_PERIOD
+            self._in_window = 0
+        self._in_window += taken
+        with self.lock:
+            if self._closed:
+                return
+            if self._ready and taken >= limits.DRAIN_MESSAGES:
+                self._loop.call_soon(self._drain)
+            elif self._in_window >= limits.BUSY_MESSAGES:
+                self._loop.call_later(limits.BUSY_PERIOD, self._drain)
+            elif self._ready or self.discarded:
+                self._loop.call_soon(self._drain)
+            else:
+                self._woken = False
+
+    def _deliver(self) -> int:
+        """Deliver what waits, but not more than the loop can do without a delay; return the number of messages."""
+        messages, size = limits.DRAIN_MESSAGES, limits.DRAIN_BYTES
+        with self.lock:
+            discarded = tuple(self.discarded)
+            self.discarded.clear()
+        for discard, item in discarded:
+            discard(item)
+        while messages > 0 and size > 0:
+            with self.lock:
+                if not self._ready:
+                    break
+                queue = self._ready.popleft()
+                taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
+                queue.reschedule()
+            with CollectedSends():  # one system call for what goes to one peer
+                for item in taken:
+                    queue.deliver(item)
+            messages -= len(taken)
+            size -= taken_bytes
+        return limits.DRAIN_MESSAGES - messages
+
+    @staticmethod
+    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
+        taken: list[object] = []
+        taken_bytes = 0
+        while len(taken) < messages and taken_bytes < limits.TURN_BYTES:
+            entry = queue.take()
+            if entry is None:
+                break
+            taken.append(entry[0])
+            taken_bytes += entry[1]
+        return taken, taken_bytes
+
+
+# Publishers behind bounded queues, and the threads that put their messages to Zenoh.
+#
+# A put of a reliable publisher waits while the transport's queue of its priority is full: Zenoh has one such queue
+# for
+# each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits
+# for
+# a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest
+# messages
+# of each publisher are dropped, and counted.
+
+
+class PutHandle(Protocol):
+    """What puts: a publisher of the Zenoh library, once it is declared."""
+
+    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
+        """Hand one message to Zenoh."""
+
+
+class QueuedPublisher:
+    """A publisher that queues, with the bounds of its QoS; each message has its own attachment.
+
+    Args:
+        lane: The thread of its priority.
+        key: Its key.
+        qos: Its bounds.
+        undeclare: Called in the event loop once nothing of it is sent any more.
+    """
+
+    def __init__(self, lane: SendingLane, key: str, qos: ZenohQos, undeclare: Callable[[], None]) -> None:
+        self._lane = lane
+        self.key: Final = key
+        self._qos = qos
+        self._undeclare = undeclare
+        self.handle: PutHandle | None = None
+        """Zenoh's publisher; nothing is sent before it is declared."""
+        self._queue: deque[tuple[bytes, bytes]] = deque()
+        self._queue_bytes = 0
+        self._taken = 0
+        self._scheduled = False
+        self._flush_timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        self.sent = 0
+        self.dropped = 0
+
+    @property
+    def waiting(self) -> int:
+        """Messages in the queue, with those whose turn it is."""
+        return len(self._queue) + self._taken
+
+    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
+        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
+        return self.put_all(((payload if isinstance(payload, bytes) else bytes(payload), attachment),))
+
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
+        """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
+        size = 0
+        for message in messages:
+            size += len(message[0])
+        with self._lane.changed:
+            if self._closed:
+                self.dropped += len(messages)
+                return len(messages)
+            self._queue.extend(messages)
+            self._queue_bytes += size
+            dropped = self._make_room()
+            self._schedule()
+        return dropped
+
+    def declared(self, handle: PutHandle) -> None:
+        """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
+        with self._lane.changed:
+            self.handle = handle
+            self._schedule()
+
+    def close(self) -> None:
+        """Undeclare it, after the queue is empty or a second has passed."""
+        with self._lane.changed:
+            if self._closed:
+                return
+            self._closed = True
+            empty = not self._queue and not self._taken
+        if empty:
+            self._undeclare()
+        else:
+            self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
+
+    def take_turn(self) -> list[tuple[bytes, bytes]]:
+        """Take the messages of one turn. The caller has the lane's lock."""
+        turn: list[tuple[bytes, bytes]] = []
+        size = 0
+        while self._queue and len(turn) < limits.TURN_MESSAGES and size < limits.TURN_BYTES:
+            message = self._queue.popleft()
+            turn.append(message)
+            size += len(message[0])
+        self._queue_bytes -= size
+        self._taken = len(turn)
+        return turn
+
+    def send(self, turn: list[tuple[bytes, bytes]]) -> None:
+        """Put the messages of one turn, and count them. Called from the lane's thread, without its lock."""
+        for payload, attachment in turn:
+            sent = self._lane.put(self.handle, self.key, payload, attachment)
+            self._taken -= 1
+            if sent:
+                self.sent += 1
+            else:
+                with self._lane.changed:
+                    self.dropped += 1
+
+    def end_turn(self) -> None:
+        """Queue up for another turn, or end. The caller has the lane's lock."""
+        self._taken = 0
+        self._scheduled = False
+        if self._queue:
+            self._schedule()
+        elif self._closed:
+            self._lane.call_loop(self._flushed)
+
+    def _schedule(self) -> None:
+        if self._queue and not self._scheduled and self.handle is not None:
+            self._scheduled = True
+            self._lane.schedule(self)
+
+    def _make_room(self) -> int:
+        dropped = 0
+        while len(self._queue) > 1 and (
+            len(self._queue) + self._taken > self._qos.messages or self._queue_bytes > self._qos.bytes
+        ):
+            old = self._queue.popleft()
+            self._queue_bytes -= len(old[0])
+            dropped += 1
+        self.dropped += dropped
+        return dropped
+
+    def _flushed(self) -> None:
+        if self._flush_timer is not None:
+            self._flush_timer.cancel()
+            self._flush_timer = None
+            self._undeclare()
+
+    def _give_up(self) -> None:
+        with self._lane.changed:
+            self.dropped += len(self._queue)
+            self._queue.clear()
+            self._queue_bytes = 0
+        self._flushed()
+
+
+class SendingLane:
+    """The thread that puts the messages of one priority.
+
+    Args:
+        loop: The event loop that the publishers belong to.
+        name: The thread's name.
+        failures: The exceptions of Zenoh's ``put``.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, name: str, failures: tuple[type[Exception], ...]) -> None:
+        self.loop: Final = loop
+        self._failures = failures
+        self.changed: Final = threading.Condition(threading.Lock())
+        """Guards the queues of all publishers of this lane."""
+        self._ready: deque[QueuedPublisher] = deque()
+        self._stopped = False
+        self._failed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def schedule(self, publisher: QueuedPublisher) -> None:
+        """Give a publisher its turn. The caller has the lock."""
+        self._ready.append(publisher)
+        if len(self._ready) == 1:
+            self.changed.notify()
+
+    def call_loop(self, function: Callable[[], None]) -> None:
+        """Call ``function`` in the event loop, if it still runs."""
+        try:
+            self.loop.call_soon_threadsafe(function)
+        except RuntimeError:  # the loop was closed before the session
+            self._stopped = True
+
+    def stop(self) -> None:
+        """End the thread after the put that is under way."""
+        with self.changed:
+            self._stopped = True
+            self.changed.notify()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread's end, which ``stop`` asks for.
+
+        Args:
+            timeout: Seconds.
+
+        Returns:
+            Whether it has ended.
+        """
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        window_end, in_window = 0.0, 0
+        while True:
+            if in_window >= limits.BUSY_MESSAGES and not self._ready:
+                # The loop need not wake this thread, nor wait for the interpreter's lock, for each message.
+                time.sleep(limits.BUSY_PERIOD / 2)
+            with self.changed:
+                while not self._ready and not self._stopped:
+                    self.changed.wait()
+                if self._stopped:
+                    return
+                publisher = self._ready.popleft()
+                turn = publisher.take_turn()
+            publisher.send(turn)
+            now = time.monotonic()
+            if now >= window_end:
+                window_end, in_window = now + limits.BUSY_PERIOD, 0
+            in_window += len(turn)
+            del turn
+            with self.changed:
+                publisher.end_turn()
+
+    def put(self, handle: PutHandle | None, key: str, payload: bytes, attachment: bytes) -> bool:
+        """Put one message; return whether Zenoh took it. Called from the lane's thread."""
+        if self._stopped or handle is None:
+            return False
+        try:
+            handle.put(payload, attachment=attachment or None)
+        except self._failures as error:
+            if not self._failed:
+                self._failed = True
+                _log.warning("zenoh: a message by %s was not sent: %s", key, error)
+            return False
+        return True
