@@ -24,7 +24,7 @@ import table
 from module import arguments, joined, run
 from rate import Rate
 from rmpa.core.errors import RmpaError
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 from sites import SITES
 from watch import HERE, MODULES, TOPICS, PoseView, View, Watch
 

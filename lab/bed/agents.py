@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from lab.bed.processes import DEADLINE, BedError, CommandFailed, Deadline, Process, eventually
 from lab.bed.ros import free_port
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

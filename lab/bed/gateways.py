@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import CommandFailed, Process, eventually
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -27,7 +27,7 @@ from lab.results import finish
 from lab.tables import dash, ratio, table_of, us
 from lab.usage import Meter, wakeups
 from rmpa.core.errors import RmpaError
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -20,7 +20,7 @@ import msgspec
 
 from lab.nodes.node import say
 from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.observe.peer_info import LinkInfo, PeerInfo
 from rmpa.observe.snapshot import LatencyInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot, TopicInfo
 

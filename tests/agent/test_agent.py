@@ -18,7 +18,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.proxies import proxied_node
 from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node

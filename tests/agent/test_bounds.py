@@ -11,7 +11,7 @@ import pytest
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import ConfigError
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros import limits as ros_limits
 from tests.agent.test_agent import node, running, until

@@ -13,10 +13,10 @@ import rmpa
 from rmpa.config.read import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.graph_changes import GraphRevision, TopicRow
-from rmpa.observe.io.control_client import ControlClient
-from rmpa.observe.io.control_operations import REPLIES
-from rmpa.observe.peer_agent import PeerAgent
+from rmpa.observe.control import GraphRevision, TopicRow
+from rmpa.observe.control_client import ControlClient
+from rmpa.observe.control_server import REPLIES
+from rmpa.observe.peer_info import PeerAgent
 from rmpa.ros.environment import NodeFacts, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType

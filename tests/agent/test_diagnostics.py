@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.config.settings import Multicast, Settings
 from rmpa.core.contract import ContractRule
-from rmpa.observe.io.control_client import ControlClient
-from rmpa.observe.io.diagnostics import TOPIC
+from rmpa.observe.control_client import ControlClient
+from rmpa.observe.health import TOPIC
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.types.definitions import ARRAY_MD5, ARRAY_TYPE
 from tests.agent.test_agent import node, running, until

@@ -22,8 +22,8 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import proxies as proxy_nodes
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError, UnreachableError
-from rmpa.observe.io.control_client import ControlClient
-from rmpa.observe.io.control_server import ControlServer
+from rmpa.observe.control_client import ControlClient
+from rmpa.observe.control_server import ControlServer
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore

@@ -32,7 +32,7 @@ from rmpa.core.errors import UnreachableError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore

@@ -11,7 +11,7 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.config.settings import Multicast, Settings
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node

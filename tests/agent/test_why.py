@@ -12,7 +12,7 @@ import pytest
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import CheckLevel
+from rmpa.observe.peer_info import CheckLevel
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rmpa.observe.io.control_server import ControlServer, Handler
+from rmpa.observe.control_server import ControlServer, Handler
 from rmpa.observe.snapshot import PingReply, Snapshot
 from rmpa.ros.core.embedded import RosCore
 from tests.observe.samples import SNAPSHOT

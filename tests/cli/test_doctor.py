@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.observe.doctor.io.checks import CHECKS
+from rmpa.observe.doctor.checks import CHECKS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,7 +14,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.observe.io.control_server import ControlServer
+from rmpa.observe.control_server import ControlServer
 from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 from tests.observe.samples import SNAPSHOT

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rmpa.observe.reload_reply import ReloadReply
+from rmpa.observe.control import ReloadReply
 
 if TYPE_CHECKING:
     from tests.cli.conftest import Place

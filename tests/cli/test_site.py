@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.io.control_server import ControlServer, Handler
-from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.control_server import ControlServer, Handler
+from rmpa.observe.peer_info import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:

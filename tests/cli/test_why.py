@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.io.control_server import ControlServer, Handler
+from rmpa.observe.control_server import ControlServer, Handler
+from rmpa.observe.peer_info import Check, CheckLevel
 from rmpa.observe.why.diagnosis import Diagnosis
 from tests.observe.samples import SNAPSHOT
 

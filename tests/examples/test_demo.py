@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from lab.bed.processes import Process, eventually
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
 from rmpa.ros.node.node import Node
 from stick import AXIS, BUTTON, EVENT

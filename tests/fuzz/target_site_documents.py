@@ -7,7 +7,7 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.sites.exported_topic import TopicHeader
 from rmpa.gateway.sites.why import WhyQuestion, parse_ways
-from rmpa.observe.check import OK, Check
+from rmpa.observe.peer_info import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 

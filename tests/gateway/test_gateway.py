@@ -15,7 +15,7 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
 from rmpa.gateway.gateway import Gateway
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from tests.agent.conftest import pytest_asyncio_loop_factories
 from tests.agent.test_agent import settings, until
 from tests.gateway.memory_zenoh import MemorySession, MemoryZenoh

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from lab.bed.processes import Process
 from rmpa.config import limits as config_limits
 from rmpa.core.identity import Guid
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import limits as trust_limits

@@ -12,7 +12,7 @@ import pytest
 
 from lab.bed.processes import Process, eventually, run
 from rmpa.core import limits
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
 

@@ -9,7 +9,7 @@ import pytest
 
 from lab.bed.processes import Process
 from rmpa.bridge import limits
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from tests.interop.modules import flows
 from tests.interop.ros import NODES
 from tests.interop.transports import AUTO, on_the_network, wait_direct

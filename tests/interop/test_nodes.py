@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.processes import eventually
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 
 if TYPE_CHECKING:
     from lab.bed.namespaces import Lab

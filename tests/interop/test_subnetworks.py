@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.processes import eventually
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
 

@@ -7,7 +7,7 @@ import subprocess
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.processes import DEADLINE, Deadline, eventually
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 

@@ -18,10 +18,8 @@ from rmpa.cli.doctor import _json as doctor_json
 from rmpa.cli.doctor import _lines as doctor_lines
 from rmpa.cli.doctor import _summary as doctor_summary
 from rmpa.cli.why import _lines as why_lines
-from rmpa.observe.check import exit_code
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.firewall import judge_rules, read_iptables, read_nft
-from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_rights
+from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_rights, judge_shell
 from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
@@ -33,9 +31,12 @@ from rmpa.observe.doctor.network import (
     judge_radio,
     judge_routes,
     judge_rp_filter,
+    judge_rules,
+    read_iptables,
+    read_nft,
 )
-from rmpa.observe.doctor.ros_environment import judge_shell
 from rmpa.observe.health import Health, diagnostic_status
+from rmpa.observe.peer_info import exit_code
 from rmpa.observe.snapshot import EventInfo, FilesInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.definitions import frame_array
 from tests.observe.doctor.test_firewall import IPTABLES_UFW, NFT_AGAINST, NFT_CLOSED, NFT_OPEN, NFT_OURS, PORTS
@@ -46,8 +47,7 @@ from tests.observe.why import test_direct_stages, test_services, test_topics
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from rmpa.observe.check import Check
-    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.peer_info import Check, PeerInfo
     from rmpa.observe.why.diagnosis import Diagnosis
 
 RADIO: Final = Radio("wlan0", "10.0.0.0/24")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rmpa.observe import graph_changes, limits
-from rmpa.observe.graph_changes import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
+from rmpa.observe import control as graph_changes
+from rmpa.observe import limits
+from rmpa.observe.control import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.registrations import Registrations
 
 _API = "http://127.0.0.1:9/"

@@ -3,8 +3,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rmpa.observe.control import ControlReply
-from rmpa.observe.json_pieces import json_pieces
+from rmpa.observe.control import ControlReply, json_pieces
 from rmpa.observe.snapshot import Snapshot
 from tests.observe.samples import SNAPSHOT
 

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.observe.control import ControlReply
+from rmpa.observe.control import ControlReply, SnapshotDecoder
 from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
-from rmpa.observe.snapshot_decoder import SnapshotDecoder
 from rmpa.trust.joining import TrustStatus
 from tests.web.snapshots import AGENT, peer
 

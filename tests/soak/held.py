@@ -16,7 +16,7 @@ import psutil
 
 from lab.bed.processes import BedError, eventually
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

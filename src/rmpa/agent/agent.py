@@ -27,18 +27,14 @@ from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.discovery.network import list_interfaces
-from rmpa.observe.io.control_client import ControlClient, find_agents
-from rmpa.observe.io.control_operations import ControlOperations
-from rmpa.observe.io.control_server import ControlServer
-from rmpa.observe.io.diagnostics import Diagnostics
-from rmpa.observe.io.graph_revision import GraphRevisions
-from rmpa.observe.io.peer_clocks import PeerClocks
-from rmpa.observe.io.peer_credentials import control_access
-from rmpa.observe.io.runtime_dir import runtime_dir
-from rmpa.observe.io.site_requests import SiteRequests
-from rmpa.observe.io.snapshot_builder import SnapshotBuilder, SnapshotSources
-from rmpa.observe.peer_agent import INFO
-from rmpa.observe.why.io.why import WhyService
+from rmpa.observe.control import GraphRevisions
+from rmpa.observe.control_client import ControlClient, SiteRequests, find_agents, runtime_dir
+from rmpa.observe.control_server import ControlOperations, ControlServer, control_access
+from rmpa.observe.health import Diagnostics
+from rmpa.observe.peer_info import INFO
+from rmpa.observe.snapshot_builder import SnapshotBuilder, SnapshotSources
+from rmpa.observe.topics_section import PeerClocks
+from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
@@ -57,7 +53,7 @@ if TYPE_CHECKING:
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
-    from rmpa.observe.io.control_server import Handler
+    from rmpa.observe.control_server import Handler
     from rmpa.observe.snapshot import AgentInfo
     from rmpa.ros.core.api import Core
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.settings import SETTINGS
 from rmpa.core.counters import Backoff, remedy
 from rmpa.core.errors import ConfigError, StartError
-from rmpa.observe.reload_reply import ReloadReply
+from rmpa.observe.control import ReloadReply
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import process as realtime
 from rmpa.runtime.accept import is_shortage, raise_file_limit

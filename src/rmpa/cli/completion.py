@@ -122,13 +122,13 @@ def _with_peers(found: dict[str, list[str]], incomplete: str) -> Iterable[str]:
 
 
 def _agents(ctx: click.Context, _: str) -> Iterable[str]:  # noqa: ARG001 - as the others
-    from rmpa.observe.io.control_client import find_agents
+    from rmpa.observe.control_client import find_agents
 
     return [agent.name for agent in find_agents(os.environ)]
 
 
 def _peers(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.observe.io.control_client import ControlClient, choose_agent
+    from rmpa.observe.control_client import ControlClient, choose_agent
 
     with ControlClient(choose_agent(os.environ, ctx.params.get("agent")).path, timeout=ANSWER) as client:
         return [peer.name for peer in client.snapshot(topics=()).peers]

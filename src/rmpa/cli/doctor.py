@@ -10,12 +10,12 @@ import click
 
 from rmpa.cli.options import FiniteRange, json_option
 from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
-from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
+from rmpa.observe.peer_info import FAIL, WARN, CheckLevel, exit_code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.check import Check
+    from rmpa.observe.peer_info import Check
 
 EPILOG = """\
 \b
@@ -42,7 +42,7 @@ def doctor(config: str | None, quiet: bool, listen: float | None, as_json: bool)
     checks that it comes back. To see whether a switch or a firewall in between drops it, run it with --listen on one
     machine and meanwhile without on the other, then the other way round.
     """
-    from rmpa.observe.doctor.io.checks import examine, look_at
+    from rmpa.observe.doctor.checks import examine, look_at
 
     found, shown = [], []
     for check in examine(look_at(os.environ, config, listen or 0.0)):

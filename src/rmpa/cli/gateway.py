@@ -22,7 +22,7 @@ from rmpa.config.settings import WebSettings
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
-from rmpa.observe.io.control_client import ControlClient, find_agents
+from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter
 from rmpa.trust.joining import TrustStatus
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 

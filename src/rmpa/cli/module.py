@@ -13,7 +13,7 @@ from rmpa.config.module_name import GATEWAY_SUFFIX, choose_name, keep_name, stat
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_problem
-from rmpa.observe.io.control_client import ControlClient, find_agents, with_running
+from rmpa.observe.control_client import ControlClient, find_agents, with_running
 from rmpa.trust.joining import TrustStatus
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.output import warn
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe import limits
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.ros.environment import NodeLine, PeerNodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
-from rmpa.observe.check import CheckLevel
+from rmpa.observe.peer_info import CheckLevel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

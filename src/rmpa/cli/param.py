@@ -16,7 +16,7 @@ from rmpa.cli.output import Column, json_text, print_json, print_line, print_tab
 from rmpa.cli.param_store import open_store, read_key, split_peer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.snapshot import FollowedInfo
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name
 from rmpa.observe import limits
-from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.io.peer_params import PeerParams, parameters_in
+from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.observe.peers_section import PeerParams, parameters_in
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

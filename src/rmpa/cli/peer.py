@@ -16,7 +16,7 @@ from rmpa.cli.selection import LINES, Selection, summary
 from rmpa.cli.topic_crossing import shown_state
 from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.peer_info import FOREIGN
 from rmpa.observe.snapshot import PingReply
 

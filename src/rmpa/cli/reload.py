@@ -7,7 +7,7 @@ import click
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import print_json, print_line, printable, warn
 from rmpa.cli.peer import connect
-from rmpa.observe.reload_reply import ReloadReply
+from rmpa.observe.control import ReloadReply
 
 EPILOG = """\
 \b

@@ -304,7 +304,7 @@ class ModuleAgent:
 
 def _core_of(name: str) -> str | None:
     """The URI of the core of a running agent, or ``None``."""
-    from rmpa.observe.io.control_client import ControlClient, find_agents
+    from rmpa.observe.control_client import ControlClient, find_agents
 
     for found in find_agents(os.environ):
         if found.name == name:

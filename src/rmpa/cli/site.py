@@ -15,12 +15,11 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.io.site_requests import INFO, REPORT
-from rmpa.observe.sites import SitesReport
+from rmpa.observe.control_client import INFO, REPORT, ControlClient, choose_agent
+from rmpa.observe.peer_info import SitesReport
 
 if TYPE_CHECKING:
-    from rmpa.observe.sites import SiteInfo
+    from rmpa.observe.peer_info import SiteInfo
 
 _T = TypeVar("_T")
 _COLOURS: Final = {"this site": "green", "joined": "green", "no gateway": "yellow", "unreachable": "red"}

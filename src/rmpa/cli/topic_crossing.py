@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
-from rmpa.observe.transport_text import UNMEASURED, route_texts, subscriber_text
+from rmpa.observe.health import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 
 if TYPE_CHECKING:

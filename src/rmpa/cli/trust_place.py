@@ -17,7 +17,7 @@ from rmpa.cli.output import warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, keep_name, kept_name, note_state_dir
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
-from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient
 from rmpa.trust.joining import TrustStatus
 from rmpa.trust.store import TrustStore
 

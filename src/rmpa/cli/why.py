@@ -12,14 +12,14 @@ from rmpa.cli.options import agent_option, completes, json_option
 from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits
-from rmpa.observe.check import FAIL, OK, WARN
-from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.observe.peer_info import FAIL, OK, WARN
 from rmpa.observe.why.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.check import Check, CheckLevel
+    from rmpa.observe.peer_info import Check, CheckLevel
 
 EPILOG = """\
 \b

@@ -12,19 +12,320 @@ the number of its bytes, and they follow the line.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+import asyncio
+import contextlib
+import itertools
+import secrets
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
 from rmpa.bridge.messages import without_text
-from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.observe import limits
-from rmpa.observe.json_pieces import json_pieces
+from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
+from rmpa.ros.master.parameters import RegistrationKind
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
     from rmpa.core.counters import Yielder
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.trust.joining import TrustStatus
+
+
+# The value of the control socket's operation ``reload``.
+
+
+class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
+    """The settings as read again, against those that the agent runs with.
+
+    Attributes:
+        file: The file that was read, or empty if there is none.
+        changed: The keys whose new values hold from now on (or would, for a check): ``bridge.deny``, ``[[peer]]``.
+        restart: Those that hold after a restart only, each with both values: ``mesh.port (40001 instead of 0)``.
+        notes: Doubtful settings, each ready to read.
+        problem: Why the settings cannot be used, with the file's line, and nothing has changed; empty if they can.
+    """
+
+    file: str = ""
+    changed: tuple[str, ...] = ()
+    restart: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    problem: str = ""
+
+
+# Encodes large JSON values in pieces, between which other work can be done.
+
+
+_BATCH: Final = 16
+"""Elements of a list in one piece: some 50 microseconds where they are topics."""
+
+
+def json_pieces(value: object) -> Iterator[bytes]:
+    """The output of ``msgspec.json.encode`` in pieces: long lists, also those in fields of structs, are cut.
+
+    Args:
+        value: Must not change meanwhile.
+
+    Raises:
+        TypeError, ValueError, RecursionError: JSON cannot hold it.
+    """
+    if isinstance(value, list | tuple) and len(value) > _BATCH:
+        yield from _list(value)
+    elif isinstance(value, msgspec.Struct) and not type(value).__struct_config__.tag:
+        yield from _struct(value)
+    else:
+        yield msgspec.json.encode(value)
+
+
+def _list(values: Sequence[object]) -> Iterator[bytes]:
+    for begin in range(0, len(values), _BATCH):
+        yield b"[" if begin == 0 else b","
+        yield msgspec.json.encode(values[begin : begin + _BATCH])[1:-1]
+    yield b"]"
+
+
+def _struct(value: msgspec.Struct) -> Iterator[bytes]:
+    omit = type(value).__struct_config__.omit_defaults
+    separator = b"{"
+    for field in msgspec.structs.fields(value):
+        content = getattr(value, field.name)
+        if omit and content == _default(field):
+            continue
+        yield separator + msgspec.json.encode(field.encode_name) + b":"
+        yield from json_pieces(content)
+        separator = b","
+    yield b"{}" if separator == b"{" else b"}"
+
+
+def _default(field: msgspec.structs.FieldInfo) -> object:
+    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+
+
+# Decodes the snapshots of one agent, one after the other; what has not changed is not decoded again.
+
 
 _T = TypeVar("_T")
+
+
+class _SnapshotParts(msgspec.Struct, kw_only=True, frozen=True):
+    """A ``Snapshot`` whose long lists are not decoded."""
+
+    agent: AgentInfo
+    taken: float
+    peers: tuple[PeerInfo, ...] = ()
+    topics: tuple[msgspec.Raw, ...] = ()
+    services: tuple[msgspec.Raw, ...] = ()
+    counters: dict[str, int] = {}
+    notes: tuple[str, ...] = ()
+    unreachable: tuple[UnreachableInfo, ...] = ()
+    trust: TrustStatus | None = None
+    topics_left: int = 0
+    services_left: int = 0
+    strangers: tuple[PeerInfo, ...] = ()
+
+
+class _SnapshotReply(msgspec.Struct, frozen=True):
+    """A ``ControlReply`` with a snapshot."""
+
+    ok: bool
+    value: _SnapshotParts
+
+
+class _Entries(Generic[_T]):
+    """The entries of one list, by their bytes in the last snapshot."""
+
+    def __init__(self, type_: type[_T]) -> None:
+        self._decode = msgspec.json.Decoder(type_).decode
+        self._known: dict[bytes, _T] = {}
+
+    def decode(self, raws: tuple[msgspec.Raw, ...]) -> tuple[_T, ...]:
+        before, known = self._known, {}
+        made: list[_T] = []
+        for raw in raws:
+            text = bytes(raw)
+            entry = before.get(text)
+            if entry is None:
+                entry = self._decode(text)
+            known[text] = entry
+            made.append(entry)
+        self._known = known
+        return tuple(made)
+
+
+class SnapshotDecoder:
+    """Snapshots of one agent. An entry of topics and services with the same bytes as before is the same object.
+
+    Most of a large mesh is idle: its bytes are found again in less time than they are decoded in, and equal entries
+    need not be compared.
+    """
+
+    def __init__(self) -> None:
+        self._reply = msgspec.json.Decoder(_SnapshotReply)
+        self._topics = _Entries(TopicInfo)
+        self._services = _Entries(ServiceInfo)
+
+    def decode(self, line: bytes) -> Snapshot:
+        """The snapshot of a control reply.
+
+        Raises:
+            RemoteProtocolError: It has none.
+        """
+        try:
+            parts = self._reply.decode(line).value
+            return Snapshot(
+                agent=parts.agent,
+                taken=parts.taken,
+                peers=parts.peers,
+                topics=self._topics.decode(parts.topics),
+                services=self._services.decode(parts.services),
+                counters=parts.counters,
+                notes=parts.notes,
+                unreachable=parts.unreachable,
+                trust=parts.trust,
+                topics_left=parts.topics_left,
+                services_left=parts.services_left,
+                strangers=parts.strangers,
+            )
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            raise RemoteProtocolError(f"not a snapshot: {error}") from None
+
+
+# The local graph as the control socket tells it: all of it, or the topics and services that have changed since.
+#
+# A row is the present state of one topic or service, so it does not matter how often it changed meanwhile. The
+# history
+# has names alone; the rows are read from the graph when a client asks.
+
+
+_Nodes = tuple[str, ...]
+
+
+class TopicRow(msgspec.Struct, frozen=True, array_like=True):
+    """A topic as it is now; one without publishers and subscribers is gone.
+
+    Attributes:
+        name: Its name.
+        type: The type last registered; ``*`` or empty where none is known.
+        publishers: Names of nodes.
+        subscribers: Likewise.
+    """
+
+    name: str
+    type: str
+    publishers: _Nodes
+    subscribers: _Nodes
+
+
+class ServiceRow(msgspec.Struct, frozen=True, array_like=True):
+    """A service as it is now; one without providers is gone.
+
+    Attributes:
+        name: Its name.
+        providers: Names of nodes.
+    """
+
+    name: str
+    providers: _Nodes
+
+
+class GraphRows(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=True):
+    """What a client has to know of the graph.
+
+    Attributes:
+        whole: Whether these are all topics and services; else those that have changed since the revision that the
+            client knows.
+        topics: Topics.
+        services: Services.
+    """
+
+    whole: bool = False
+    topics: tuple[TopicRow, ...] = ()
+    services: tuple[ServiceRow, ...] = ()
+
+
+class GraphRevision(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=True):
+    """The value of the operation ``graph``.
+
+    Attributes:
+        revision: Stands for the present local graph; another number stands for another graph.
+        core_uri: The master whose graph it is; empty without ``rows``.
+        rows: The graph, for a client that asked for rows. ``None`` where the core is another program, which can be
+            read without the agent and knows its graph first; an older agent has none either.
+    """
+
+    revision: int
+    core_uri: str = ""
+    rows: GraphRows | None = None
+
+
+class GraphHistory:
+    """Which topics and services have changed at the last ``limits.GRAPH_HISTORY`` revisions.
+
+    It is kept while clients ask for rows: without one, a change of the graph costs nothing.
+
+    Args:
+        revision: The first one.
+    """
+
+    def __init__(self, revision: int) -> None:
+        self.revision = revision
+        """The present one."""
+        self._changes: deque[tuple[RegistrationKind, str]] | None = None
+        self._asked = 0
+
+    def __len__(self) -> int:
+        """The number of revisions that are kept."""
+        return len(self._changes or ())
+
+    def add(self, change: GraphChange) -> None:
+        """The graph has changed, which makes a new revision."""
+        self.revision += 1
+        if self._changes is None:
+            return
+        if self.revision - self._asked > limits.GRAPH_HISTORY:
+            self._changes = None  # the client that asked last is too far behind by now, or has gone
+        else:
+            self._changes.append((change.kind, change.name))
+
+    def rows_since(self, known: object, state: GraphState) -> GraphRows:
+        """What has changed since a revision, or everything where the history does not reach back to it.
+
+        Args:
+            known: The revision that a client knows; ``None``, or anything that is not one of this agent: none.
+            state: The present graph.
+        """
+        self._asked = self.revision
+        if self._changes is None:
+            self._changes = deque(maxlen=limits.GRAPH_HISTORY)
+        behind = self.revision - known if type(known) is int else -1
+        if not 0 <= behind <= len(self._changes):
+            topics = state.publishers.keys() | state.subscribers.keys()
+            return GraphRows(
+                whole=True, topics=_topics(sorted(topics), state), services=_services(sorted(state.services), state)
+            )
+        recent = dict.fromkeys(itertools.islice(reversed(self._changes), behind))
+        topics_changed = dict.fromkeys(name for kind, name in recent if kind is not RegistrationKind.SERVICE)
+        services_changed = [name for kind, name in recent if kind is RegistrationKind.SERVICE]
+        return GraphRows(topics=_topics(topics_changed, state), services=_services(services_changed, state))
+
+
+def _topics(names: Iterable[str], state: GraphState) -> tuple[TopicRow, ...]:
+    publishers, subscribers, types = state.publishers, state.subscribers, state.types
+    return tuple(
+        TopicRow(name, types.get(name, ""), tuple(publishers.get(name, ())), tuple(subscribers.get(name, ())))
+        for name in names
+    )
+
+
+def _services(names: Iterable[str], state: GraphState) -> tuple[ServiceRow, ...]:
+    return tuple(ServiceRow(name, tuple(state.services.get(name, ()))) for name in names)
+
+
 ROLE: Final = "role"
 """The operation that only an agent with another role than a module's serves; its value names that."""
 GATEWAY_ROLE: Final = "gateway"
@@ -119,3 +420,61 @@ class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
         if len(line) > limits.CONTROL_REPLY_MAX:
             raise LocalProtocolError(f"a reply of {len(line)} bytes is more than {limits.CONTROL_REPLY_MAX}")
         return line
+
+
+# Lets clients of the control socket wait for the next change of the local graph, and tells them what has changed.
+
+
+_REVISION_BITS = 52
+"""Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other."""
+
+
+class GraphRevisions:
+    """The revision of a core's graph: a number that every change of the graph replaces.
+
+    Args:
+        core: Tells the changes.
+        rows: Whether clients get the changes themselves. Those of a core that is another program are known here later
+            than there.
+    """
+
+    def __init__(self, core: Core, *, rows: bool) -> None:
+        self._core = core
+        self._rows = rows
+        # Begins anywhere, so that a client takes the graph of an agent that was started anew for another one.
+        self._history = GraphHistory(secrets.randbits(_REVISION_BITS))
+        self._changed = asyncio.Event()
+        self._waiting = 0
+        core.on_change(self._add)
+
+    def _add(self, change: GraphChange) -> None:
+        self._history.add(change)
+        if self._waiting:
+            self._changed.set()
+            self._changed = asyncio.Event()
+
+    async def after(self, args: dict[str, object]) -> GraphRevision:
+        """The revision, as soon as it differs from the one that the client knows.
+
+        Args:
+            args: ``after``: the known revision; ``wait``: the most seconds to wait for another one, 0 by default;
+                ``rows``: true for what has changed since ``after``.
+
+        Raises:
+            ConfigError: An argument is out of range.
+        """
+        known, wait = args.get("after"), args.get("wait", 0)
+        if not isinstance(wait, int | float) or not 0 <= wait <= limits.CONTROL_WAIT_MAX:
+            raise ConfigError("wait", f"{wait!r} is not between 0 and {limits.CONTROL_WAIT_MAX:g} s")
+        if known == self._history.revision:
+            self._waiting += 1
+            try:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(wait):
+                        await self._changed.wait()
+            finally:
+                self._waiting -= 1
+        if not self._rows or args.get("rows") is not True:
+            return GraphRevision(revision=self._history.revision)
+        rows = self._history.rows_since(known, self._core.state())
+        return GraphRevision(revision=self._history.revision, core_uri=self._core.uri, rows=rows)

@@ -5,22 +5,244 @@ Levels are those of REP 107. STALE marks what existed before and is gone, such a
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import remedy
 from rmpa.observe import limits
-from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
-from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values
-from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
-from rmpa.ros.types.definitions import DiagnosticLevel, DiagnosticStatus
+from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
+from rmpa.ros.node.publication import Publication, PublicationEvents
+from rmpa.ros.types.definitions import (
+    ARRAY_DEFINITION,
+    ARRAY_MD5,
+    ARRAY_TYPE,
+    DiagnosticLevel,
+    DiagnosticStatus,
+    frame_array,
+)
+from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Iterator, Mapping
 
-    from rmpa.observe.check import CheckLevel
-    from rmpa.observe.peer_info import PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.observe.peer_info import CheckLevel, PeerInfo
+    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
+    from rmpa.observe.snapshot_builder import SnapshotBuilder
+    from rmpa.observe.topics_section import PeerClocks
+    from rmpa.ros.core.api import Core
+
+
+# The transport of routes and of their subscribers in words, for the command line, ``rmpa why`` and health. Pure.
+
+
+BY_TOOL: Final = "measures"
+"""``Condition.MEASURES``: the subscriber is a tool of RMPA, and relayed on purpose."""
+BY_RULE: Final = "transport"
+"""``Condition.TRANSPORT``: the contract of one end says ``relay``."""
+_REMEDIES: Final = {
+    "contract": 'take these terms out of [[contract]], or set its transport to "relay"',
+    "name": "leave it out of prefix and remap of the [[peer]]",
+    "listening": "start the publisher without ROS_IP and ROS_HOSTNAME, or with an address of that network",
+    "subscriber": "start the subscriber without ROS_IP and ROS_HOSTNAME, or with an address of that network",
+    "caller_id": "give one of both nodes another name",
+    "reachable": "see that TCP gets through from this machine to the ports of nodes over there (a firewall?)",
+    "latched": "start the subscriber again",
+    "trust": "trust.direct = true in both modules allows it, where the network is trusted (docs/permissions.md)",
+}
+"""What a user may do about some of the conditions; the others say it themselves, or pass."""
+REMEDY: Final = "docs/contracts.md explains the conditions"
+UNMEASURED: Final = "not measured: the nodes are connected directly"
+"""In place of figures."""
+STUCK_REMEDY: Final = "give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
+_WAITS: Final = {
+    "asking": "the peer's agent is asked for a direct connection, and its node is tried",
+    "direct": "it may connect directly, and has not asked for the topic yet",
+}
+_MOVES: Final = {
+    "asking": "the peer's agent is asked whether it may be direct",
+    "direct": "it is moved to a direct connection",
+}
+
+
+def subscriber_text(one: SubscriberTransport, since: str = "") -> str:
+    """The transport of one subscriber: ``direct to 10.0.0.2:41234 for /viewer (3 min)``.
+
+    Args:
+        one: The subscriber.
+        since: For how long, as text.
+    """
+    node = f"{one.node} ({since})" if since else one.node
+    reason = f"{one.text} (condition {one.condition})" if one.condition else one.text
+    if one.state == "granted":
+        return f"direct for {node}, to port {one.endpoint} of this machine"
+    if one.transport == "direct":
+        text = f"direct to {one.endpoint} for {node}"
+        if one.stuck:
+            return f"{text}, has to be relayed, but its connection cannot be ended ({one.stuck}): {reason}"
+        if one.state == "relayed":
+            return f"{text}, is moved to the relayed transport: {reason}"
+        return text
+    if one.transport == "relay":
+        return f"relayed for {node}: {reason or _MOVES.get(one.state, one.state)}"
+    if one.state == "relayed":
+        return f"relayed for {node}, once it connects: {reason}"
+    return f"none yet for {node}: {_WAITS.get(one.state, one.state)}"
+
+
+def route_texts(route: RouteInfo) -> list[str]:
+    """The transport of a route: one text for each subscriber that has, or may get, a direct connection."""
+    if route.subscribers:
+        return [subscriber_text(one) for one in route.subscribers]
+    if route.transport == "relay" and route.condition:
+        return [f"relayed: {route.condition_text} (condition {route.condition})"]
+    return []
+
+
+def transport_remedy(one: SubscriberTransport) -> str:
+    """What to do about a subscriber that is relayed, or cannot be."""
+    return STUCK_REMEDY if one.stuck else _REMEDIES.get(one.condition, REMEDY)
+
+
+def fallbacks(route: RouteInfo) -> list[SubscriberTransport]:
+    """The subscribers that are relayed although their module's contract says ``direct``; without those by rule."""
+    return [
+        one
+        for one in route.subscribers
+        if one.wanted == "direct" and one.state == "relayed" and one.condition not in {BY_RULE, BY_TOOL}
+    ]
+
+
+def stuck(route: RouteInfo) -> list[SubscriberTransport]:
+    """The subscribers whose direct connection cannot be ended although they have to be relayed."""
+    return [one for one in route.subscribers if one.stuck]
+
+
+# The evidence of each health check: figures as text, their units in the keys, so that rqt can plot them.
+
+
+def number(value: float | None, scale: float = 1.0) -> str:
+    """Six significant digits; empty for ``None``."""
+    return "" if value is None else f"{value * scale:.6g}"
+
+
+def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
+    """The agent's own figures, and its counters by name."""
+    agent = snapshot.agent
+    known = {
+        "name": agent.name,
+        "GUID": agent.guid,
+        "domain": str(agent.domain),
+        "ROS core": agent.core_uri,
+        "core memory": agent.core_memory,
+        "version": agent.version,
+        "uptime (s)": number(agent.uptime),
+        "CPU (%)": number(agent.cpu),
+        "memory (MB)": number(agent.rss, 1e-6),
+        "open files": str(agent.files.open) if agent.files else "",
+        "limit of open files": str(agent.files.limit) if agent.files else "",
+        "peers": str(len(snapshot.peers)),
+        "linked": str(linked),
+        "proxies": str(agent.proxies),
+        "proxies' listening sockets": str(agent.proxy_sockets),
+        "real time": "; ".join(agent.realtime),
+        "certificate (h left)": number(snapshot.trust.expires - snapshot.taken, 1 / 3600) if snapshot.trust else "",
+    }
+    return _known(known) | {f"count {name}": str(count) for name, count in snapshot.counters.items()}
+
+
+def link_values(info: PeerInfo) -> dict[str, str]:
+    """The figures of a peer and its link."""
+    known = {"state": info.state, "GUID": info.guid, "address": ", ".join(info.addresses)}
+    link = info.link
+    if link is not None:
+        known |= {
+            "up (s)": number(link.up_ago),
+            "heard (ms ago)": number(link.heard_ago, 1e3),
+            "pace": "at rest" if link.rests else "in use",
+            "round trip (ms)": number(link.rtt, 1e3),
+            "clock offset (ms)": number(link.clock_offset, 1e3),
+            "clock error (± ms)": number(link.clock_error, 1e3),
+            "bytes in": str(link.bytes_in),
+            "bytes out": str(link.bytes_out),
+            "queued (B)": str(link.queued),
+            "dropped": str(link.dropped),
+            "topics in": str(info.topics_in),
+            "topics out": str(info.topics_out),
+        }
+    for bound in info.beyond:
+        known[f"{bound.kind} hidden here (limit {bound.limit})"] = str(bound.hidden)
+    return _known(known)
+
+
+def service_values(info: ServiceInfo) -> dict[str, str]:
+    """The figures of a service's calls across the mesh."""
+    known = {
+        "node": info.node,
+        "state": info.state,
+        "type": info.type,
+        "calls": str(info.calls),
+        "failed": str(info.failed),
+        "under way": str(info.active),
+        "last problem": info.problem,
+    }
+    return _known(known | _milliseconds("latency", info.latency, "p50", "p99", "max"))
+
+
+def route_values(route: RouteInfo) -> dict[str, str]:
+    """The figures of one source of a topic."""
+    period, latency = route.period, route.latency
+    known = {
+        "node": route.node,
+        "type": route.type,
+        "state": route.state,
+        "transport": route.transport,
+        "relayed by": route.condition if route.condition != BY_RULE else "",
+        "lane": route.lane,
+        "rate (Hz)": number(route.rate),
+        "bandwidth (B/s)": number(route.bandwidth),
+        "age (s)": number(route.age),
+    }
+    if period is not None:
+        known |= _milliseconds("period", period, "mean", "sd", "min", "max", "p99")
+        known["jitter (ms)"] = number(route.jitter, 1e3)
+    if latency is not None:
+        known |= _milliseconds("latency", latency, "p50", "p99", "max", "last")
+        known["latency error (± ms)"] = number(latency.error, 1e3)
+    if route.direction == "out":
+        known |= {"waiting": str(route.kept)}
+    if route.oversized:
+        known |= {"too long": str(route.oversized), "too long, last (B)": str(route.oversized_bytes)}
+    if route.messages or route.dropped or route.lost:
+        counted = ("messages", "lost", "late", "expired", "dropped")
+        known |= {name: str(getattr(route, name)) for name in counted}
+    for one in route.subscribers:
+        known |= _direct_values(one)
+    known |= {f"contract {key}": str(value) for key, value in route.contract.items()}
+    known |= {f"events {kind}": str(count) for kind, count in route.events.items()}
+    return _known(known)
+
+
+def _direct_values(one: SubscriberTransport) -> dict[str, str]:
+    """What is known of a subscriber that is connected directly."""
+    if one.transport != "direct":
+        return {}
+    known = {"to": one.endpoint, "since (s)": number(one.since_ago), "interruptions": str(one.interruptions or "")}
+    return {f"direct {one.node} {key}": value for key, value in known.items()}
+
+
+def _milliseconds(what: str, spread: SampleSpread | None, *fields: str) -> dict[str, str]:
+    if spread is None:
+        return {}
+    return {f"{what} {field} (ms)": number(getattr(spread, field), 1e3) for field in fields}
+
+
+def _known(values: dict[str, str]) -> dict[str, str]:
+    return {key: value for key, value in values.items() if value}
+
 
 HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
@@ -274,3 +496,83 @@ def _relayed(route: RouteInfo) -> str:
         return f"{route.state}, last message {route.age:.3g} s ago" if route.age is not None else route.state
     latency = f", {route.latency.p50 * 1e3:.2f} ms" if route.latency is not None else ""
     return f"{route.rate:.1f} Hz{latency}"
+
+
+# Publishes the agent's health on ``/diagnostics`` once a second (REP 107).
+#
+# The agent's own node publishes it, so it does not cross to other modules. Without a subscriber nothing is built.
+
+
+_log = logging.getLogger(__name__)
+
+TOPIC: Final = "/diagnostics"
+"""The topic of REP 107."""
+
+
+class Diagnostics(PublicationEvents):
+    """Publishes judged snapshots; follows the peers' clocks as often, and seldom while no link is in use.
+
+    Args:
+        core: The local core.
+        bridge: Has the node that publishes; started before.
+        snapshots: Builds what is judged.
+        clocks: The clocks of the peers.
+    """
+
+    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder, clocks: PeerClocks) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._snapshots = snapshots
+        self._clocks = clocks
+        self._clock = SystemClock()
+        self._health = Health()
+        self._sequence = 0
+        self._publication = Publication(
+            TOPIC,
+            bridge.node.name,
+            TopicDescription(ARRAY_TYPE, ARRAY_MD5, ARRAY_DEFINITION),
+            queue_messages=limits.DIAGNOSTICS_QUEUE,
+            events=self,
+        )
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Advertise, and publish once a second."""
+        node = self._bridge.node
+        node.add_publication(self._publication)
+        code, text, _ = self._core.call("registerPublisher", node.name, TOPIC, ARRAY_TYPE, node.uri)
+        if code != 1:
+            _log.error("! the local core does not take %s: %s", TOPIC, text)
+        self._again()
+
+    def close(self) -> None:
+        """Unadvertise."""
+        if self._timer is not None:
+            self._timer.cancel()
+        node = self._bridge.node
+        self._core.call("unregisterPublisher", node.name, TOPIC, node.uri)
+        node.remove_publication(TOPIC)
+
+    def _again(self) -> None:
+        used = self._publication.subscribers or any(not s.link.rests for s in self._bridge.sessions.linked())
+        self._timer = call_at_tick(limits.DIAGNOSTICS_INTERVAL if used else limits.CLOCKS_IDLE_INTERVAL, self._look)
+
+    def first_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._again()
+
+    def _look(self) -> None:
+        self._again()
+        self._clocks.follow(self._clock.now())
+        if self._publication.subscribers:
+            self._publish()
+
+    def _publish(self) -> None:
+        self._sequence += 1
+        snapshot, parts = self._snapshots.build(most=limits.DIAGNOSTICS_TOPICS), []
+        for check in self._health.judge(snapshot, self._clock.now()):
+            parts.append(diagnostic_status(check, snapshot.agent.name).serialize())
+            yield_to_data()
+        self._publication.publish_framed(frame_array(self._sequence, self._clock.wall_ns(), parts))

@@ -1,13 +1,231 @@
-"""The peers in an agent's snapshot: each peer of the roster, its link and the link's lanes.
-
-Times are seconds; ``…_ago`` counts back from the snapshot.
-"""
+"""The result of a check: one model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``."""
 
 from __future__ import annotations
 
-from typing import Final
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
+
+from rmpa.core.errors import ConfigError
+from rmpa.core.identity import peer_name_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+class CheckLevel(StrEnum):
+    """How bad a result is."""
+
+    OK = "ok"
+    WARN = "warn"
+    """It works, or may work: the first thing to check when something fails."""
+    FAIL = "fail"
+    """Something cannot work like this. ERROR on ``/diagnostics``."""
+    SKIPPED = "skipped"
+    """It could not be checked."""
+    UNKNOWN = "unknown"
+    """The agent that knows the answer did not reply; the walk along a path goes on."""
+    STALE = "stale"
+    """It existed before, and is gone (REP 107)."""
+
+
+OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL
+SKIPPED, UNKNOWN, STALE = CheckLevel.SKIPPED, CheckLevel.UNKNOWN, CheckLevel.STALE
+
+
+class Check(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One result of one check.
+
+    It crosses the mesh as a stage of ``rmpa why``, where ``level`` is called ``verdict``.
+
+    Attributes:
+        name: What was looked at: ``multicast``, ``clock``, a stage of a topic's path, a component of
+            ``/diagnostics``.
+        level: How bad it is.
+        text: What was seen, ready to read.
+        remedy: What to do, where something is to be done.
+        where: Which of several: an interface, a variable, a peer; empty where there is one only.
+        evidence: Figures by their name, as ``/diagnostics`` shows them; units stand in the names.
+    """
+
+    name: str
+    level: CheckLevel = msgspec.field(name="verdict")
+    text: str
+    remedy: str = ""
+    where: str = ""
+    evidence: dict[str, str] = {}
+
+    @classmethod
+    def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
+        """Split a message as ``message`` joins it: text after the first "; " replaces the given remedy."""
+        text, _, told = message.partition("; ")
+        return cls(name, level, text, told or remedy, where)
+
+    @property
+    def message(self) -> str:
+        """Text and remedy in one line."""
+        return f"{self.text}; {self.remedy}" if self.remedy else self.text
+
+
+def exit_code(checks: Iterable[Check]) -> int:
+    """The exit code of a command: 1 if something fails, else 0; warnings do not count."""
+    return int(any(check.level is FAIL for check in checks))
+
+
+# The terms of a topic's contract by the settings of a module, which the topic has before any route is open.
+
+
+class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
+    """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
+
+    Attributes:
+        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
+        rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
+            ``default``.
+    """
+
+    value: str | float | None
+    rule: str
+
+
+# What an agent tells its peers of itself: the answer to their question ``agent.info``.
+
+
+INFO: Final = "agent.info"
+"""The request for what an agent tells of itself."""
+
+
+class PeerAgent(msgspec.Struct, kw_only=True, frozen=True):
+    """An agent, as its peers may know it. Later releases may add fields; each is optional.
+
+    Attributes:
+        version: Of RMPA; empty where it is not told.
+        uptime: Seconds since it started.
+        core_uri: Its ROS core's, as in ROS_MASTER_URI of its own module.
+        cpu: Share of one core over the last second or longer, in percent.
+        rss: Resident memory, bytes.
+        files_open: File descriptors that are open.
+        files_limit: How many it may have.
+        proxies: The number of proxies of peers' nodes in its graph.
+    """
+
+    version: str = ""
+    uptime: float | None = None
+    core_uri: str = ""
+    cpu: float | None = None
+    rss: int | None = None
+    files_open: int | None = None
+    files_limit: int | None = None
+    proxies: int | None = None
+
+
+# Other sites as a gateway sees them: what ``rmpa site`` shows.
+
+
+class SiteModuleInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """A module of a site.
+
+    Attributes:
+        name: The module.
+        instance: Its run, 32 hexadecimal digits.
+        topics: Its topics that its site offers, each publisher counted.
+        services: Its services that its site offers.
+        shown: How many of both are in the graph here; for a module of this site: how many are offered.
+    """
+
+    name: str
+    instance: str = ""
+    topics: int = 0
+    services: int = 0
+    shown: int = 0
+
+
+class SiteSourceInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """A topic of one publisher, or a service, of a site.
+
+    Attributes:
+        kind: ``topic`` or ``service``.
+        module: The module.
+        node: The node in its module's graph.
+        name: Its name there.
+        type: ``package/Name``; ``*`` for a service whose server was not asked.
+        here: Its name in the gateway's graph; empty if it is not shown.
+        problem: Why it does not cross, or does not work; empty for nothing.
+    """
+
+    kind: str
+    module: str
+    node: str
+    name: str
+    type: str = "*"
+    here: str = ""
+    problem: str = ""
+
+
+class SiteInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """A site.
+
+    Attributes:
+        name: The site.
+        state: ``this site``; ``joined``; ``no gateway``: its modules are announced and no gateway leads it;
+            ``unreachable``: it was there, and is not now.
+        since_ago: Seconds since that is so; ``None``: unknown.
+        gateways: How many gateways it has.
+        modules: Its modules.
+        sources: What it offers, in ``rmpa site info`` alone.
+        not_shown: How many sources a rule or a conflict of names keeps out.
+        beyond: Sources that were left out because there are too many.
+    """
+
+    name: str
+    state: str = "joined"
+    since_ago: float | None = None
+    gateways: int = 0
+    modules: tuple[SiteModuleInfo, ...] = ()
+    sources: tuple[SiteSourceInfo, ...] = ()
+    not_shown: int = 0
+    beyond: int = 0
+
+
+class SitesReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What one gateway joins.
+
+    Attributes:
+        gateway: The gateway's name among its peers.
+        site: Its site.
+        leads: Whether it is the one that exports and imports.
+        rank: Of gateways of one site the lowest leads.
+        problem: Why no other site can be reached; empty for nothing.
+        endpoints: The Zenoh endpoints that it is connected to.
+        sites: This site first, then the others.
+    """
+
+    gateway: str
+    site: str
+    leads: bool = False
+    rank: int = 0
+    problem: str = ""
+    endpoints: tuple[str, ...] = ()
+    sites: tuple[SiteInfo, ...] = ()
+
+
+def read_site_module(text: str) -> tuple[str, str]:
+    """Split ``warehouse/arm`` into the site and the module.
+
+    Raises:
+        ConfigError: It is not the name of a site and of a module.
+    """
+    site, slash, module = text.partition("/")
+    if not slash or peer_name_problem(site) is not None or peer_name_problem(module) is not None:
+        raise ConfigError("SITE/MODULE", f"{text!r} is not a site and a module", "write one as warehouse/arm")
+    return site, module
+
+
+# The peers in an agent's snapshot: each peer of the roster, its link and the link's lanes.
+#
+# Times are seconds; ``…_ago`` counts back from the snapshot.
+
 
 FOREIGN: Final = "foreign"
 """The state of a module that is heard, or refuses this one, because it is not of this mesh."""

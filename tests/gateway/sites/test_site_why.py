@@ -27,8 +27,8 @@ from rmpa.gateway.sites.why import (
     parse_ways,
     sent_stages,
 )
-from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
+from rmpa.observe.control_client import INFO, PARAM, REPORT, WHY
+from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.documents import Permissions
@@ -36,7 +36,7 @@ from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 
 if TYPE_CHECKING:
-    from rmpa.observe.sites import SitesReport
+    from rmpa.observe.peer_info import SitesReport
     from tests.gateway.sites.site_bed import Site, SiteBed
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")

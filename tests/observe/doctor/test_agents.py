@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from rmpa.observe.check import Check, CheckLevel, exit_code
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.peer_info import FOREIGN, PeerInfo
+from rmpa.observe.peer_info import FOREIGN, Check, CheckLevel, PeerInfo, exit_code
 from rmpa.observe.snapshot import FilesInfo, UnreachableInfo
 from tests.observe.samples import SNAPSHOT
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.observe.check import CheckLevel
-from rmpa.observe.doctor.exposed_nodes import is_beyond_loopback, judge_exposed_nodes
+from rmpa.observe.doctor.agents import is_beyond_loopback, judge_exposed_nodes
+from rmpa.observe.peer_info import CheckLevel
 
 
 def test_without_trust_no_ports_are_listed() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.observe.check import CheckLevel
-from rmpa.observe.doctor.firewall import judge_rules, names_port, read_iptables, read_nft
+from rmpa.observe.doctor.network import judge_rules, names_port, read_iptables, read_nft
+from rmpa.observe.peer_info import CheckLevel
 
 PORTS = frozenset({11411, 40001})
 NFT_OPEN = """\

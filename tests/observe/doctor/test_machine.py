@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from rmpa.observe.check import CheckLevel
 from rmpa.observe.doctor.machine import (
     KernelRights,
     WallClock,
@@ -15,6 +14,7 @@ from rmpa.observe.doctor.machine import (
     judge_rights,
     judge_sim_time,
 )
+from rmpa.observe.peer_info import CheckLevel
 
 GOOD = WallClock(stepped=0.00001, synchronised=True, error=0.004, year=2026)
 FREE = KernelRights(fifo="", memlock=None, wanted=True, files=65536)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.doctor.agents import judge_membership
+from rmpa.observe.peer_info import FAIL, OK, WARN
 from rmpa.trust.joining import TrustStatus
 
 WALL = 1_790_000_000.0

@@ -6,7 +6,6 @@ from ipaddress import IPv4Interface
 
 import pytest
 
-from rmpa.observe.check import Check, CheckLevel, exit_code
 from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
@@ -19,6 +18,7 @@ from rmpa.observe.doctor.network import (
     judge_routes,
     judge_rp_filter,
 )
+from rmpa.observe.peer_info import Check, CheckLevel, exit_code
 
 LO = NetworkInterface("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
 WLAN = NetworkInterface("wlan0", (IPv4Interface("192.168.1.5/24"),))

@@ -14,8 +14,13 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.observe.control import ControlReply
-from rmpa.observe.io.control_server import ControlServer
-from rmpa.observe.io.peer_credentials import ControlAccess, PeerCredentials, control_access, peer_credentials
+from rmpa.observe.control_server import (
+    ControlAccess,
+    ControlServer,
+    PeerCredentials,
+    control_access,
+    peer_credentials,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path

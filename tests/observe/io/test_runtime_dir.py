@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.observe.io import runtime_dir as module
-from rmpa.observe.io.runtime_dir import NameLock, make_runtime_dir, runtime_dir, runtime_dirs
+from rmpa.observe import control_client as module
+from rmpa.observe.control_client import NameLock, make_runtime_dir, runtime_dir, runtime_dirs
 
 HOLD = """
 import sys, signal
 from pathlib import Path
-from rmpa.observe.io.runtime_dir import NameLock
+from rmpa.observe.control_client import NameLock
 lock = NameLock(Path(sys.argv[1]), "base")
 print("held", flush=True)
 sys.stdin.read()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.observe.check import CheckLevel
+from rmpa.observe.peer_info import CheckLevel
 from rmpa.observe.snapshot import SubscriberTransport
 from tests.observe.why.test_topics import PEER, ROUTE, SOURCE, Case, connected
 

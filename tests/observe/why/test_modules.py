@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.observe.peer_agent import PeerAgent
-from rmpa.observe.peer_info import BoundInfo, LaneInfo, PeerInfo
-from rmpa.observe.why.modules import diagnose_module
+from rmpa.observe.peer_info import BoundInfo, LaneInfo, PeerAgent, PeerInfo
+from rmpa.observe.why.why import diagnose_module
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why.test_topics import LINK, PEER
 

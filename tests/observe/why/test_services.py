@@ -8,7 +8,7 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.peer_info import Check, CheckLevel
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport, diagnose_service
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from rmpa.config import limits as config_limits
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.peer_info import LinkInfo, PeerInfo
+from rmpa.observe.peer_info import Check, CheckLevel, LinkInfo, PeerInfo
 from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
     BothEnds,

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.observe import limits
-from rmpa.observe.graph_changes import GraphHistory, GraphRows, ServiceRow, TopicRow
+from rmpa.observe.control import GraphHistory, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.web.hub.graph_table import GraphTable, rows_of

@@ -26,10 +26,9 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
-from rmpa.observe.peer_agent import PeerAgent
-from rmpa.observe.peer_info import LaneInfo
+from rmpa.observe.peer_info import LaneInfo, PeerAgent
 from rmpa.observe.snapshot import Snapshot
-from rmpa.observe.why.modules import diagnose_module
+from rmpa.observe.why.why import diagnose_module
 from rmpa.web.hub import requests
 from rmpa.web.hub.rights import FULL
 from rmpa.web.monitor import session as monitor

@@ -7,8 +7,8 @@ import functools
 import secrets
 from typing import TYPE_CHECKING, Any
 
-from rmpa.observe.io.control_server import ControlServer
-from rmpa.observe.io.graph_revision import GraphRevisions
+from rmpa.observe.control import GraphRevisions
+from rmpa.observe.control_server import ControlServer
 from rmpa.web.server.graph_signal import GraphSignal
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node, running_hub
@@ -16,7 +16,7 @@ from tests.web.hub.client import local_core, node, running_hub
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.observe.graph_changes import GraphRevision
+    from rmpa.observe.control import GraphRevision
     from rmpa.web.hub.hub import Hub
 
 

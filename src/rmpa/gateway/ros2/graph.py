@@ -16,7 +16,7 @@ from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2En
 from rmpa.gateway.ros2.pairs import described_types
 from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
 from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
-from rmpa.observe.check import FAIL, OK, WARN, Check
+from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
-from rmpa.observe.io.site_requests import INFO, REPORT, WHY
-from rmpa.observe.sites import SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.control_client import INFO, REPORT, WHY
+from rmpa.observe.peer_info import SiteInfo, SiteSourceInfo, SitesReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.services import Ros2Part
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
-    from rmpa.observe.io.site_requests import SiteAnswerer
+    from rmpa.observe.control_client import SiteAnswerer
     from rmpa.observe.why.diagnosis import Diagnosis
 
 

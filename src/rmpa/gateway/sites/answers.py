@@ -18,8 +18,8 @@ from rmpa.gateway.sites.plans import SitePart
 from rmpa.gateway.sites.services import SiteActions, SiteServiceExports, SiteServiceImports
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.why import ACCESS, SiteWhy
-from rmpa.observe.io.site_requests import INFO, PARAM, REPORT, WHY
-from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.control_client import INFO, PARAM, REPORT, WHY
+from rmpa.observe.peer_info import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust.documents import refusal
 

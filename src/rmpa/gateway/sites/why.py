@@ -15,7 +15,7 @@ from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import GATEWAY, ROOT
-from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 from rmpa.ros.wire.tcpros import printable
 

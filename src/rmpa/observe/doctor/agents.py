@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import asyncio
+from collections import Counter, defaultdict
+from ipaddress import ip_address
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
+from rmpa.bridge.proxies import proxied_peer
 from rmpa.core.counters import remedy
+from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
-from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock
-from rmpa.observe.transport_text import fallbacks, stuck, subscriber_text
-from rmpa.observe.transport_text import remedy as remedy_for
+from rmpa.observe.health import fallbacks, stuck, subscriber_text
+from rmpa.observe.health import transport_remedy as remedy_for
+from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
+from rmpa.ros.http.rpc import call_api
+from rmpa.runtime.tcp_connections import listening_sockets
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot, UnreachableInfo
+    from rmpa.runtime.tcp_connections import ListeningSocket
     from rmpa.trust.joining import TrustStatus
-
 
 _PERMISSION: Final = "permission."
 """The counters of what ``[[permission]]`` refused begin so."""
@@ -166,3 +174,132 @@ def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
         yield Check("peer", WARN, text, advice, where=both)
     if link.clock_offset is not None:
         yield judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
+
+
+# Judges which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/security.md).
+
+
+_NAME: Final = "exposed nodes"
+_LISTED: Final = 5
+_REMEDY: Final = (
+    "start them with ROS_IP=127.0.0.1 (roscpp's XML-RPC port stays open), and let a firewall drop what comes from "
+    "outside to them (docs/security.md)"
+)
+_DIRECT: Final = "; direct transport needs them open, and crosses the network unprotected"
+
+
+def judge_exposed_nodes(
+    agent: str, exposed: Mapping[str, tuple[int, ...]] | None, *, trusted: bool, direct: bool = False
+) -> Check:
+    """Whether other machines reach the nodes of one agent's core past the agent.
+
+    Args:
+        agent: The agent's name.
+        exposed: The TCP ports, beyond loopback, of each node that has some; ``None``: they cannot be read.
+        trusted: Whether the module is in a secured mesh; else nothing is protected, and no ports are listed.
+        direct: Whether the settings allow direct transport.
+    """
+    if not trusted:
+        return Check(_NAME, SKIPPED, "trust is off: the mesh is open too (rmpa trust init)", where=agent)
+    if exposed is None:
+        return Check(_NAME, SKIPPED, "the core or the kernel does not tell the nodes' ports", where=agent)
+    if not exposed:
+        return Check(_NAME, OK, "every node listens on loopback alone", where=agent)
+    listed = [f"{node} ({', '.join(map(str, ports))})" for node, ports in sorted(exposed.items())]
+    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    text = f"other machines reach {', '.join(listed[:_LISTED])}{more} without any check"
+    return Check(_NAME, WARN, text, _REMEDY + (_DIRECT if direct else ""), where=agent)
+
+
+def is_beyond_loopback(address: str) -> bool:
+    """Whether a socket that listens at an address is reached from other machines."""
+    try:
+        return not ip_address(address).is_loopback
+    except ValueError:
+        return True
+
+
+# Finds the TCP ports of a core's nodes that other machines reach.
+
+
+_CALLER: Final = "/rmpa_doctor"
+_AGENTS_OWN: Final = ("/rmpa", "/rosout")
+
+
+def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] | None:
+    """The TCP ports, beyond loopback, of each node of a core; those of the agent and its proxies are left out.
+
+    A node is found by the port of its slave API; its other ports are those of the same process, where this user may
+    see its descriptors.
+
+    Returns:
+        Ports by node; ``None`` where the core or the kernel does not tell.
+    """
+    sockets = listening_sockets()
+    if sockets is None:
+        return None
+    try:
+        nodes = asyncio.run(_slave_ports(core_uri))
+    except (RmpaError, OSError, ValueError, TimeoutError):
+        return None
+    return exposed_ports(nodes, sockets, owners({each.inode for each in sockets}), agent_pid)
+
+
+def exposed_ports(
+    nodes: Mapping[str, int], sockets: Sequence[ListeningSocket], processes: Mapping[int, int], agent_pid: int
+) -> dict[str, tuple[int, ...]]:
+    """The ports beyond loopback of each node.
+
+    Args:
+        nodes: The port of each node's slave API.
+        sockets: All sockets that listen.
+        processes: The process of each socket, by its inode, where it is known.
+        agent_pid: The agent's process, whose sockets are its own affair.
+    """
+    by_process, by_port = defaultdict(set), defaultdict(set)
+    for each in sockets:
+        by_port[each.port].add(each)
+        if each.inode in processes:
+            by_process[processes[each.inode]].add(each)
+    found: dict[str, tuple[int, ...]] = {}
+    for node, port in nodes.items():
+        owners_of_it = {processes[each.inode] for each in by_port[port] if each.inode in processes}
+        if agent_pid in owners_of_it:
+            continue
+        its = by_port[port].union(*(by_process[pid] for pid in owners_of_it))
+        ports = {each.port for each in its if is_beyond_loopback(each.address)}
+        if ports:
+            found[node] = tuple(sorted(ports))
+    return found
+
+
+async def _slave_ports(core_uri: str) -> dict[str, int]:
+    async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
+        state = (await call_api(core_uri, "getSystemState", _CALLER)).value
+        kinds = state if isinstance(state, list) else []
+        rows = [row for kind in kinds if isinstance(kind, list) for row in kind if isinstance(row, list)]
+        names = {str(node) for row in rows if len(row) == 2 and isinstance(row[1], list) for node in row[1]}
+        own = [name for name in names if proxied_peer(name) is None and name not in _AGENTS_OWN]
+        found = {}
+        for name in sorted(own)[: limits.DOCTOR_NODES_MAX]:
+            uri = (await call_api(core_uri, "lookupNode", _CALLER, name)).value
+            port = urlsplit(uri).port if isinstance(uri, str) else None
+            if port:
+                found[name] = port
+        return found
+
+
+def owners(inodes: set[int]) -> dict[int, int]:
+    """The process of each socket that this user may see, by the socket's inode."""
+    found = {}
+    for process in Path("/proc").iterdir():
+        if not process.name.isdecimal():
+            continue
+        try:
+            for link in (process / "fd").iterdir():
+                target = str(link.readlink())
+                if target.startswith("socket:[") and (inode := int(target[8:-1])) in inodes:
+                    found[inode] = int(process.name)
+        except OSError:  # of another user, or ended meanwhile
+            continue
+    return found

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Final, Self
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.observe.check import FAIL, OK, Check
+from rmpa.observe.health import UNMEASURED, fallbacks, route_texts, stuck, transport_remedy
+from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.trust.documents import prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.observe.snapshot import Snapshot
-
+    from rmpa.observe.snapshot import RouteInfo, Snapshot, SubscriberTransport
 
 PERMISSION_THERE: Final = "permission there"
 """The stage of what the publisher's (server's) module lets this one do."""
@@ -248,3 +248,43 @@ class BothEnds:
     here: TopicAtSubscriber
     there: TopicAtPublisher | None = None
     refusal: str = ""
+
+
+# The stages of ``rmpa why`` for subscribers that are connected to the publisher directly. Pure.
+#
+# Their messages do not pass the agents: after the transport there is the connection alone.
+
+
+def connected_directly(route: RouteInfo) -> list[SubscriberTransport]:
+    """The subscribers of a route that were answered the publisher's own address."""
+    return [one for one in route.subscribers if one.transport == "direct"]
+
+
+def transport(route: RouteInfo) -> Check:
+    """The transport of each subscriber, and by which condition it is relayed. It is never the stage that fails."""
+    text = "; ".join(route_texts(route)) or "relayed"
+    troubled = [*stuck(route), *fallbacks(route)]
+    if troubled:
+        return Check("transport", WARN, text, transport_remedy(troubled[0]))
+    return Check("transport", OK, text)
+
+
+def connection(route: RouteInfo) -> Check:
+    """The direct subscribers of a route; their agent looks each second whether the connections stand."""
+    text = ", ".join(f"{one.node} is connected to {one.endpoint}" for one in connected_directly(route))
+    return Check("connection", OK, f"{text}; {UNMEASURED}")
+
+
+def adrift_stages(link: Check, route: RouteInfo) -> tuple[Check, ...]:
+    """Judge the direct subscribers of a peer whose agent has died: their messages go on without it.
+
+    Args:
+        link: The stage of the link, which fails.
+        route: The route.
+    """
+    text = f"{link.text}; without its agent only what is connected directly goes on"
+    return (
+        Check("link", WARN, text, f"start the agent of {route.peer} again: it takes the direct connections over"),
+        transport(route),
+        connection(route),
+    )

@@ -19,17 +19,20 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
+from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
     PERMISSION_HERE,
     PERMISSION_THERE,
     UNASKED,
     Diagnosis,
+    adrift_stages,
+    connected_directly,
+    connection,
     permission_here,
     permission_there,
+    transport,
     until_failure,
 )
-from rmpa.observe.why.direct_stages import adrift_stages, connected_directly, connection, transport
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from rmpa.web.hub.graph_table import GraphTable, rows_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.observe.graph_changes import GraphRows
+    from rmpa.observe.control import GraphRows
     from rmpa.ros.node.node import Node
     from rmpa.web.hub.clients import Key
     from rmpa.web.hub.node_link import NodeLink

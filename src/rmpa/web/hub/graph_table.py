@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.observe.graph_changes import GraphRows, ServiceRow, TopicRow
+from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
 from rmpa.web.hub.requests import GraphService, GraphTopic

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.snapshot_decoder import SnapshotDecoder
+from rmpa.observe.control import SnapshotDecoder
+from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.web import limits
 
 if TYPE_CHECKING:

@@ -11,9 +11,8 @@ import msgspec
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.graph_changes import GraphRevision
-from rmpa.observe.io.control_client import choose_agent, same_core
+from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision
+from rmpa.observe.control_client import choose_agent, same_core
 from rmpa.web import limits
 
 if TYPE_CHECKING:

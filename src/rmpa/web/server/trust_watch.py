@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe.control import ControlRequest
-from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.trust.joining import TrustStatus
 from rmpa.web import limits
 from rmpa.web.server.graph_signal import ask, control_stream
@@ -17,7 +17,7 @@ from rmpa.web.server.graph_signal import ask, control_stream
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rmpa.observe.io.control_client import FoundAgent
+    from rmpa.observe.control_client import FoundAgent
     from rmpa.observe.snapshot import Snapshot
 
 _log = logging.getLogger(__name__)

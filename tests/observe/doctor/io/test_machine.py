@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rmpa.observe.doctor.io.machine import read_sim_time
+from rmpa.observe.doctor.machine import read_sim_time
 from rmpa.ros.core.embedded import RosCore
 
 

@@ -1,19 +1,26 @@
-"""The peers' part of the snapshot: what discovery, mesh and bridge know of each."""
+"""The parameters of a peer's module, read and written through this machine's agent."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from rmpa.observe.io.direct_section import direct_counts
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.params import rules as transfer
+from rmpa.bridge.params.rules import key_problem
+from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
+from rmpa.discovery import limits
 from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo
-from rmpa.observe.shared_address import mark_shared_addresses
+from rmpa.observe.topics_section import direct_counts
+from rmpa.ros.master.parameters import leaves
+from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 from rmpa.runtime.loop import SystemClock, yield_to_data
 from rmpa.trust.certificates import not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
     from rmpa.bridge.services.part import Services
@@ -24,7 +31,140 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import LaneSender, PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.keepalive import PeerStatus
+    from rmpa.observe.control_client import ControlClient
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.runtime.stream import Stream
+
+
+def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
+    """The parameters in a value, each with its name.
+
+    Raises:
+        RmpaError: A name in it is not a parameter's.
+    """
+    found = list(leaves(key, value))
+    for name, one in found:
+        if name == "/":
+            raise RmpaError(f"the root can only be set to a dictionary, not to {one!r}")
+        if problem := key_problem(name):
+            raise RmpaError(problem)
+    return found
+
+
+@dataclass
+class PeerParams:
+    """The parameters of a peer's module, through both agents; each call blocks.
+
+    Args:
+        client: Asks this machine's agent.
+        peer: The peer's name or GUID.
+    """
+
+    client: ControlClient
+    peer: str
+
+    @property
+    def title(self) -> str:
+        """The peer, for error texts."""
+        return self.peer
+
+    def get(self, key: str) -> XmlRpcValue:
+        """A value, or a namespace.
+
+        Raises:
+            RmpaError: There is none, or the peer does not answer or refuses.
+        """
+        return self._value(transfer.GET, key=key)
+
+    def names(self) -> list[str]:
+        """The names of all parameters that may be read, in order; errors as for ``get``."""
+        value = self._value(transfer.NAMES)
+        return sorted(str(name) for name in value) if isinstance(value, list) else []
+
+    def set(self, key: str, value: XmlRpcValue) -> int:
+        """Set a parameter, or each member of a namespace; return the number. Errors as for ``get``."""
+        parameters_in(key, value)
+        try:
+            text = serialize_response(value)
+        except LocalProtocolError as error:
+            raise RmpaError(f"{key}: {error}") from None
+        if len(text) > bridge_limits.PARAM_TEXT_MAX:
+            raise RmpaError(transfer.too_large(key, len(text)))
+        return transfer.count_of(self._ask(transfer.SET, key=key, text=text.decode()))
+
+    def delete(self, key: str) -> None:
+        """Delete a parameter or namespace; errors as for ``get``."""
+        self._ask(transfer.DELETE, key=key)
+
+    def _value(self, what: str, **args: str) -> XmlRpcValue:
+        return parse_response(transfer.text_of(self._ask(what, **args)).encode())
+
+    def _ask(self, what: str, **args: str) -> object:
+        try:
+            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, **args)
+        except PeerRefused as error:
+            raise RmpaError(error.reason) from None  # this agent only passes on the answer of the peer's agent
+
+
+# Finds peers that share an IP address with another machine.
+#
+# Each agent has a mesh port of its own, so the GUIDs of two machines with one address differ, and the roster takes
+# them
+# for two agents of one machine. TCP shows the difference: the beacons of both arrive, because multicast needs no
+# reply,
+# but connections to the address reach only one machine, and it refuses the other machine's port.
+
+
+def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tuple[PeerInfo, ...]:
+    """Set the state ``conflict`` for peers whose address seems to be another machine's too.
+
+    Args:
+        peers: All peers.
+        own: This machine's addresses.
+
+    Returns:
+        The same peers in the same order.
+    """
+    holders: dict[str, list[PeerInfo]] = {}
+    for peer in peers:
+        holders.setdefault(_address(peer), []).append(peer)
+    return tuple(_marked(peer, holders[_address(peer)], own) if _unreachable_by_tcp(peer) else peer for peer in peers)
+
+
+def _address(peer: PeerInfo) -> str:
+    return peer.guid.rpartition(":")[0]
+
+
+def _unreachable_by_tcp(peer: PeerInfo) -> bool:
+    """Whether its beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``."""
+    return (
+        peer.state == "linking"
+        and peer.since_ago >= limits.ADDRESS_SHARED_AFTER
+        and peer.beacon_ago is not None
+        # An agent that was killed sends no beacons after its link has fallen.
+        and peer.beacon_ago < peer.since_ago - limits.ADDRESS_SHARED_MARGIN
+        and not _address(peer).startswith("127.")
+    )
+
+
+def _marked(peer: PeerInfo, holders: Sequence[PeerInfo], own: Collection[str]) -> PeerInfo:
+    address = _address(peer)
+    others = [f"peer {other.name}" for other in holders if other is not peer]
+    if address in own:
+        others.append("this machine")
+    if not others:
+        return peer
+    port = peer.guid.partition("#")[0].rpartition(":")[2]
+    text = (
+        f"its address {address} is also that of {' and '.join(others)}, and its port {port} does not answer there: "
+        "two machines seem to have one address; give one of them another (was an image copied with its address?), "
+        f"or, if both run on one machine, open port {port} in its firewall"
+    )
+    return msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text))
+
+
+# The peers' part of the snapshot: what discovery, mesh and bridge know of each.
+
 
 _DENY: Final = {"services": "services.deny"}
 """The setting that denies things of a kind, where it is not ``bridge.deny``."""

@@ -1,7 +1,8 @@
-"""The topics in the snapshot: the local graph, the routes across the mesh, and their figures."""
+"""Direct transport in the snapshot: which subscribers of a route are direct, and why others are relayed."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, cast
@@ -9,15 +10,25 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from rmpa.bridge.data.export import ReliableRouteSender
-from rmpa.bridge.data.quality import shown_seconds
+from rmpa.bridge.data.quality import PeerClockHistory, shown_seconds
+from rmpa.bridge.direct.grants import Want
+from rmpa.bridge.direct.nodes import Condition, unmet_by_contract
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, PolicyDecision, is_own
 from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
-from rmpa.core.contract import KEYS, Contract
-from rmpa.observe.contract_term import ContractTerm
-from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
+from rmpa.core.contract import KEYS, Contract, Transport
+from rmpa.observe.peer_info import ContractTerm
+from rmpa.observe.snapshot import (
+    EventInfo,
+    LatencyInfo,
+    RouteInfo,
+    SampleSpread,
+    SubscriberTransport,
+    TopicInfo,
+    UnreachableInfo,
+)
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
 
@@ -25,15 +36,169 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.data.quality import PeerClockHistory, QosWatch, QualitySummary
+    from rmpa.bridge.data.quality import QosWatch, QualitySummary
     from rmpa.bridge.data.route import ReceptionHistory
+    from rmpa.bridge.direct.paths import Interruption, Path
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.config.settings import Settings
-    from rmpa.observe.io.direct_section import DirectSection
-    from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.ros.core.api import Core
+
+
+class DirectSection:
+    """Reads what the bridge knows of direct transport; changes nothing.
+
+    Args:
+        bridge: The agent's bridge.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+
+    def inbound(self, info: RouteInfo, peer: int, source: Source, contract: Contract, now: float) -> RouteInfo:
+        """Add the transport to a route from a peer.
+
+        Args:
+            info: The route.
+            peer: The number of the peer's session.
+            source: The source, by its wire name.
+            contract: This module's for the topic.
+            now: Monotonic seconds.
+        """
+        topics = self._bridge.topics
+        session = self._bridge.sessions.get(peer)
+        publication = topics.of(session).publication(source) if session is not None else None
+        relayed = publication is not None and publication.subscribers > 0
+        known = topics.direct_imports.interruptions
+        subscribers = tuple(
+            _interrupted(
+                _subscriber(path, now),
+                known.get(session.link.name, path.want) if session is not None else None,
+                now,
+            )
+            for path in topics.direct_imports.of(peer, source.topic, source.node)
+        )
+        direct = any(one.transport == "direct" for one in subscribers)
+        condition, text = _condition(subscribers)
+        if relayed and not condition and contract.transport is Transport.RELAY:
+            unmet = unmet_by_contract(contract, "this module")
+            condition, text = (unmet.condition.value, unmet.text) if unmet is not None else ("", "")
+        return msgspec.structs.replace(
+            info,
+            transport=_transport(direct=direct, relayed=relayed),
+            condition=condition,
+            condition_text=text,
+            subscribers=subscribers,
+        )
+
+    def outbound(self, info: RouteInfo, peer: int, source: Source) -> RouteInfo:
+        """Add the transport to a route to a peer that is relayed at present."""
+        subscribers = self.granted_to(peer, source)
+        transport = _transport(direct=bool(subscribers), relayed=info.state == "open")
+        return msgspec.structs.replace(info, transport=transport, subscribers=subscribers)
+
+    def granted(self, source: Source) -> list[int]:
+        """The peers that have subscribers with a direct connection to a local source."""
+        grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
+        return list(dict.fromkeys(peer for peer, _, _ in grants))
+
+    def granted_to(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
+        """A peer's subscribers that may connect to a local source directly, by name."""
+        exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
+        wants = [
+            (Want(source.topic, source.node, name), grant)
+            for owner, name, grant in exports.of(source.topic, source.node)
+            if owner == peer
+        ]
+        return tuple(
+            _interrupted(
+                SubscriberTransport(node=want.user, transport="direct", state="granted", endpoint=str(grant.port)),
+                exports.interruptions.get(session.link.name, want) if session is not None else None,
+                asyncio.get_running_loop().time(),
+            )
+            for want, grant in wants
+        )
+
+
+def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
+    """The number of direct connections to a peer's publishers, and of the grants that it has here."""
+    there = sum(path.peer == peer and path.endpoint is not None for path in bridge.topics.direct_imports)
+    return there, sum(owner == peer for owner, _, _ in bridge.topics.direct_exports)
+
+
+def _interrupted(one: SubscriberTransport, found: Interruption | None, now: float) -> SubscriberTransport:
+    """A subscriber with when it was without its path."""
+    if found is None:
+        return one
+    ended = now if found.ended is None else found.ended
+    return msgspec.structs.replace(
+        one,
+        interruptions=found.count,
+        interrupted=ended - found.began,
+        interrupted_ago=None if found.ended is None else now - ended,
+    )
+
+
+def _transport(*, direct: bool, relayed: bool) -> str:
+    if direct:
+        return "both" if relayed else "direct"
+    return "relay" if relayed else ""
+
+
+def _condition(subscribers: tuple[SubscriberTransport, ...]) -> tuple[str, str]:
+    """The condition by which a route's subscribers are relayed; RMPA's own tools count only if there is no other."""
+    relayed = [one for one in subscribers if one.state == "relayed"]
+    relayed.sort(key=lambda one: one.condition == Condition.MEASURES)
+    return (relayed[0].condition, relayed[0].text) if relayed else ("", "")
+
+
+def _subscriber(path: Path, now: float) -> SubscriberTransport:
+    endpoint = path.endpoint
+    unmet = path.unmet
+    return SubscriberTransport(
+        node=path.want.user,
+        transport="direct" if endpoint is not None else "relay" if path.answered else "",
+        state=path.state,
+        since_ago=now - (path.answered_at if endpoint is not None else path.since),
+        wanted=path.wanted.value,
+        endpoint=f"{endpoint[0]}:{endpoint[1]}" if endpoint is not None else "",
+        condition=unmet.condition.value if unmet is not None else "",
+        text=unmet.text if unmet is not None else "",
+        stuck=path.stuck,
+    )
+
+
+# The clocks of all peers over the last minute; those of peers that are away for a moment are kept.
+
+
+class PeerClocks:
+    """Records each link's estimate of its peer's clock; ``follow`` is called once a second.
+
+    Args:
+        bridge: Has the links.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._clocks: dict[int, PeerClockHistory] = {}
+
+    def __getitem__(self, peer: int) -> PeerClockHistory:
+        """The clock of a peer, by its session's number."""
+        return self._clocks[peer]
+
+    def follow(self, now: float) -> None:
+        """Record the present estimates; forget peers that are gone. ``now`` is monotonic seconds."""
+        before, self._clocks = self._clocks, {}
+        for session in self._bridge.sessions:
+            clock = self._clocks[session.peer] = before.get(session.peer) or PeerClockHistory()
+            offset, error = session.link.clock_offset, session.link.clock_error
+            if offset is not None and error is not None and session.linked:
+                clock.add(offset, error, now)
+
+
+# The topics in the snapshot: the local graph, the routes across the mesh, and their figures.
+
 
 _DEFAULT = Contract()
 

@@ -1,0 +1,511 @@
+"""The blocking client of the control socket, and the search for this machine's agents; for the command line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
+from urllib.parse import urlsplit
+
+import msgspec
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.messages import with_text
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
+from rmpa.config.module_name import NameFacts, running_agent
+from rmpa.config.peer_rules import Access
+from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.limits import KIB
+from rmpa.observe import limits
+from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply, ControlRequest
+from rmpa.observe.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from types import TracebackType
+
+    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.observe.control import SnapshotDecoder
+    from rmpa.observe.snapshot import AgentInfo
+
+
+# The directory of the control sockets, and the lock that keeps agents' names apart.
+
+
+_SYSTEM: Final = Path("/run/rmpa")
+_REMEDY: Final = "set RMPA_RUNTIME_DIR to a directory of your own"
+
+
+def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
+    """The directory for a new agent of this user; it need not exist yet.
+
+    Args:
+        environ: Has RMPA_RUNTIME_DIR and XDG_RUNTIME_DIR, or not.
+        setting: ``Settings.runtime_dir``; empty for the usual place.
+    """
+    if setting or environ.get("RMPA_RUNTIME_DIR"):
+        return Path(setting or environ["RMPA_RUNTIME_DIR"])
+    if environ.get("XDG_RUNTIME_DIR"):
+        return Path(environ["XDG_RUNTIME_DIR"]) / "rmpa"
+    if os.geteuid() == 0 and os.access(_SYSTEM.parent, os.W_OK):
+        return _SYSTEM
+    return Path(f"/tmp/rmpa-{os.geteuid()}")  # noqa: S108 - made with mode 0700, its owner checked
+
+
+def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:
+    """The directories in which a client looks for agents: those that exist and that it may read.
+
+    With RMPA_RUNTIME_DIR that one alone; else every usual one, since ``sudo`` and ``systemd`` drop variables.
+    """
+    places = [runtime_dir(environ)]
+    if not environ.get("RMPA_RUNTIME_DIR"):
+        places += [_SYSTEM, Path(f"/run/user/{os.geteuid()}/rmpa"), Path(f"/tmp/rmpa-{os.geteuid()}")]  # noqa: S108 - read, owner checked
+    return [place for place in dict.fromkeys(places) if _usable(place)]
+
+
+def _usable(place: Path) -> bool:
+    """Whether this user may read it, and no untrusted user can have put a socket there.
+
+    The owner of ``/run/rmpa`` does not matter: only root makes it, or systemd for a unit's user.
+    """
+    try:
+        info = place.lstat()
+    except OSError:
+        return False
+    trusted = place == _SYSTEM or info.st_uid in {0, os.geteuid()}
+    return stat.S_ISDIR(info.st_mode) and trusted and os.access(place, os.R_OK | os.X_OK)
+
+
+def make_runtime_dir(place: Path, group: int | None = None) -> None:
+    """Make the directory, for this user alone, or for one group too.
+
+    Args:
+        place: The directory.
+        group: The number of the group that may look into it.
+
+    Raises:
+        StartError: It cannot be made or given to the group, or another user owns it.
+    """
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = place.lstat()
+        if not stat.S_ISDIR(info.st_mode):
+            raise StartError(str(place), "is not a directory", _REMEDY)
+        if info.st_uid != os.geteuid():
+            raise StartError(str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY)
+        if group is not None:
+            os.chown(place, -1, group)
+            place.chmod(0o750)
+        elif info.st_mode & 0o077:
+            place.chmod(0o700)
+    except OSError as error:
+        raise StartError(str(place), f"cannot be made: {error.strerror}", _REMEDY) from None
+
+
+class NameLock:
+    """Holds ``<name>.lock`` while the agent runs; the kernel releases the lock however the agent ends.
+
+    Args:
+        place: The runtime directory; made if needed.
+        name: The agent's name.
+        group: As for ``make_runtime_dir``.
+
+    Raises:
+        StartError: Another agent holds it (the text has its process id), or the directory cannot be used.
+    """
+
+    def __init__(self, place: Path, name: str, group: int | None = None) -> None:
+        make_runtime_dir(place, group)
+        self.path = place / f"{name}.lock"
+        while True:
+            try:
+                fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            except OSError as error:
+                raise StartError(str(self.path), f"cannot be opened: {error.strerror}", _REMEDY) from None
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                pid = os.read(fd, 32).decode("ascii", "replace").strip()
+                os.close(fd)
+                whose = f" (pid {pid})" if pid else ""
+                problem = f"an agent named {name!r} already runs on this machine{whose}"
+                raise StartError("rmpa up", problem, "stop it, or give this one a --name of its own") from None
+            if self._still_there(fd):
+                break
+            os.close(fd)  # the last holder removed the file after it was opened here
+        self._fd = fd
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without the process id in the file
+            os.ftruncate(fd, 0)
+            os.write(fd, f"{os.getpid()}\n".encode())
+
+    def _still_there(self, fd: int) -> bool:
+        try:
+            return self.path.stat().st_ino == os.fstat(fd).st_ino
+        except FileNotFoundError:
+            return False
+
+    def release(self) -> None:
+        """Remove the file and release the lock; may be called twice."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            os.close(self._fd)
+            self._fd = -1
+
+
+# Questions about other sites: a gateway answers them; another agent asks the gateways that it is linked to.
+
+
+REPORT: Final = "site.report"
+"""The request for a ``SitesReport`` without sources."""
+INFO: Final = "site.info"
+"""The request for a ``SitesReport`` of one site with its sources: ``{site}``."""
+PARAM: Final = "site.param"
+"""A request about parameters (``bridge.params.transfer``) to a module: ``{site, module, what, key, text}``."""
+WHY: Final = "site.why"
+"""The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
+_ALL: Final = (REPORT, WHY)
+"""Those that every gateway answers for itself."""
+QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
+_SOURCES: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL),
+    "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
+)
+_PARAM: Final = Needs(
+    (Access.PARAM,),
+    "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site",
+)
+_WAYS: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
+)
+
+
+class SiteAnswerer(Protocol):
+    """Answers questions about other sites: ``gateway.sites`` has it."""
+
+    def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Awaitable[Any]:
+        """The reply to one of ``QUESTIONS``, which tells ``asker``, a linked module, only what it may have.
+
+        Without ``asker`` this machine's user asks, who may have everything.
+
+        Raises:
+            RmpaError: It cannot be answered; the text says why.
+        """
+        ...
+
+
+class SiteRequests:
+    """The operation ``site`` of the control socket, and the peers' requests about sites.
+
+    Args:
+        rpc: Carries requests between the modules.
+        linked: Returns the sessions of the peers that are linked now.
+        gate: Decides which peers are believed about other sites.
+    """
+
+    def __init__(
+        self, rpc: PeerRpc, linked: Callable[[], Iterable[PeerSession]], gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        self._gate = gate
+        self._rpc = rpc
+        self._linked = linked
+        self._gateway: SiteAnswerer | None = None
+        self._liked: dict[str, str] = {}
+        """The gateway that answered for a site, by its GUID."""
+
+    @property
+    def answerer(self) -> SiteAnswerer | None:
+        """What answers as a gateway; ``None``: this agent is none."""
+        return self._gateway
+
+    def serve(self, gateway: SiteAnswerer) -> None:
+        """Answer as a gateway from now on."""
+        self._gateway = gateway
+        rpc = self._rpc
+        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
+        rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
+        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
+        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
+
+    async def answer(self, args: dict[str, Any]) -> Any:
+        """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
+
+        ``site.report`` and ``site.why`` return a list with the answers of all gateways; the others one answer.
+        """
+        what, inner = args.get("what"), args.get("args")
+        if what not in QUESTIONS or not isinstance(inner, dict):
+            raise ConfigError("what", f"{what!r} is no question about sites")
+        return await (self.all(what, inner) if what in _ALL else self.one(what, inner))
+
+    async def all(self, what: str, args: dict[str, Any]) -> list[Any]:
+        """The answers of all gateways; those that fail are left out."""
+        if self._gateway is not None:
+            return [await self._gateway.answer(what, args)]
+        sessions = self._believed()
+        # Twice the time: the gateway itself asks the other site for so long.
+        wait = 2 * bridge_limits.ASK_TIMEOUT
+        found = await asyncio.gather(*(self._ask(session, what, args, wait) for session in sessions))
+        return [value for value, error in found if error is None]
+
+    async def one(self, what: str, args: dict[str, Any]) -> Any:
+        """The answer of the first gateway that has one.
+
+        Raises:
+            UnreachableError: This module is linked to no gateway.
+            RmpaError: No gateway has an answer; the text is that of the one that knew most.
+        """
+        if self._gateway is not None:
+            return await self._gateway.answer(what, args)
+        site = str(args.get("site", ""))
+        sessions = sorted(self._believed(), key=lambda each: str(each.link.guid) != self._liked.get(site))
+        problem: RmpaError | None = None
+        for session in sessions:
+            value, error = await self._ask(session, what, args, bridge_limits.PARAM_ASK_TIMEOUT)
+            if error is None:
+                self._liked[site] = str(session.link.guid)
+                return value
+            if not _is_no_gateway(error):
+                problem = problem or error
+        self._liked.pop(site, None)
+        if isinstance(problem, PeerRefused):
+            raise PeerRefused(problem.peer, problem.reason, problem.remedy)
+        if problem is not None:
+            raise problem
+        raise UnreachableError(
+            "gateway",
+            "any linked peer",
+            "start one with `rmpa gateway`; `rmpa peer list` shows the links. In a secured mesh "
+            "`relays` of [trust] names the gateways that are believed",
+        )
+
+    def _believed(self) -> list[PeerSession]:
+        """The linked peers whose word about other sites counts: any member could answer as a gateway."""
+        return [session for session in self._linked() if self._gate.may_relay(session.link.name)]
+
+    @staticmethod
+    def _answer_peer(gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]) -> Awaitable[object]:
+        return gateway.answer(what, args, asker.link.name)
+
+    async def _ask(
+        self, session: PeerSession, what: str, args: dict[str, Any], wait: float
+    ) -> tuple[Any, RmpaError | None]:
+        try:
+            return await self._rpc.request(session, what, args, wait), None
+        except RmpaError as error:
+            return None, error
+
+
+def _is_no_gateway(error: RmpaError) -> bool:
+    return isinstance(error, PeerRefused) and UNKNOWN_QUESTION in error.reason
+
+
+_T = TypeVar("_T")
+_START_ONE = "start one with `rmpa up`"
+
+
+class ControlClient:
+    """One connection to an agent; a context manager.
+
+    Args:
+        path: Its socket.
+        timeout: Seconds for each call.
+
+    Raises:
+        UnreachableError: No agent accepts the connection.
+    """
+
+    def __init__(self, path: Path, timeout: float = limits.CONTROL_CALL_TIMEOUT) -> None:
+        self.path = path
+        try:
+            self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        except OSError as error:
+            remedy = "close some programs, or raise the limit (ulimit -n)"
+            raise UnreachableError("agent", f"{path}: {error.strerror}", remedy) from None
+        self._sock.settimeout(timeout)
+        try:
+            self._sock.connect(str(path))
+        except OSError:
+            self._sock.close()
+            raise UnreachableError("agent", str(path), _START_ONE) from None
+        self._file = self._sock.makefile("rb", 256 * KIB)
+
+    @property
+    def name(self) -> str:
+        """The agent's name."""
+        return self.path.stem
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._file.close()
+        self._sock.close()
+
+    def call(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
+        """Send a request, and wait for the reply.
+
+        Args:
+            op: The name of the operation (``control_operations.REPLIES``).
+            type: The type of its value.
+            args: Its arguments.
+
+        Raises:
+            PeerRefused: The agent refused, and said why.
+            UnreachableError: It closed the connection, or did not reply in time.
+            RemoteProtocolError: Its value has another type.
+        """
+        return self._parse(op, self._exchange(op, args), type)
+
+    def snapshot(self, decoder: SnapshotDecoder | None = None, **args: object) -> Snapshot:
+        """Everything that the agent shows; raises as ``call``.
+
+        Args:
+            decoder: For those that ask again and again.
+            args: Of the operation.
+        """
+        if decoder is None:
+            return self.call("snapshot", Snapshot, **args)
+        line = self._exchange("snapshot", args)
+        with contextlib.suppress(RemoteProtocolError):
+            return decoder.decode(line)
+        return self._parse("snapshot", line, Snapshot)
+
+    def agent(self) -> AgentInfo:
+        """What the agent tells of itself, without its peers, topics and services; raises as ``call``."""
+        return self.snapshot(topics=(), peers=False).agent
+
+    def _exchange(self, op: str, args: dict[str, object]) -> bytes:
+        def exchange() -> bytes:
+            self._sock.sendall(ControlRequest(op, args).serialize())
+            return self._file.readline(limits.CONTROL_REPLY_MAX + 1)
+
+        line = self._received(exchange)
+        if line.endswith(b"\n"):
+            return line[:-1]
+        if len(line) > limits.CONTROL_REPLY_MAX:
+            raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
+        raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
+
+    def _received(self, receive: Callable[[], bytes]) -> bytes:
+        try:
+            return receive()
+        except TimeoutError:
+            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
+        except OSError as error:
+            raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
+
+    def _parse(self, op: str, line: bytes, type: type[_T]) -> _T:  # noqa: A002 - as msgspec calls it
+        reply = ControlReply.parse(line)
+        if not reply.ok:
+            raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)
+        if reply.follows:
+            with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
+        try:
+            return msgspec.convert(reply.value, type)
+        except msgspec.ValidationError as error:
+            raise RemoteProtocolError(
+                f"agent {self.name} answers {op} in another way: {error}; is it older?"
+            ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundAgent:
+    """An agent that runs on this machine."""
+
+    name: str
+    path: Path
+
+
+def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
+    """The agents of this machine that accept a connection, by name; sockets of killed agents are left out."""
+    found = []
+    for place in runtime_dirs(environ):
+        for path in sorted(place.glob("*.sock")):
+            with contextlib.suppress(UnreachableError), ControlClient(path, timeout=limits.CONTROL_LOOK_TIMEOUT):
+                found.append(FoundAgent(path.stem, path))
+    return sorted(found, key=lambda agent: agent.name)
+
+
+def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
+    """The named agent; else that of RMPA_AGENT, else the one that ``config.module_name.running_agent`` chooses.
+
+    Raises:
+        UnreachableError: No agent runs, or none of that name.
+        RmpaError: Several agents run, and none is selected; the text lists them.
+    """
+    agents = find_agents(environ)
+    wanted = name or environ.get("RMPA_AGENT")
+    listed = ", ".join(agent.name for agent in agents)
+    if not wanted and not agents:
+        places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
+        raise UnreachableError("agent", places, _START_ONE)
+    if not wanted:
+        facts = NameFacts()
+        if len(agents) > 1:
+            from rmpa.config.read import load_settings  # noqa: PLC0415 - most commands need no settings
+
+            with contextlib.suppress(ConfigError):  # a broken rmpa.toml is no reason not to ask
+                facts = load_settings({}, environ, host_name=socket.gethostname()).name_facts
+        wanted = running_agent(with_running(facts, agents, environ))
+    for agent in agents:
+        if agent.name == wanted:
+            return agent
+    path = runtime_dir(environ) / f"{wanted}.sock"
+    remedy = f"running here: {listed}" if agents else f"start it with `rmpa up --name {wanted}`"
+    raise UnreachableError(f"agent {wanted!r}", str(path), remedy)
+
+
+def with_running(facts: NameFacts, agents: Sequence[FoundAgent], environ: Mapping[str, str]) -> NameFacts:
+    """What the choice of a module depends on, with the agents that run; several are asked which of them they are."""
+    gateways: tuple[str, ...] = ()
+    of_master = ""
+    if len(agents) > 1:
+        gateways = tuple(agent.name for agent in agents if _is_gateway(agent))
+        of_master = _of_master(agents, environ.get("ROS_MASTER_URI", ""))
+    names = tuple(agent.name for agent in agents)
+    return replace(facts, running=names, gateways=gateways, of_master=of_master)
+
+
+def _of_master(agents: Sequence[FoundAgent], uri: str) -> str:
+    """The agent whose core a URI names; empty: none."""
+    for agent in agents if uri else ():
+        with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+            if same_core(client.agent().core_uri, uri):
+                return agent.name
+    return ""
+
+
+def _is_gateway(agent: FoundAgent) -> bool:
+    """Whether it is the agent of ``rmpa gateway``; others refuse the question."""
+    with contextlib.suppress(RmpaError), ControlClient(agent.path, timeout=limits.CONTROL_LOOK_TIMEOUT) as client:
+        return client.call(ROLE, str) == GATEWAY_ROLE
+    return False
+
+
+def same_core(one: str, other: str) -> bool:
+    """Whether two URIs name the same ROS core: equal ports, and equal hosts or two names of this machine."""
+    try:
+        first, second = urlsplit(one), urlsplit(other)
+        hosts = {_local(u.hostname or "") for u in (first, second)}
+        return first.port is not None and first.port == second.port and len(hosts) == 1
+    except ValueError:
+        return False
+
+
+def _local(host: str) -> str:
+    return "localhost" if host.startswith("127.") or host == socket.gethostname().lower() else host

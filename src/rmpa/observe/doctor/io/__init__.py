@@ -1,1 +1,0 @@
-"""Reads the machine for ``rmpa doctor``, and lists the checks."""

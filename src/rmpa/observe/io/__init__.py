@@ -1,1 +1,0 @@
-"""Builds the snapshot from the rooms, and serves it: control socket and ``/diagnostics``."""

@@ -1,1 +1,0 @@
-"""Gathers what ``rmpa why`` judges: from this agent's rooms, and from the other agent."""
