@@ -12,11 +12,11 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.requirements import at_least, at_most
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.descriptor import describe
-from rmpa.resource.run.dynamic_reconfigure import read_config
+from rmpa.resource.run.reconfigure import read_config
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node

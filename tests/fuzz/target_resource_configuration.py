@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.context_rules import parse_rule
+from rmpa.resource.declare.attributes import parse_rule
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
+from rmpa.resource.run.reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
 from rmpa.ros.types.messages import MessageError, MessageType
 
 _ONE = Resource("one", role="sensing")

@@ -120,7 +120,7 @@ class ResourceGraph:
 
     async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, read_config
+        from rmpa.resource.run.reconfigure import CONFIG_TYPE, read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}
@@ -131,7 +131,7 @@ class ResourceGraph:
         Raises:
             RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
-        from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+        from rmpa.resource.run.reconfigure import SERVICE_TYPE
         from rmpa.ros.types.installed import ServiceType
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)

@@ -12,10 +12,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Final
 
-from rmpa.resource.declare.answer import RequirementAnswer
-from rmpa.resource.declare.connections import DeclaredAttribute, Demand, Input, Output
-from rmpa.resource.declare.parameters import Parameter
-from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
+from rmpa.resource.declare.parameters import DeclaredAttribute, Demand, Input, Output, Parameter
+from rmpa.resource.declare.requirements import QoSRequest, RequirementAnswer, at_least, at_most, between, exactly
 from rmpa.resource.declare.resource import Resource, Role
 
 if TYPE_CHECKING:

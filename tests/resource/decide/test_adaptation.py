@@ -6,13 +6,10 @@ from dataclasses import replace
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.decide.actions import Action, AlarmKind, Apply, Clear, Raise, Reacted
-from rmpa.resource.decide.adaptation import Adaptation, ProfileState
-from rmpa.resource.decide.cool_downs import CoolDown
-from rmpa.resource.decide.decision import Decider
-from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.decide.adaptation import Adaptation, CoolDown, ProfileState
+from rmpa.resource.decide.decision import Action, AlarmKind, Apply, Clear, Decider, Raise, Reacted
 from rmpa.resource.declare.attributes import LATENCY, RATE
-from rmpa.resource.declare.profiles import Profile
+from rmpa.resource.declare.parameters import AdaptationSettings, Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
 
 ATTRIBUTES = {"rate": RATE, "latency": LATENCY}

@@ -4,7 +4,7 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.decide.clients import Clients
+from rmpa.resource.decide.reports import Clients
 from rmpa.resource.declare.attributes import LATENCY, RATE
 
 NOW_NS = 1_800_000_000_000_000_000

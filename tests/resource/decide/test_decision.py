@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import ConfigError
 from rmpa.resource.decide.decision import Decider
 from rmpa.resource.declare.attributes import LATENCY, RATE, Attribute, Direction, Scale
-from rmpa.resource.declare.profiles import Profile
+from rmpa.resource.declare.parameters import Profile
 from rmpa.resource.declare.requirements import Bound, bound
 
 RESOLUTION = Attribute("resolution", Direction.MAX, "px")

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.decide.lifecycle import TRANSITIONS, LifeCycle, LifecycleState, Transition
+from rmpa.resource.decide.reports import TRANSITIONS, LifeCycle, LifecycleState, Transition
 
 
 def at(state: LifecycleState) -> LifeCycle:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import struct
 
-from rmpa.resource.decide.measuring import QualityMeasurement
+from rmpa.resource.decide.quality import QualityMeasurement
 from rmpa.resource.declare.resource import Resource
 
 

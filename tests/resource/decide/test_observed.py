@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decide.observed import MissingInputs, ObservedQualities
-from rmpa.resource.declare.qos_request import at_least
-from rmpa.resource.declare.requirements import Requirement
+from rmpa.resource.decide.quality import MissingInputs, ObservedQualities
+from rmpa.resource.declare.requirements import Requirement, at_least
 from rmpa.resource.declare.resource import Resource
 
 if TYPE_CHECKING:

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-from rmpa.resource.decide.actions import Alarm, AlarmKind, Shortfall
 from rmpa.resource.decide.adaptation import Adaptation
-from rmpa.resource.decide.decision import Decider
+from rmpa.resource.decide.decision import Alarm, AlarmKind, Decider, Shortfall
 from rmpa.resource.decide.reports import alarm_values, answer_to, decision_report, describe_alarm, health
 from rmpa.resource.declare.attributes import LATENCY, RATE
-from rmpa.resource.declare.profiles import Profile
+from rmpa.resource.declare.parameters import Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
 from rmpa.ros.types.definitions import DiagnosticLevel
 

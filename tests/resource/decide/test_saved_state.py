@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decide.saved_state import SavedCoolDown, SavedRequirement, SavedState
+from rmpa.resource.decide.reports import SavedCoolDown, SavedRequirement, SavedState
 from rmpa.resource.declare.resource import Resource
 
 NOW = 1_800_000_000_000_000_000

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.declare.context_rules import ContextRule, ContextSelector, Reference, Scalar, parse_rule
+from rmpa.resource.declare.attributes import ContextRule, ContextSelector, Reference, Scalar, parse_rule
 from rmpa.resource.declare.resource import Resource
 
 PARAMETERS = ("gain", "name", "on")

@@ -9,9 +9,18 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare.attributes import LATENCY, RATE, Attribute, Direction, Scale
-from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
-from rmpa.resource.declare.requirement_text import parse_bound, parse_request, parse_requirement
-from rmpa.resource.declare.requirements import Bound, Requirement
+from rmpa.resource.declare.requirements import (
+    Bound,
+    QoSRequest,
+    Requirement,
+    at_least,
+    at_most,
+    between,
+    exactly,
+    parse_bound,
+    parse_request,
+    parse_requirement,
+)
 
 ATTRIBUTES = {
     "rate": RATE,

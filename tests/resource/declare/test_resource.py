@@ -7,7 +7,7 @@ import pytest
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.resource.declare.parameters import Parameter
-from rmpa.resource.declare.qos_request import at_least, at_most, between, exactly
+from rmpa.resource.declare.requirements import at_least, at_most, between, exactly
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import Descriptor, describe
 

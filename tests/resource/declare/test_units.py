@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.units import convert, quantity
+from rmpa.resource.declare.attributes import convert, quantity
 
 
 @pytest.mark.parametrize(

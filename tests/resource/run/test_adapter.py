@@ -8,8 +8,8 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.resource.declare.adaptation_settings import AdaptationSettings
-from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.parameters import AdaptationSettings
+from rmpa.resource.declare.requirements import at_least, at_most
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.adapter import Adapter
 from rmpa.resource.run.client import ResourceClient

@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.applier import HungError
+from rmpa.resource.run.adapter import HungError
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.declare.qos_request import at_least
+from rmpa.resource.declare.requirements import at_least
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
+from rmpa.resource.run.reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
 from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node

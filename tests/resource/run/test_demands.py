@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.requirements import at_least, at_most
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.resource_node import ResourceNode

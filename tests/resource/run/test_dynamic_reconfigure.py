@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.dynamic_reconfigure import (
+from rmpa.resource.run.reconfigure import (
     CONFIG_TYPE,
     DESCRIPTION_TYPE,
     checked,

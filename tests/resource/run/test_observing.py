@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.requirements import at_least, at_most
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.resource_node import ResourceNode

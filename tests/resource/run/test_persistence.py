@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.resource import limits
-from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.requirements import at_least, at_most
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.resource_node import ResourceNode
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.resource.decide.cool_downs import CoolDown
+    from rmpa.resource.decide.adaptation import CoolDown
 
 
 @pytest.fixture

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.resource import limits
-from rmpa.resource.declare.qos_request import at_most
+from rmpa.resource.declare.requirements import at_most
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.preconditions import Preconditions
 from rmpa.resource.run.resource_node import ResourceNode
-from rmpa.resource.run.runtime import RuntimePart
+from rmpa.resource.run.runtime import Preconditions, RuntimePart
 from rmpa.ros.core.embedded import RosCore
 
 if TYPE_CHECKING:

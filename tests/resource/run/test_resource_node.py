@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.decide.lifecycle import Transition
-from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.decide.reports import Transition
+from rmpa.resource.declare.parameters import AdaptationSettings
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.resource_node import ResourceNode, run_all
 from rmpa.ros.core.embedded import RosCore

@@ -16,7 +16,7 @@ from rmpa.ros.types.messages import MessageError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.resource.declare.connections import Input, Output
+    from rmpa.resource.declare.parameters import Input, Output
     from rmpa.ros.node.endpoints import Received
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.resource.run.schedule import Schedule, TaskFigures, TaskReport, restart_delay, stuck_after, too_slow
+from rmpa.resource.run.descriptor import Schedule, TaskFigures, TaskReport, restart_delay, stuck_after, too_slow
 
 
 def test_times_are_absolute_whatever_the_work_takes() -> None:

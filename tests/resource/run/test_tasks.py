@@ -16,7 +16,7 @@ from rmpa.ros.types.definitions import DiagnosticLevel
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.resource.run.task_runners import TaskProblem
+    from rmpa.resource.run.tasks import TaskProblem
 
 
 class Bench:

@@ -21,15 +21,23 @@ Without a disturbance the profile changes only for an improvement of more than `
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused
-from rmpa.resource.decide.actions import Action, Alarm, AlarmKind, Apply, Clear, Raise, Reacted, Shortfall
-from rmpa.resource.decide.cool_downs import CoolDown, CoolDowns
-from rmpa.resource.decide.violations import ViolationDetector
-from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.decide.decision import (
+    Action,
+    Alarm,
+    AlarmKind,
+    Apply,
+    Clear,
+    Raise,
+    Reacted,
+    Shortfall,
+    ViolationDetector,
+)
+from rmpa.resource.declare.parameters import AdaptationSettings
 from rmpa.resource.declare.requirements import MergedRequirements, Requirement, merge
 
 if TYPE_CHECKING:
@@ -37,6 +45,74 @@ if TYPE_CHECKING:
 
     from rmpa.resource.decide.decision import Decider, ProfileDecision, ProfileScore
     from rmpa.resource.declare.attributes import Attribute, Value
+
+
+# Cool-downs: a profile that failed or was violated is excluded for a while, and for longer each time.
+
+
+COOL_DOWN_GROWTH: Final = 2.0
+"""Factor by which each cool-down of a profile is longer than the one before, up to ``cool_down_max``."""
+
+
+@dataclass(slots=True)
+class CoolDown:
+    """The exclusion of one profile.
+
+    Args:
+        until: End of the cool-down, in monotonic seconds.
+        cool_down: Length of the cool-down in seconds; the next one is longer, up to the maximum.
+        why: The failure or violation, as a text for people.
+    """
+
+    until: float
+    cool_down: float
+    why: str
+
+
+class CoolDowns:
+    """The cool-downs of one resource's profiles.
+
+    Args:
+        first: Seconds of a profile's first cool-down.
+        longest: Seconds of a profile's longest cool-down.
+    """
+
+    def __init__(self, first: float, longest: float) -> None:
+        self._first = first
+        self._longest = longest
+        self._known: dict[str, CoolDown] = {}
+        """The last cool-down by profile. One that is over has an infinite ``until`` and is kept for its length, from
+        which the length of the next one is computed."""
+
+    def restore(self, before: Mapping[str, CoolDown], now: float) -> None:
+        """Continue the cool-downs that were saved before a restart, bounded by the present settings."""
+        for name, one in before.items():
+            cool_down = min(one.cool_down, self._longest)
+            self._known[name] = CoolDown(min(one.until, now + cool_down), cool_down, one.why)
+
+    def begin(self, profile: str, why: str, now: float) -> None:
+        """Begin a cool-down, for which the profile is excluded."""
+        before = self._known.get(profile)
+        cool_down = self._first if before is None else min(before.cool_down * COOL_DOWN_GROWTH, self._longest)
+        self._known[profile] = CoolDown(now + cool_down, cool_down, why)
+
+    def reset(self, profile: str) -> None:
+        """End a profile's cool-down; its next one has the length of the first again."""
+        self._known.pop(profile, None)
+
+    def active(self, now: float) -> dict[str, CoolDown]:
+        """The cool-downs that are not over, by profile."""
+        return {name: replace(one) for name, one in self._known.items() if now < one.until < math.inf}
+
+    def next_timer(self) -> float:
+        """When the next cool-down ends, in monotonic seconds; infinite: none is under way."""
+        return min((one.until for one in self._known.values()), default=math.inf)
+
+    def handle_timer(self, now: float) -> None:
+        """End the cool-downs that are over."""
+        for one in self._known.values():
+            if one.until <= now:
+                one.until = math.inf
 
 
 class ProfileState(Enum):

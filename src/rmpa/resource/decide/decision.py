@@ -1,33 +1,124 @@
-"""Finds the most similar profile: the one that serves the merged requirements best (paper, section 3.1).
-
-For each requested attribute, a profile's *shortfall* is the distance by which its value lies outside of the bound,
-divided by ``s``: the attribute's tolerance, or else its range over all profiles. Where that is 0, the shortfall is 0
-or 1. A value within the bound has no shortfall. A profile's *distance* ``D`` is the weighted root mean square of its
-shortfalls, plus a part of its cost::
-
-    delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
-
-The result is the profile with the least ``D`` among those that meet every hard requirement. If none does, it is the
-declared best-effort profile, or else the profile with the least (largest weighted hard shortfall, ``D``, cost). In a
-tie the profile that was declared first is chosen.
-"""
+"""Actions that the control loop returns to its driver: apply a profile, raise or clear an alarm, report a change."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.profiles import check_profiles
+from rmpa.resource.declare.parameters import check_profiles
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.declare.attributes import Attribute, Value
-    from rmpa.resource.declare.profiles import Profile
+    from rmpa.resource.declare.parameters import Profile
     from rmpa.resource.declare.requirements import Bound
+
+
+class AlarmKind(Enum):
+    """The kind of an alarm, which determines its diagnostic level (REP 107)."""
+
+    ADAPTATION = "adaptation"
+    """A quality is violated, and another profile takes over: WARN."""
+    NON_ADAPTABLE = "non_adaptable"
+    """No profile meets the requirements; the most similar one runs: ERROR."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shortfall:
+    """One attribute that violates the requirements.
+
+    Args:
+        attribute: Name of the attribute.
+        requested: The bound that is violated.
+        offered: The measured value, or else the one that the profile declares; ``None``: there is neither.
+    """
+
+    attribute: str
+    requested: Bound
+    offered: Value | None
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """An alarm, which is published to all clients.
+
+    Args:
+        kind: Adaptation or non-adaptable.
+        shortfalls: The violated attributes.
+        before: The profile that ran; empty: none.
+        after: The profile that takes over; equal to ``before`` if that stays.
+        at: When the alarm was raised, in monotonic seconds.
+    """
+
+    kind: AlarmKind
+    shortfalls: tuple[Shortfall, ...]
+    before: str
+    after: str
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Apply:
+    """Apply this profile, then report ``applied`` or ``failed`` to the loop; ``why`` is a text for people."""
+
+    profile: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Raise:
+    """Publish an alarm."""
+
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Clear:
+    """Publish that an alarm is over."""
+
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Reacted:
+    """A reconfiguration is complete.
+
+    Args:
+        profile: The profile that runs now.
+        reaction: Seconds since the cause: a request, or the beginning of the first violated window.
+    """
+
+    profile: str
+    reaction: float
+
+
+Action = Apply | Raise | Clear | Reacted
+
+
+# Finds the most similar profile: the one that serves the merged requirements best (paper, section 3.1).
+#
+# For each requested attribute, a profile's *shortfall* is the distance by which its value lies outside of the
+# bound,
+# divided by ``s``: the attribute's tolerance, or else its range over all profiles. Where that is 0, the shortfall
+# is 0
+# or 1. A value within the bound has no shortfall. A profile's *distance* ``D`` is the weighted root mean square of
+# its
+# shortfalls, plus a part of its cost::
+#
+#     delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
+#
+# The result is the profile with the least ``D`` among those that meet every hard requirement. If none does, it is
+# the
+# declared best-effort profile, or else the profile with the least (largest weighted hard shortfall, ``D``, cost).
+# In a
+# tie the profile that was declared first is chosen.
+
 
 EPSILON: Final = 1e-3
 """What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall."""
@@ -210,3 +301,71 @@ def describe_bound(attribute: Attribute, bound: Bound) -> str:
     if low and high:
         return f"{low} to {high}"
     return f"at least {low}" if low else f"at most {high}"
+
+
+# Detects disturbances: a quality that is violated in ``k`` of the last ``n`` windows.
+
+
+EXPECTED: Final = 1.25
+"""Factor by which a soft bound may be missed further than the profile declares, before it counts as violated."""
+
+
+class ViolationDetector:
+    """Judges windows of measured quality against the merged requirements, under one profile.
+
+    Args:
+        attributes: The resource's attributes, by name.
+        violations: ``k``, the number of violated windows that are a disturbance.
+        windows: ``n``, the number of last windows that are kept.
+    """
+
+    def __init__(self, attributes: Mapping[str, Attribute], violations: int, windows: int) -> None:
+        self._attributes = attributes
+        self._needed = violations
+        self._windows: deque[tuple[float, tuple[Shortfall, ...]]] = deque(maxlen=windows)
+
+    def clear(self) -> None:
+        """Forget all windows, because the profile or the requirements have changed."""
+        self._windows.clear()
+
+    def add(
+        self, began: float, measured: Mapping[str, Value], bounds: Mapping[str, Bound], offers: Mapping[str, Value]
+    ) -> None:
+        """Judge a window; attributes that were not measured are left out.
+
+        Args:
+            began: When the window began, in monotonic seconds.
+            measured: Measured values by attribute.
+            bounds: The merged requirements by attribute.
+            offers: The declared quality of the profile that runs, by attribute.
+        """
+        self._windows.append(
+            (
+                began,
+                tuple(
+                    Shortfall(name, bound, measured[name])
+                    for name, bound in bounds.items()
+                    if name in measured and self._violates(name, bound, measured[name], offers.get(name))
+                ),
+            )
+        )
+
+    @property
+    def violated(self) -> list[tuple[float, tuple[Shortfall, ...]]]:
+        """The violated windows among the last ``n``, oldest first: when each began, and its shortfalls."""
+        return [(began, short) for began, short in self._windows if short]
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether at least ``k`` of the last ``n`` windows are violated."""
+        return len(self.violated) >= self._needed
+
+    def _violates(self, name: str, bound: Bound, value: Value, offer: Value | None) -> bool:
+        attribute = self._attributes[name]
+        if bound.met_by(attribute, value):
+            return False
+        if bound.hard or offer is None or bound.met_by(attribute, offer):
+            return True
+        # The profile was chosen although it is declared to miss this soft bound; judge by how far it misses it.
+        beyond, declared = bound.excess(attribute.position(value)), bound.excess(attribute.position(offer))
+        return beyond > EXPECTED * declared

@@ -26,19 +26,32 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
-from rmpa.resource.declare.adaptation_settings import AdaptationSettings, read_adaptation
-from rmpa.resource.declare.attributes import MEASURED, Attribute, Category, Direction, Scale
-from rmpa.resource.declare.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task
-from rmpa.resource.declare.checks import check_arity, read_contract, read_enum
-from rmpa.resource.declare.connections import DeclaredAttribute, Demand, Input, Output, TopicType
-from rmpa.resource.declare.context_rules import parse_rule
-from rmpa.resource.declare.parameters import Parameter, ParameterValue
-from rmpa.resource.declare.profiles import Profile, check_profiles
+from rmpa.resource.declare.attributes import MEASURED, Attribute, Category, Direction, Scale, parse_rule, quantity
+from rmpa.resource.declare.parameters import (
+    AdaptationSettings,
+    Context,
+    DeclaredAttribute,
+    DeclaredProfile,
+    Demand,
+    Hook,
+    Input,
+    OnFailure,
+    Output,
+    Parameter,
+    ParameterValue,
+    Profile,
+    Task,
+    TopicType,
+    check_arity,
+    check_profiles,
+    read_adaptation,
+    read_contract,
+    read_enum,
+)
 from rmpa.resource.declare.requirements import find_attribute
-from rmpa.resource.declare.units import quantity
 
 if TYPE_CHECKING:
-    from rmpa.resource.declare.qos_request import QoSRequest
+    from rmpa.resource.declare.requirements import QoSRequest
 
 _RATE_MAX: Final = 10_000
 """The highest rate of a periodic task, in Hz."""

@@ -7,29 +7,66 @@ import inspect
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
-from rmpa.resource.decide.lifecycle import LifeCycle, LifecycleState, Transition
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.resource.decide.reports import LifeCycle, LifecycleState, Transition
 from rmpa.resource.run.adapter import Adapter
-from rmpa.resource.run.contexts import Contexts
-from rmpa.resource.run.demands import Demands
-from rmpa.resource.run.output_types import learn_outputs
-from rmpa.resource.run.persistence import Persistence
+from rmpa.resource.run.client import Demands
+from rmpa.resource.run.contexts import Contexts, Persistence
 from rmpa.resource.run.reconfigure import Reconfigure
 from rmpa.resource.run.runtime import Runtime, RuntimePart
 from rmpa.resource.run.tasks import Tasks
+from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
+from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
     from pathlib import Path
 
-    from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+    from rmpa.resource.declare.parameters import AdaptationSettings, Output
     from rmpa.resource.declare.resource import Resource
-    from rmpa.resource.run.task_runners import TaskProblem
+    from rmpa.resource.run.tasks import TaskProblem
+
+
+# Learns the types of outputs that are unknown on this machine from a publisher, in this module or at a peer.
+
 
 _log = logging.getLogger(__name__)
+
+
+async def learn_outputs(resource: Resource, master_uri: str, caller_id: str) -> None:
+    """Wait until the type of each output is known; missing types and the places searched for them are logged once.
+
+    Args:
+        resource: The resource, completely declared; the function sets the types of its outputs.
+        master_uri: URI of the master whose publishers are queried.
+        caller_id: Name of the resource's node, which need not be registered yet.
+    """
+    logged: set[str] = set()
+    while missing := [output for output in resource.outputs.values() if output.kind.known is None]:
+        for output in missing:
+            if await _learn(output, master_uri, caller_id) or output.kind.name in logged:
+                continue
+            logged.add(output.kind.name)
+            _log.warning("! %s waits for the type of output %s: %s", caller_id, output.name, output.kind.problem)
+        if any(output.kind.known is None for output in missing):
+            await asyncio.sleep(limits.TYPE_LOOK)
+
+
+async def _learn(output: Output, master_uri: str, caller_id: str) -> bool:
+    try:
+        learnt = await fetch_type(master_uri, caller_id, output.kind.name)
+    except UnreachableError as error:
+        _log.debug("! %s: %s", caller_id, error)  # the resource's start reports an unreachable master
+        return False
+    if learnt is not None:
+        output.kind.known = learnt.kind
+        whence = printable(learnt.node), printable(learnt.topic)
+        _log.info("= %s: %s is learnt from %s, which publishes %s", caller_id, output.kind.name, *whence)
+    return learnt is not None
 
 
 class ResourceNode:

@@ -12,22 +12,24 @@ from collections import Counter, deque
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
-from rmpa.ros.wire.tcpros import printable
+from rmpa.ros.wire.tcpros import LENGTH, printable
+from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.resource.declare.attributes import Value
-    from rmpa.resource.declare.connections import Input, Output
-    from rmpa.resource.declare.parameters import Parameter
+    from rmpa.resource.declare.parameters import DeclaredProfile, Input, Output, Parameter
     from rmpa.resource.declare.resource import Resource
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
     from rmpa.ros.node.node import Node
-    from rmpa.ros.types.definitions import DiagnosticLevel
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
@@ -304,3 +306,119 @@ class Runtime:
         except MessageError as error:
             raise MessageError(f"{output.name}: {error}") from None
         self.call_in_loop(self.send, output, bytes(numbers.stamp(payload)), CALLER.get())
+
+
+# Evaluates the preconditions of profiles (``needs=``), each in a thread of its own, because they may block.
+
+
+class Preconditions:
+    """The preconditions of one resource.
+
+    Args:
+        profiles: The declared profiles, by name.
+    """
+
+    def __init__(self, profiles: Mapping[str, DeclaredProfile]) -> None:
+        self._needs = {name: one.needs for name, one in profiles.items() if one.needs is not None}
+        self._calls: dict[str, asyncio.Task[str | bool | None]] = {}
+        """The call under way, by profile."""
+
+    async def check(self) -> dict[str, str]:
+        """Call all preconditions, except those whose last call has not returned; at most one check at a time.
+
+        Returns:
+            The profiles that must not run, with the reason, after ``limits.PRECONDITION_TIMEOUT`` seconds at most.
+        """
+        for name, needs in self._needs.items():
+            if name not in self._calls:
+                self._calls[name] = asyncio.create_task(in_thread(needs, f"needs of {name}"), name=f"needs of {name}")
+        if not self._calls:
+            return {}
+        done, _ = await asyncio.wait(self._calls.values(), timeout=limits.PRECONDITION_TIMEOUT)
+        found = {}
+        for name, call in list(self._calls.items()):
+            why: str | bool | None = f"its precondition has not answered for {limits.PRECONDITION_TIMEOUT:g} s"
+            if call in done:
+                del self._calls[name]
+                error = call.exception()
+                why = f"its precondition failed: {type(error).__name__}: {error}" if error else call.result()
+            if why is False:
+                why = "its precondition does not hold"
+            if why and isinstance(why, str):
+                found[name] = why
+        return found
+
+    async def close(self) -> None:
+        """Stop waiting for calls; threads that hang are left behind."""
+        for call in self._calls.values():
+            call.cancel()
+        await asyncio.gather(*self._calls.values(), return_exceptions=True)
+
+
+# Publishes the reports of a resource: quality, diagnostics, alarms, responses, profile and decision.
+
+
+LEVEL_FOR: Final = "level_for"
+"""The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ."""
+_LATCHED: Final = {"quality": False, "alarms": False, "responses": True}
+
+
+class StatusPublisher:
+    """The report topics of one resource (``docs/smart-resources.md`` lists them).
+
+    Args:
+        runtime: The runtime of the resource.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._name = runtime.resource.name
+        self.publishers: dict[str, Publisher] = {}
+        self._responses: list[bytes] | None = None
+        self._level: tuple[DiagnosticLevel, float] | None = None
+        """The level of ``quality``, and since when, in monotonic seconds."""
+
+    async def start(self) -> None:
+        """Advertise the topics."""
+        node = self._runtime.node
+        for name, latch in _LATCHED.items():
+            topic = f"{node.name}/{name}"
+            self.publishers[name] = await node.advertise(topic, MessageType(ARRAY_TYPE), latch=latch)
+        self.publishers["diagnostics"] = await node.advertise("/diagnostics", MessageType(ARRAY_TYPE))
+        for name in ("profile", "decision"):
+            await self._runtime.advertise_text(name, "")
+
+    def close(self) -> None:
+        """Stop publishing; later reports of quality, alarms and responses are dropped."""
+        self.publishers.clear()
+
+    def quality(self, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
+        """Publish the quality of a window, also on ``/diagnostics``, with how long it has had this level."""
+        now = time.monotonic()
+        if self._level is None or self._level[0] != level:
+            self._level = level, now
+        lasting = {LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
+        status = [DiagnosticStatus(level, self._name, message, self._name, {**values, **lasting})]
+        self._publish("quality", status)
+        self._publish("diagnostics", status)
+
+    def alarm(self, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
+        """Publish an alarm."""
+        self._publish("alarms", [DiagnosticStatus(level, self._name, message, self._name, values)])
+
+    def responses(self, statuses: Sequence[DiagnosticStatus]) -> None:
+        """Publish the responses to all clients, if they differ from the last ones."""
+        serialized = [status.serialize() for status in statuses]
+        if serialized != self._responses and "responses" in self.publishers:
+            self._responses = serialized
+            self._publish("responses", statuses)
+
+    def decision(self, profile: str, decision: Mapping[str, Any]) -> None:
+        """Publish the profile that runs and the decision (see ``decision_report``), each if it has changed."""
+        self._runtime.publish_text("profile", profile)
+        self._runtime.publish_text("decision", msgspec.json.encode(decision).decode())
+
+    def _publish(self, topic: str, statuses: Sequence[DiagnosticStatus]) -> None:
+        if (publisher := self.publishers.get(topic)) is not None:
+            array = frame_array(0, time.time_ns(), [status.serialize() for status in statuses])[LENGTH.size :]
+            publisher.publish_raw(publisher.numbers.stamp(array) if publisher.numbers is not None else array)

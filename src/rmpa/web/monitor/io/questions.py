@@ -21,7 +21,7 @@ from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.peers_section import PeerParams, parameters_in
-from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+from rmpa.resource.run.reconfigure import SERVICE_TYPE
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.nodes import node_key, shown_node
 from rmpa.web.values.codec import codec_for

@@ -13,8 +13,8 @@ from rmpa.bridge.proxies import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
-from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE
-from rmpa.resource.run.status_publisher import LEVEL_FOR
+from rmpa.resource.run.reconfigure import CONFIG_TYPE
+from rmpa.resource.run.runtime import LEVEL_FOR
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web.hub.clients import OWN_CLIENT
 from rmpa.web.monitor import limits
