@@ -17,8 +17,7 @@ from click.testing import CliRunner
 
 from rmpa import __version__
 from rmpa.cli import completion
-from rmpa.cli.lazy_group import REMOVED_VERBS, LazyGroup
-from rmpa.cli.main import MEANT, cli, main
+from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
 from tests.cli.conftest import DEADLINE, with_core
 
 if TYPE_CHECKING:
@@ -148,7 +147,7 @@ def test_completion_scripts(shell: str) -> None:
     assert "_RMPA_COMPLETE" in CliRunner().invoke(cli, ["completion", shell]).output
 
 
-@pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.up", "rmpa.cli.peer", "rmpa.cli.topic_graph"])
+@pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.agent", "rmpa.cli.peer", "rmpa.cli.topic"])
 def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
     importlib.import_module(module)
     heavy = "{'aiohttp', 'prometheus_client', 'rich', 'numpy', 'rosbags', 'ruamel', 'yaml', 'matplotlib'}"
@@ -159,7 +158,7 @@ def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
 def test_help_imports_no_command() -> None:
     code = (
         "import sys; from rmpa.cli.main import main; main(['--help']);"
-        "sys.exit(' '.join({'asyncio', 'msgspec', 'rmpa.cli.up', 'rmpa.cli.peer'} & set(sys.modules)) or 0)"
+        "sys.exit(' '.join({'asyncio', 'msgspec', 'rmpa.cli.agent', 'rmpa.cli.peer'} & set(sys.modules)) or 0)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
 

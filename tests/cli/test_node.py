@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from rmpa.cli.main import main
-from rmpa.cli.node_names import _untold
+from rmpa.cli.node import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.observe.snapshot import UnreachableInfo
 from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, RosEnvironment

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
-from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
+from rmpa.cli.param import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe.control_server import ControlServer
 from rmpa.observe.snapshot import FollowedInfo

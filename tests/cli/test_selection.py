@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.cli.selection import Selection, summary
+from rmpa.cli.options import Selection, summary
 from rmpa.observe.peer_info import PeerInfo
 from tests.observe.samples import SNAPSHOT
 

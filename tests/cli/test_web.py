@@ -158,6 +158,6 @@ def test_mistakes_are_told_with_their_option(place: Place) -> None:
 
 
 def test_the_agent_does_not_import_the_web(place: Place) -> None:
-    code = f"import sys, {Agent.__module__}, rmpa.cli.up; print([n for n in sys.modules if n.startswith({WEB})])"
+    code = f"import sys, {Agent.__module__}, rmpa.cli.agent; print([n for n in sys.modules if n.startswith({WEB})])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=place.environ, check=True)
     assert done.stdout.strip() == "[]"

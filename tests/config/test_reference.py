@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from click.testing import CliRunner
 
+from rmpa.cli.agent import up
 from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
-from rmpa.cli.up import up
 from rmpa.config.module_name import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
 from rmpa.config.read import load_settings
 from rmpa.config.settings import SETTINGS, TABLES, Multicast

@@ -16,7 +16,7 @@ import pytest
 
 from lab.bed.processes import Process, eventually
 from rmpa.cli.run import load
-from rmpa.cli.topic_pub import read_values
+from rmpa.cli.topic import read_values
 from rmpa.resource.declare.requirements import parse_requirement
 from tests.interop.ros import free_port
 

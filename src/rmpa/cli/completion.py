@@ -16,8 +16,7 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.cli.graph import Graph
-    from rmpa.cli.master import Master
+    from rmpa.cli.output import Graph, Master
 
 EPILOG = """\
 \b
@@ -81,7 +80,7 @@ def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
             found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
 
     # Imported here, not in the thread: the time that this takes is not the agent's.
-    from rmpa.cli import graph, master, param_store, resource_graph  # noqa: F401
+    from rmpa.cli import output as graph  # noqa: F401
 
     if kind in _BY_NODE:
         from rmpa.ros.node import node  # noqa: F401
@@ -94,13 +93,13 @@ def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
 
 
 def _master(ctx: click.Context) -> Master:
-    from rmpa.cli.master import choose_master
+    from rmpa.cli.output import choose_master
 
     return choose_master(ctx.params.get("master"), ctx.params.get("agent"), os.environ)
 
 
 def _graph(ctx: click.Context) -> Graph:
-    from rmpa.cli.graph import read_graph
+    from rmpa.cli.output import read_graph
 
     return asyncio.run(read_graph(_master(ctx)))
 
@@ -153,7 +152,7 @@ def _nodes(ctx: click.Context, _: str) -> Iterable[str]:
 
 def _params(ctx: click.Context, incomplete: str) -> Iterable[str]:
     from rmpa.cli.options import GraphOptions
-    from rmpa.cli.param_store import open_store, split_peer
+    from rmpa.cli.param import open_store, split_peer
 
     before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
     peer, _ = split_peer(ctx.params.get("peer"), incomplete)
@@ -175,7 +174,7 @@ def _resources(ctx: click.Context, _: str) -> Iterable[str]:
 
 def _choices(ctx: click.Context, what: str) -> Iterable[str]:
     """The profiles or contexts of the resource that stands before them in the line."""
-    from rmpa.cli.resource_graph import ResourceGraph, with_resources
+    from rmpa.cli.resource import ResourceGraph, with_resources
 
     found: list[str] = []
 

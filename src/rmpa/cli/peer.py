@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import find_peer
-from rmpa.cli.options import FiniteRange, agent_option, completes, json_option
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
-from rmpa.cli.selection import LINES, Selection, summary
-from rmpa.cli.topic_crossing import shown_state
+from rmpa.cli.options import LINES, FiniteRange, Selection, agent_option, completes, json_option, summary
+from rmpa.cli.output import Column, duration, find_peer, print_json, print_line, print_table, size, warn
+from rmpa.cli.topic import shown_state
 from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.control_client import ControlClient, choose_agent

@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
 
-from rmpa.cli.output import print_error, printable
+from rmpa.cli.options import GraphOptions, completes, graph_options
+from rmpa.cli.output import Column, print_error, print_json, print_table, printable
+from rmpa.cli.profile import ManualChoice, resource_json
+from rmpa.cli.resource import run_with_resources
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.runtime import limits
 
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType, TracebackType
 
+    from rmpa.cli.resource import ResourceGraph, SeenResource
     from rmpa.resource.declare.parameters import Parameter
     from rmpa.resource.declare.resource import Resource
 
@@ -407,3 +411,59 @@ def _leave(code: int) -> NoReturn:
 def _interrupt(number: int, _frame: FrameType | None) -> NoReturn:
     """Handle a signal before there is a loop: unwind as at Ctrl-C, which ends a child agent."""
     raise KeyboardInterrupt(number)
+
+
+# ``rmpa context list|get|set``.
+
+
+@click.command("list", epilog="\b\nExamples:\n  rmpa context list\n  rmpa context list base:/sonar --json\n")
+@click.argument("resource", required=False, shell_complete=completes("resource"))
+@graph_options
+def list_(resource: str | None, options: GraphOptions) -> None:
+    """List a RESOURCE's contexts, their rules and what they require."""
+
+    async def body(graph: ResourceGraph) -> None:
+        one = graph.pick(resource)
+        present = await _present(graph, one)
+        contexts = one.descriptor.contexts
+        if options.as_json:
+            print_json({**resource_json(one), **present, "contexts": contexts})
+            return
+        columns = tuple(map(Column, ("CONTEXT", "NOW", "WHEN", "REQUIRES", "PROFILES", "OUTPUTS")))
+        rows = [
+            (
+                each.name,
+                _mark(each.name, **present),
+                each.when or "by hand",
+                ", ".join(f"{key} {bound}" for key, bound in each.requires.items()) or "-",
+                ", ".join(each.profiles) or "any",
+                ", ".join(each.outputs) or "none" if each.outputs is not None else "all",
+            )
+            for each in contexts
+        ]
+        print_table(columns, rows)
+
+    run_with_resources(options, body)
+
+
+def _mark(name: str, context: str, chosen: str) -> str:
+    if name != context:
+        return ""
+    return "by hand" if name == chosen else "yes"
+
+
+async def _present(graph: ResourceGraph, one: SeenResource) -> dict[str, str]:
+    """The present context, and the one chosen by hand."""
+    if not one.descriptor.contexts:
+        return {"context": "", "chosen": ""}
+    (said,), values = await asyncio.gather(graph.texts([one], "context"), graph.configuration(one))
+    if one not in said:
+        raise RmpaError(f"{one} does not say its context; does it run?")
+    return {"context": said[one], "chosen": str(values.get("context", ""))}
+
+
+_CHOICE = ManualChoice("context", lambda descriptor: (each.name for each in descriptor.contexts), _present)
+get = _CHOICE.get_command("Print the present context of a RESOURCE; an empty line for none.")
+set_ = _CHOICE.set_command(
+    "Choose the CONTEXT of a RESOURCE by hand; returns when it is there.", "Let the rules decide again.", "docked"
+)

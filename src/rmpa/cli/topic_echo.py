@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import io
 import sys
+import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.bridge.proxies import proxied_node
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, warn_unpublished
-from rmpa.cli.message_text import flatten, pick, shorten, to_text
-from rmpa.cli.options import GraphOptions, completes, graph_options
-from rmpa.cli.output import print_json
-from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
+from rmpa.bridge.proxies import proxied_node, proxied_peer
+from rmpa.cli.options import (
+    Enough,
+    GraphOptions,
+    StreamWatch,
+    completes,
+    flatten,
+    graph_options,
+    pick,
+    run_stream,
+    shorten,
+    to_text,
+    watch_topic,
+)
+from rmpa.cli.output import Graph, GraphName, print_json, read_graph, read_name, require_peer, size, warn_unpublished
+from rmpa.cli.topic import arriving, bandwidth_text, latency_text, origin, rate_text
+from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary
+from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.cli.master import Master
+    from collections.abc import Callable
+
+    from rmpa.cli.output import Master
+    from rmpa.observe.snapshot import RouteInfo
     from rmpa.ros.node.node import Received
-    from rmpa.ros.types.messages import Plain
+    from rmpa.ros.types.messages import MessageType, Plain
 
 
 @dataclass
@@ -131,3 +148,261 @@ async def _echo(master: Master, topic: str, count: int | None, printer: _Message
         await watch_topic(master, wanted, on_message, body)
     except Enough:
         return
+
+
+# ``rmpa topic hz|bw|delay``: figures of a topic, once a second, in rostopic's format.
+#
+# This command's own subscriber measures them. For each remote source the agent's figures follow, which are more
+# exact:
+# the agent takes the time of each message when it arrives, this program only when it is scheduled.
+
+
+_EVERY: Final = 1.0
+"""Seconds between two lines, as rostopic has it."""
+
+
+class _Figures:
+    """The figures of one command over a sliding window of messages.
+
+    Args:
+        window: Messages in it.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._shown = 0
+        self.flow = ArrivalStats(window)
+
+    def add(self, received: Received, now: float) -> None:
+        """One message, at ``now`` (monotonic seconds)."""
+        self.flow.arrived(now, len(received.raw))
+
+    def fresh(self) -> bool:
+        """Whether a message came since the last call."""
+        fresh = self.flow.messages > self._shown
+        self._shown = self.flow.messages
+        return fresh
+
+    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
+        """For JSON, in base units; ``source`` is what measured them, ``routes`` the agent's figures."""
+        return {"source": "subscriber", **self.own(), "routes": routes}
+
+    def own(self) -> dict[str, float]:
+        """The figures of this command's subscriber, in base units."""
+        raise NotImplementedError
+
+    def text(self) -> str:
+        """The subscriber's figures as text."""
+        raise NotImplementedError
+
+    def remote(self, route: RouteInfo) -> str:
+        """The agent's figures of a remote source as text."""
+        raise NotImplementedError
+
+
+class _Rate(_Figures):
+    """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
+
+    def own(self) -> dict[str, float]:
+        p = self.flow.periods()
+        return {"rate": self.flow.rate(), "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
+
+    def text(self) -> str:
+        v = self.own()
+        if v["window"] < 2:
+            return "one message, no rate yet"
+        spread = f"min: {v['min']:.3f}s max: {v['max']:.3f}s std dev: {v['sd']:.5f}s window: {v['window']}"
+        return f"average rate: {v['rate']:.3f}\n\t{spread}"
+
+    def remote(self, route: RouteInfo) -> str:
+        return f"at the agent, from {origin(route)}: {rate_text(route)}"
+
+
+class _Bandwidth(_Figures):
+    """Bytes a second, in the format of ``rostopic bw``."""
+
+    def __init__(self, window: int) -> None:
+        super().__init__(window)
+        self._sizes = SampleRing(window)
+
+    def add(self, received: Received, now: float) -> None:
+        super().add(received, now)
+        self._sizes.add(len(received.raw))
+
+    def own(self) -> dict[str, float]:
+        s = self._sizes.summary()
+        rate = self.flow.bandwidth()
+        return {"bandwidth": rate, "mean": s.mean, "min": s.minimum, "max": s.maximum, "window": s.count}
+
+    def text(self) -> str:
+        v = self.own()
+        spread = f"mean: {size(v['mean'])} min: {size(v['min'])} max: {size(v['max'])} window: {v['window']}"
+        return f"average: {size(v['bandwidth'])}/s\n\t{spread}"
+
+    def remote(self, route: RouteInfo) -> str:
+        return f"at the agent, from {origin(route)}: {bandwidth_text(route)}"
+
+
+class _Delay(_Figures):
+    """Age on arrival, in seconds.
+
+    By the header's stamp, exact only as far as both machines' clocks agree; and for a remote source by the agent,
+    which knows the clocks' offset. Without a header only the latter is known.
+
+    Args:
+        window: Messages in it.
+        by_link: Whether the master is an agent's core, whose figures may stand in for a header.
+    """
+
+    def __init__(self, window: int, *, by_link: bool) -> None:
+        super().__init__(window)
+        self._delays = SampleRing(window)
+        self._by_link = by_link
+        from rmpa.ros.types.messages import MessageType
+
+        # The modules that read messages take 0.3 s to import, which would count as the first message's delay.
+        MessageType("std_msgs/Header").make()
+
+    def add(self, received: Received, now: float) -> None:
+        """One message.
+
+        Raises:
+            RmpaError: Its type has no header, and it did not come over the mesh.
+        """
+        super().add(received, now)
+        if _has_header(received.kind):
+            stamp = received.message.header.stamp
+            self._delays.add((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
+        elif not self._by_link or proxied_peer(received.caller_id) is None:
+            raise RmpaError(f"{received.kind.name} has no header, and so no stamp to tell its age by")
+
+    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
+        """Seconds; without headers those of the agent, if there is one remote source."""
+        if self._delays.total:
+            return {"source": "header", "error": None, **self.own(), "routes": routes}
+        latency = routes[0].latency if len(routes) == 1 else None
+        if latency is None:
+            return {"source": "link", "error": None, **self.own(), "routes": routes}
+        spread = {"delay": latency.mean, "min": latency.min, "max": latency.max, "sd": latency.sd}
+        return {"source": "link", "error": latency.error, **spread, "window": latency.count, "routes": routes}
+
+    def own(self) -> dict[str, float]:
+        s: SampleSummary = self._delays.summary()
+        return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
+
+    def text(self) -> str:
+        """As ``rostopic delay``, with a digit more."""
+        if not self._delays.total:
+            return "no header, and so no stamp to tell the whole age by"
+        v = self.own()
+        spread = f"min: {v['min']:.4f}s max: {v['max']:.4f}s std dev: {v['sd']:.5f}s window: {v['window']}"
+        return f"average delay: {v['delay']:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"
+
+    def remote(self, route: RouteInfo) -> str:
+        return f"by the link's clock, from {origin(route)}: {latency_text(route.latency)}"
+
+
+def _has_header(kind: MessageType) -> bool:
+    return any(field.name == "header" and field.type == "std_msgs/Header" for field in kind.fields)
+
+
+async def _show(figures: _Figures, master: Master, wanted: GraphName, *, as_json: bool) -> None:
+    if not figures.fresh():
+        if not as_json:
+            click.echo("no new messages")
+        return
+    routes = await asyncio.to_thread(arriving, master, wanted)
+    if as_json:
+        print_json({"topic": str(wanted), **figures.values(routes)})
+    else:
+        click.echo("\n\t".join([figures.text(), *(figures.remote(route) for route in routes)]))
+
+
+def _watch(topic: str, make: Callable[[Master], _Figures], count: int | None, options: GraphOptions) -> None:
+    wanted = read_name(topic)
+    (master, graph), as_json = options.graph(), options.as_json
+    require_peer(master, graph, wanted)
+    warn_unpublished(master, graph, wanted)
+    figures = make(master)
+
+    async def body(watch: StreamWatch) -> None:
+        if not as_json:
+            click.echo(f"subscribed to [{wanted}]")
+        while not await watch.finished(_EVERY):
+            await _show(figures, master, wanted, as_json=as_json)
+        await _show(figures, master, wanted, as_json=as_json)
+
+    def take(received: Received) -> None:
+        if figures.flow.messages == count:
+            return  # further messages arrived before the node was closed
+        figures.add(received, time.monotonic())
+        if figures.flow.messages == count:
+            raise Enough
+
+    async def run() -> None:
+        try:
+            await watch_topic(master, wanted, take, body)
+        except Enough:
+            await _show(figures, master, wanted, as_json=as_json)
+
+    run_stream(run)
+
+
+def _shared(window: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate with the arguments and flags of all three commands.
+
+    Args:
+        window: The default of ``--window``.
+    """
+    messages = click.option(
+        "-w",
+        "--window",
+        type=click.IntRange(2, 1_000_000),
+        default=window,
+        show_default=True,
+        help="Over how many messages.",
+    )
+    count = click.option("-n", "--count", type=click.IntRange(1), help="Stop after so many messages.")
+    return lambda command: click.argument("topic", shell_complete=completes("topic"))(
+        messages(count(graph_options(command)))
+    )
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa topic hz /cmd\n  rmpa topic hz joystick:/cmd -w 100 --json\n")
+@_shared(50_000)
+def hz(topic: str, window: int, count: int | None, options: GraphOptions) -> None:
+    """Show how often messages come, once a second until Ctrl-C.
+
+    The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
+    the arrivals of the last minute over the mesh.
+    """
+    _watch(topic, lambda _: _Rate(window), count, options)
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa topic bw /camera/image_raw -w 30\n  rmpa topic bw base:/map --json\n")
+@_shared(100)
+def bw(topic: str, window: int, count: int | None, options: GraphOptions) -> None:
+    """Show how many bytes a second messages need, once a second until Ctrl-C.
+
+    The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
+    the arrivals of the last minute over the mesh.
+    """
+    _watch(topic, lambda _: _Bandwidth(window), count, options)
+
+
+@click.command(
+    epilog="""\
+\b
+Examples:
+  rmpa topic delay base:/odom
+  rmpa topic delay /cmd_vel --json | jq '.routes[].latency'   no header is needed over the mesh
+"""
+)
+@_shared(50_000)
+def delay(topic: str, window: int, count: int | None, options: GraphOptions) -> None:
+    """Show how old messages are when they come, once a second until Ctrl-C.
+
+    First by the header's stamp: from the publisher's stamp to here, exact across machines only as far as their clocks
+    agree. Then, for each remote source, by the link's clock: from the publisher's agent to this one. That needs
+    neither a header nor clocks that agree, and the true value lies within the ± that is shown.
+    """
+    _watch(topic, lambda master: _Delay(window, by_link=master.agent is not None), count, options)

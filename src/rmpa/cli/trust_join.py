@@ -13,8 +13,8 @@ import click
 
 from rmpa.cli.options import json_option
 from rmpa.cli.output import print_json, print_line, warn
-from rmpa.cli.trust_mesh import EXIT_CODES
-from rmpa.cli.trust_place import (
+from rmpa.cli.trust import (
+    EXIT_CODES,
     check_library,
     config_option,
     confirm,
@@ -30,7 +30,7 @@ from rmpa.trust import limits
 from rmpa.trust.joining import InviteReply, JoinStep, TrustReply
 
 if TYPE_CHECKING:
-    from rmpa.cli.trust_place import TrustPlace
+    from rmpa.cli.trust import TrustPlace
     from rmpa.trust.store import MemberFiles
 
 _LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")

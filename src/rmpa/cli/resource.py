@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import msgspec
 
 from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.bridge.proxies import proxied_node, proxied_peer
-from rmpa.cli.graph import GraphName, read_graph, read_name
-from rmpa.cli.output import printable
-from rmpa.cli.stream import with_node
+from rmpa.cli.options import GraphOptions, graph_options, with_node
+from rmpa.cli.output import Column, GraphName, print_json, print_table, printable, read_graph, read_name, warn
 from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
@@ -24,9 +25,7 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
-    from rmpa.cli.graph import Graph
-    from rmpa.cli.master import Master
-    from rmpa.cli.options import GraphOptions
+    from rmpa.cli.output import Graph, Master
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
 
@@ -268,3 +267,56 @@ def known_name(what: str, text: str, known: Iterable[str]) -> str:
         remedy = f"did you mean {printable(near)}?" if near else f"there are {printable(', '.join(names)) or 'none'}"
         raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)
     return text
+
+
+# ``rmpa resource list``: the resources of the graph.
+
+
+_COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
+_TITLES: Final = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
+_EXAMPLES: Final = """\
+\b
+Examples:
+  rmpa resource list
+  rmpa resource list --json | jq -r '.[].name'
+"""
+
+
+@click.command("list", epilog=_EXAMPLES)
+@graph_options
+def list_(options: GraphOptions) -> None:
+    """List the resources of this module, and those of peers with the peers' names."""
+
+    async def body(graph: ResourceGraph) -> None:
+        for path, count in Counter(one.path for one in graph.seen).items():
+            if count > 1:
+                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
+                warn(f"{count} modules have a resource {path}: {text}")
+        states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
+        found: list[dict[str, Any]] = [
+            {
+                "name": one.path,
+                "peer": one.peer,
+                "role": one.descriptor.role,
+                "physical": one.descriptor.physical,
+                "description": one.descriptor.description,
+                "state": states.get(one),
+                "profile": profiles.get(one),
+                "context": contexts.get(one),
+            }
+            for one in graph.seen
+        ]
+        if options.as_json:
+            print_json(found)
+        else:
+            rows = [_row(str(one), each) for one, each in zip(graph.seen, found, strict=True)]
+            colours = [_COLOURS.get(each["state"], "") for each in found]
+            print_table(tuple(map(Column, _TITLES)), rows, colours=colours)
+
+    run_with_resources(options, body)
+
+
+def _row(name: str, each: dict[str, Any]) -> list[str]:
+    kind = "device" if each["physical"] else "simulated"
+    ends = [each["profile"] or "-", each["context"] or "-", each["description"]]
+    return [name, each["state"] or "does not answer", each["role"], kind, *ends]
