@@ -17,7 +17,7 @@ import rmpa
 from rmpa.config.read import SCHEMAS
 from rmpa.core import limits as sizes
 from rmpa.core.limits import KIB, MIB
-from rmpa.web.monitor import limits as monitor_limits
+from rmpa.web import limits as monitor_limits
 
 
 def all_limits() -> dict[str, list[float]]:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from lab.bed.processes import Process
+from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from rmpa.web.monitor.patch import apply
 from tests.examples.test_demo import DEMO, all_linked, flows, views, wait_for_view
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.session import FoxgloveSession, Output
 from rmpa.web.hub import requests
-from rmpa.web.hub.rights import Rights
+from rmpa.web.hub.node_link import Rights
 
 ALL = Rights(view=True, control=True)
 SEEDS: list[bytes] = [

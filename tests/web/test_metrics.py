@@ -17,8 +17,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.web import limits
-from rmpa.web.metrics import EVENT_KINDS, exposition, metrics
-from rmpa.web.server.figures import Figures, web_metrics
+from rmpa.web.api import EVENT_KINDS, exposition, metrics
+from rmpa.web.server.access import Figures, web_metrics
 from tests.web.snapshots import AGENT, FULL, SERVICE, peer, route
 
 FIGURES = Figures(1, 2, {"200": 3}, {"host": 4}, 5, 0.6)

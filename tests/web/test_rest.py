@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from rmpa.observe.peer_info import PeerInfo
 from rmpa.observe.snapshot import ServiceInfo, Snapshot, TopicInfo
-from rmpa.web import limits, rest
+from rmpa.web import api as rest
+from rmpa.web import limits
 from tests.web.snapshots import AGENT, FULL, SERVICE
 
 API = "/api/v1"

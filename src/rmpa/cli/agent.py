@@ -518,8 +518,7 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
     from rmpa.trust.store import TrustStore, check_open
-    from rmpa.web.server.process import WebSetup, access_of
-    from rmpa.web.server.tls import certificate_files
+    from rmpa.web.server.process import WebSetup, access_of, certificate_files
 
     store = TrustStore(module.state, module.name) if module.state is not None else None
     trusted = module.secured or (store is not None and store.exists)

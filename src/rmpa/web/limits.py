@@ -220,3 +220,178 @@ WEB_TOKEN_FILE_MAX: Final = 4096
 """Bytes of a token's file; a larger one is no token."""
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
 """Seconds between two looks at the files of the certificate: a renewed one is served long before the old one ends."""
+
+
+# Limits of the monitor's clients.
+#
+# Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
+
+
+PATCH_PERIOD: Final = 0.15
+"""Between two patches of one client: some 7 a second, which looks live and is read at leisure."""
+STATE_PERIOD: Final = 0.15
+"""Shortest time from one snapshot of the agent to the next while pages are open."""
+STATE_SHARE: Final = 4.0
+"""The pause between two snapshots is at least so many times as long as a snapshot takes: a fifth of a core."""
+UNACKNOWLEDGED_MAX: Final = 2
+"""States and patches that a client has not acknowledged yet. A slow browser gets fewer patches, never a queue."""
+REQUEST_MAX: Final = 64 * KIB
+"""Bytes of one message of a client: a parameter's value, or the arguments of a call."""
+REQUEST_RATE: Final = 50.0
+"""Messages of one client a second, in the long run: a joystick sends 10, acknowledgements 7."""
+REQUEST_BURST: Final = 200.0
+"""Messages of one client at once: a page that reconnects and asks for all that it shows."""
+LOOKS_MAX: Final = 4
+"""Things whose details one client is shown at one time; a page shows one or two."""
+WATCHES_MAX: Final = 16
+"""Topics whose messages one client is shown at one time."""
+WATCH_RATE_MAX: Final = 10.0
+"""Values, images and scans a second of one watch."""
+FIELDS_MAX: Final = 8
+"""Numeric fields of one plot: as many lines as can be told apart."""
+FIELD_CHARACTERS: Final = 256
+"""Characters of a field's path, as ``pose.pose.position.x``."""
+ASKS_MAX: Final = 16
+"""Questions of one client (why, calls, parameters) that wait for their answer."""
+POINTS_MAX: Final = 64
+"""Samples of a plot in one message. Of more, the least and the greatest of each part are kept."""
+VALUE_CHARACTERS: Final = 512
+"""Characters of a string in a live value; the rest is cut."""
+VALUE_ITEMS: Final = 64
+"""Elements of an array in a live value; the rest is counted."""
+VALUE_NODES: Final = 2000
+"""Values in one live value, all levels together."""
+SCAN_POINTS: Final = 720
+"""Ranges of a laser scan that are sent: two a degree. Of more, the nearest of each part is kept."""
+IMAGE_PIXELS: Final = 320 * 240
+"""Pixels of an uncompressed image that are sent; of more, every n-th row and column."""
+TOPICS_SHOWN: Final = 2000
+"""Topics in a state; further ones are counted."""
+SERVICES_SHOWN: Final = 2000
+"""Services in a state; further ones are counted."""
+NODES_SHOWN: Final = 2000
+"""Nodes in a state; further ones are counted."""
+PARAMETER_NAMES_SHOWN: Final = 5000
+"""Names of parameters that a search is given."""
+MODULES_SHOWN: Final = 256
+"""Modules in a state; further ones are counted. A ring of more could not be read."""
+FLOW_TOPICS: Final = 8
+"""Topics that a flow names; the busiest first."""
+LOG_LINES: Final = 500
+"""Lines of the log that are kept for a page that opens it."""
+LOG_CHARACTERS: Final = 1024
+"""Characters of one line of the log; the rest is cut."""
+SILENT_AFTER: Final = 1.0
+"""Time without a word on a link after which its module is shown as silent. Keepalives come more often. For a
+link at rest it is half of its lease."""
+AWAY_AFTER: Final = 7.0
+"""Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
+AGENT_SETTLES: Final = 10.0
+"""Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
+come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
+FORGET_AFTER: Final = 600.0
+"""Time for which a module that has left the roster is still shown."""
+STEADY: Final = 0.03
+"""Share by which a figure must change before it is shown anew, so that noise moves nothing."""
+RATE_SMOOTHING: Final = 1.0
+"""Time constant of a link's byte rates."""
+ORDER_AGE: Final = 5.0
+"""Seconds that an order of a page may be old: less than the page waits for a word before it gives all up."""
+DRIVE_TIMEOUT: Final = 0.3
+"""Time after the last command of a joystick after which the robot is stopped; a joystick sends every 0.1 s."""
+DRIVE_SPEED: Final = 2.0
+"""Magnitude of a linear speed that a joystick may command, m/s."""
+DRIVE_TURN: Final = 4.0
+"""Magnitude of an angular speed that a joystick may command, rad/s."""
+RESOURCES_MAX: Final = 256
+"""Paths of Smart Resources that are followed; each is up to nine subscriptions."""
+LOOK_KEPT: Final = 10.0
+"""Time for which the details of a Smart Resource are followed after a page has shown it."""
+TICK_PERIOD: Final = 2.0
+"""Time between two signs of life to a page, which takes its connection for lost after three without any."""
+UNSENT_RETRY: Final = 0.1
+"""Pause before it is looked again whether a page has taken what was sent."""
+ANSWERS_AT_ONCE: Final = 4
+"""Questions of all pages together that wait for the agent, each in a thread: `why` takes seconds."""
+VALUES_BYTES: Final = 4 * MIB
+"""Bytes of the messages whose decoded values are kept for further pages; values take some ten times as much."""
+DECISION_DEPTH: Final = 32
+"""Objects and arrays within each other in what a Smart Resource says of its decision; a deeper one is not shown."""
+STATE_PAUSE_MAX: Final = 0.5
+"""The longest pause between two snapshots."""
+
+
+# Bounds and time-outs of one rosbridge client, in seconds and bytes.
+
+
+FRAME_MAX: Final = 10 * MIB
+"""One frame of a client, and so a message that it publishes, in JSON; rosbridge_suite's default."""
+BINARY_FRAME_MAX: Final = 2 * MIB
+"""One frame of a client in CBOR: each byte may be a value, which takes up to 64 bytes."""
+CONTAINERS_MAX: Final = 200_000
+"""Objects and lists in one frame in JSON: an empty object has two characters and takes 64 bytes."""
+ID_MAX: Final = 1 * KIB
+"""Characters of an ``id``, which is sent back and kept."""
+NAME_MAX: Final = 1 * KIB
+"""Characters of the name of a topic, service or type."""
+FRAGMENTS_MAX: Final = 10_000
+"""Fragments of one message, sent or received: a fragment of one character would need 100 bytes around it."""
+FRAGMENTED_MAX: Final = 16 * MIB
+"""Bytes of all incomplete messages of a client; the oldest incomplete message is dropped."""
+FRAGMENTED_MESSAGES_MAX: Final = 16
+"""Incomplete messages of a client; the oldest is dropped."""
+TYPE_WAIT: Final = 2.0
+"""Time for a topic to appear that is subscribed to without a type, as it may begin at the same moment."""
+FRAGMENT_TIMEOUT: Final = 60.0
+"""Time within which the next fragment of a message must arrive."""
+PNG_MAX: Final = 4 * MIB
+"""Bytes that a client's PNG unpacks to: its lines may have filters, which are undone in Python."""
+SUBSCRIPTIONS_MAX: Final = 1000
+"""Subscribed topics of a client; a page that shows all topics of some large modules stays below."""
+SUBSCRIBERS_MAX: Final = 100
+"""Ids of one client that subscribe to one topic, or advertise it."""
+QUEUE_MESSAGES_MAX: Final = 1000
+"""Largest ``queue_length`` of a subscription; larger ones are lowered to it."""
+QUEUE_BYTES_MAX: Final = 4 * MIB
+"""Bytes queued for a throttled subscription; the oldest are dropped, one message always fits."""
+QUEUES_BYTES_MAX: Final = 16 * MIB
+"""Bytes queued for all throttled subscriptions of a client; the newest message is dropped."""
+ADVERTISED_MAX: Final = 500
+"""Topics that a client advertises."""
+CALLS_MAX: Final = 1000
+"""Calls of a client without an answer yet, questions of rosapi included."""
+SERVED_MAX: Final = 200
+"""Services that a client offers."""
+REQUESTS_MAX: Final = 1000
+"""Calls to services that a client offers, without its answer yet."""
+SHARED_FRAMES: Final = 64
+"""Messages kept in the form in which they were sent, for further clients of the same topic."""
+SHARED_BYTES: Final = 16 * MIB
+"""Bytes of these; larger messages are converted for each client."""
+PARAMETER_DEPTH_MAX: Final = 32
+"""Lists and dictionaries within each other in a parameter; beyond, other nodes' XML-RPC libraries give up."""
+TEXT_MAX: Final = 500
+"""Characters of a status message."""
+
+
+# Bounds of the conversion between ROS 1 bytes and values.
+
+
+CODECS_MAX: Final = 512
+"""Compiled types in the cache of the process; a module has some 50 types. The least recently used is dropped."""
+TYPE_VALUES_MAX: Final = 100_000
+"""Values that a message without elements in its arrays of any length has; a covariance has 36, a type rarely 200."""
+TYPE_SIZE_MAX: Final = 16 * MIB
+"""Bytes of the smallest message of a type: it has fixed arrays of this size together."""
+WRITTEN_MAX: Final = 64 * MIB
+"""Bytes of a message that is written from values."""
+VALUES_PER_BYTE: Final = 16
+"""Values read for each byte of a message: messages within arrays that have no bytes could be any number."""
+VALUES_FREE: Final = 10_000
+"""Values that any message may have beyond that."""
+INLINE_MAX: Final = 64
+"""Numbers of an embedded message that are read in one step with those around it."""
+MISSING_NAMED: Final = 8
+"""Fields that were not given and are named to the client."""
+SHOWN: Final = 60
+"""Characters of a wrong value in an error."""

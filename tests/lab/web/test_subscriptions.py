@@ -14,8 +14,8 @@ from lab.nodes.node import HEAD
 from lab.web.subscriptions import How, head_of
 from lab.web.websocket import BINARY, TEXT, Frame
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.rosbridge.encodings import Compression, PublishFrames, encode_cbor_raw
-from rmpa.web.values.codec import codec_for
+from rmpa.web.rosbridge.protocol import Compression, PublishFrames, encode_cbor_raw
+from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lab.bed.processes import BedError
 from lab.web.websocket import BINARY, TEXT, Frame, FrameReader, WebSocket
-from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+from rmpa.web.gateways.frame_writer import Opcode, frame_header
 
 
 def sent(opcode: Opcode, payload: bytes) -> bytes:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.web.hub.rights import Rights
-from rmpa.web.monitor import limits
+from rmpa.web import limits
+from rmpa.web.hub.node_link import Rights
 
 if TYPE_CHECKING:
     from lab.bed.chromium import Chromium

@@ -11,8 +11,8 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web.foxglove import protocol
 from rmpa.web.foxglove.session import FoxgloveClose, FoxgloveSession, Output
 from rmpa.web.hub import requests
+from rmpa.web.hub.node_link import Rights
 from rmpa.web.hub.requests import GraphService, GraphTopic
-from rmpa.web.hub.rights import Rights
 
 ALL = Rights(view=True, control=True)
 CHATTER = GraphTopic("/chatter", ("std_msgs/String",), ("/talker",), ("/listener",))

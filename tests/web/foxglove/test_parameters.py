@@ -12,7 +12,7 @@ from msgspec import UNSET
 
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.parameters import ParameterError, ParameterRequests, from_parameter, to_parameter
+from rmpa.web.foxglove.channels import ParameterError, ParameterRequests, from_parameter, to_parameter
 from rmpa.web.hub import requests
 
 NAMES = ("/a", "/b")

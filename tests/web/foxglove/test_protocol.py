@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.parameters import to_parameter
+from rmpa.web.foxglove.channels import to_parameter
 from rmpa.web.foxglove.protocol import Capability
 
 SET_BOOL = {

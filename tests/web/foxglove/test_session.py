@@ -14,8 +14,8 @@ from rmpa.core.errors import LocalProtocolError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
 from rmpa.web.hub import requests
+from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_REMEDY, Rights
 from rmpa.web.hub.requests import GraphService, GraphTopic
-from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY, Rights
 from tests.web.foxglove.client import CHATTER, SET_BOOL, Client, described, message
 
 # --- opening, channels ---

@@ -11,8 +11,8 @@ import aiohttp
 from aiohttp import web
 
 from rmpa.web.gateways.gateways import MONITOR_PATH, Gateways
-from rmpa.web.hub.rights import FULL, Rights
-from rmpa.web.monitor.io.monitor import Monitor
+from rmpa.web.hub.node_link import FULL, Rights
+from rmpa.web.monitor.monitor import Monitor
 from tests.ros.node.peers import DEADLINE
 from tests.web.hub.client import running_hub
 

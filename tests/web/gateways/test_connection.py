@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.web.gateways.connection import ClientConnection, OutFrame
 from rmpa.web.gateways.frame_writer import FrameWriter
-from rmpa.web.hub.clients import HubClient
-from rmpa.web.hub.rights import READ_ONLY
+from rmpa.web.hub.node_link import READ_ONLY, HubClient
 from tests.ros.node.peers import DEADLINE
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.web.gateways.frame_writer import FrameWriter
-from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+from rmpa.web.gateways.frame_writer import FrameWriter, Opcode, frame_header
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.hub.rights import FULL, READ_ONLY
-from rmpa.web.server.tls import tls_context
+from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.server.process import tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.gateways.server import Client, Server, running_server
 from tests.web.hub.client import node
@@ -102,7 +102,7 @@ async def test_rosbridge_counts_its_clients(core: RosCore) -> None:
 
 async def test_a_message_is_converted_once_for_all_clients(core: RosCore, monkeypatch: Any) -> None:
     made: list[str] = []
-    from rmpa.web.rosbridge import encodings
+    from rmpa.web.rosbridge import protocol as encodings
 
     encode = encodings._encode
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.web import limits
-from rmpa.web.gateways.message_arrival import CommandAge, MessageArrival
+from rmpa.web.gateways.connection import CommandAge, MessageArrival
 
 LONG = limits.MESSAGE_TIMEOUT
 

@@ -21,10 +21,10 @@ from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticSt
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.web.hub.rights import FULL, READ_ONLY
-from rmpa.web.monitor import limits
+from rmpa.web import limits
+from rmpa.web.hub.node_link import FULL, READ_ONLY
+from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from rmpa.web.monitor.patch import apply
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.gateways.server import running_server
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.node import Node
-    from rmpa.web.hub.rights import Rights
+    from rmpa.web.hub.node_link import Rights
 
 TEXT = MessageType("std_msgs/String")
 TWIST = MessageType("geometry_msgs/Twist")

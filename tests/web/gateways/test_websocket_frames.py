@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.web.gateways.websocket_frames import MaskCheck, Opcode, frame_header
+from rmpa.web.gateways.frame_writer import MaskCheck, Opcode, frame_header
 
 
 @pytest.mark.parametrize(

@@ -10,15 +10,15 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.node_link import EVERYTHING, FULL, Rights
 from rmpa.web.hub.requests import Answer, Failed, GraphChanged, ReceivedMessage
-from rmpa.web.hub.rights import EVERYTHING, FULL, Rights
 from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from rmpa.web.hub.node_link import NodeRules
     from rmpa.web.hub.requests import HubRequest
-    from rmpa.web.hub.rights import NodeRules
 
 _A = TypeVar("_A", bound=Answer)
 _names = itertools.count(1)

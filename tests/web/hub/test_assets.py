@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import LimitExceeded
-from rmpa.web.hub.assets import AssetError, read_asset
+from rmpa.web.hub.services import AssetError, read_asset
 
 if TYPE_CHECKING:
     from pathlib import Path

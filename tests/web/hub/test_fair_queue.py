@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.web.hub.fair_queue import FairQueue
+from rmpa.web.hub.node_link import FairQueue
 
 
 def _all(queue: FairQueue[str]) -> list[str]:

@@ -12,7 +12,7 @@ from rmpa.observe import limits
 from rmpa.observe.control import GraphHistory, GraphRows, ServiceRow, TopicRow
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
-from rmpa.web.hub.graph_table import GraphTable, rows_of
+from rmpa.web.hub.graph import GraphTable, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

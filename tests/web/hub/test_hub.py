@@ -16,6 +16,7 @@ from rmpa.ros.types.definitions import HEADER_PART, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
+from rmpa.web.hub.node_link import CONTROL_REMEDY, FULL, READ_ONLY, READ_REMEDY
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
     CallService,
@@ -43,7 +44,6 @@ from rmpa.web.hub.requests import (
     UnadvertiseTopic,
     Unsubscribe,
 )
-from rmpa.web.hub.rights import CONTROL_REMEDY, FULL, READ_ONLY, READ_REMEDY
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.hub.client import FakeClient, node, running_hub
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from rmpa.web.hub.node_link import NodeLink
-from rmpa.web.hub.params import ParamMirror
+from rmpa.web.hub.publishers import ParamMirror
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.web import limits
-from rmpa.web.hub.payload_buffers import PayloadBuffers
+from rmpa.web.hub.topics import PayloadBuffers
 
 SIZE = 100_000
 

@@ -30,18 +30,18 @@ from rmpa.observe.peer_info import LaneInfo, PeerAgent
 from rmpa.observe.snapshot import Snapshot
 from rmpa.observe.why.why import diagnose_module
 from rmpa.web.hub import requests
-from rmpa.web.hub.rights import FULL
+from rmpa.web.hub.node_link import FULL
 from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from rmpa.web.monitor.nodes import node_detail, node_key
+from rmpa.web.monitor.questions import node_detail, node_key
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.view import StateBuilder, details
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.web.hub.rights import Rights
-    from rmpa.web.monitor.patch import Tree
+    from rmpa.web.hub.node_link import Rights
+    from rmpa.web.monitor.live import Tree
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"

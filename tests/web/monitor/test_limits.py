@@ -6,8 +6,9 @@ import re
 from pathlib import Path
 
 from rmpa.core.limits import KIB
+from rmpa.web import limits
 from rmpa.web import limits as web_limits
-from rmpa.web.monitor import limits, messages, session
+from rmpa.web.monitor import messages, session
 
 PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.web.monitor import limits
+from rmpa.web import limits
 from rmpa.web.monitor.live import IMAGE_HEADER, compressed_picture, cut, field_path, number_at, raw_picture, scan
 
 

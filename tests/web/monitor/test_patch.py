@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rmpa.web.monitor.patch import apply, difference, without_nulls
+from rmpa.web.monitor.live import apply, difference, without_nulls
 
 SCALARS = st.booleans() | st.integers(-3, 3) | st.sampled_from((0.0, 1.0, 1.5, -2.0)) | st.text(max_size=3)
 KEYS = st.sampled_from(("a", "b", "/odom", "__proto__", ""))

@@ -7,7 +7,7 @@ import math
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rmpa.web.monitor.series import SampleBuffer
+from rmpa.web.monitor.live import SampleBuffer
 
 VALUE = st.none() | st.integers(-1000, 1000).map(float)
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.web import limits
+from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
-from rmpa.web.hub.rights import FULL, Rights
-from rmpa.web.monitor import limits
-from rmpa.web.monitor.patch import apply
+from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
 
 if TYPE_CHECKING:

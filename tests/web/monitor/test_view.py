@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
-from rmpa.web.monitor import limits
-from rmpa.web.monitor.patch import Tree, apply, difference
+from rmpa.web import limits
+from rmpa.web.monitor.live import Tree, apply, difference
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.view import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots

@@ -11,8 +11,8 @@ import msgspec
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.requests import Answer, GraphService, GraphTopic, HubRequest, ParamValue, ReceivedMessage
-from rmpa.web.rosbridge.encodings import PublishFrames
-from rmpa.web.rosbridge.session import RosbridgeSession
+from rmpa.web.rosbridge.calls import RosbridgeSession
+from rmpa.web.rosbridge.protocol import PublishFrames
 
 if TYPE_CHECKING:
     from rmpa.web.rosbridge.protocol import RosbridgeFrame

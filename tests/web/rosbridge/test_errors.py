@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.web import limits
 from rmpa.web.hub.requests import (
     CallService,
     Failed,
@@ -18,7 +19,6 @@ from rmpa.web.hub.requests import (
     Subscribe,
     Unsubscribe,
 )
-from rmpa.web.rosbridge import limits
 from tests.web.rosbridge.hub import Client
 
 if TYPE_CHECKING:

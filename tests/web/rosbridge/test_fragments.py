@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded
-from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.fragments import Assembler, split
+from rmpa.web import limits
 from rmpa.web.rosbridge.protocol import OpError, RosbridgeFrame
+from rmpa.web.rosbridge.subscriptions import Assembler, split
 
 if TYPE_CHECKING:
     import random

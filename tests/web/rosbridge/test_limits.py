@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from rmpa.core.limits import MIB
-from rmpa.web.rosbridge import limits
+from rmpa.web import limits
 
 PAGE = Path(__file__).parents[3] / "docs" / "rosbridge.md"
 

@@ -11,6 +11,7 @@ import pytest
 
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
+from rmpa.web import limits
 from rmpa.web.hub.requests import (
     CallService,
     CancelCall,
@@ -27,10 +28,9 @@ from rmpa.web.hub.requests import (
     ServiceResult,
     SetParam,
 )
-from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.encodings import decode_png
+from rmpa.web.rosbridge.protocol import decode_png
 from rmpa.web.rosbridge.rosapi import Rosapi
-from rmpa.web.values.codec import codec_for
+from rmpa.web.values.values import codec_for
 from tests.web.rosbridge.hub import NOW_NS, Client, Types
 
 ADD = "rospy_tutorials/AddTwoInts"

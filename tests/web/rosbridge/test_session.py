@@ -5,6 +5,7 @@ import json
 import cbor2
 import pytest
 
+from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
     Failed,
@@ -14,9 +15,7 @@ from rmpa.web.hub.requests import (
     UnadvertiseTopic,
     Unsubscribe,
 )
-from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.encodings import PublishFrames, decode_png
-from rmpa.web.rosbridge.protocol import OPS
+from rmpa.web.rosbridge.protocol import OPS, PublishFrames, decode_png
 from tests.web.rosbridge.hub import NOW_NS, Client
 
 STRING = "std_msgs/String"

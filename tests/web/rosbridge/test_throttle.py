@@ -1,8 +1,8 @@
 from __future__ import annotations
 
+from rmpa.web import limits
 from rmpa.web.hub.requests import ReceivedMessage
-from rmpa.web.rosbridge import limits
-from rmpa.web.rosbridge.throttle import QueuedBytes, Throttle
+from rmpa.web.rosbridge.subscriptions import QueuedBytes, Throttle
 
 
 def _message(number: int, size: int = 1) -> ReceivedMessage:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.web.server.auth import (
+from rmpa.web.server.access import (
     AccessGranted,
     AccessPolicy,
     AccessRefused,

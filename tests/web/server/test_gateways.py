@@ -14,14 +14,12 @@ import pytest
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
+from rmpa.web.gateways.frame_writer import Opcode, frame_header
 from rmpa.web.gateways.gateways import Gateways
-from rmpa.web.gateways.websocket_frames import Opcode, frame_header
+from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.hub_setup import make_hub, priority_of
-from rmpa.web.server.process import TokenAccess, WebSetup
-from rmpa.web.server.server import WebServer
-from rmpa.web.server.tls import CertificateFiles
+from rmpa.web.server.app import WebServer
+from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub, priority_of
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node
 from tests.web.snapshots import FULL as SNAPSHOT

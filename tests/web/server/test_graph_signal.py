@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.observe.control import GraphRevisions
 from rmpa.observe.control_server import ControlServer
-from rmpa.web.server.graph_signal import GraphSignal
+from rmpa.web.server.agent_watch import GraphSignal
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node, running_hub
 

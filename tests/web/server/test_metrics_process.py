@@ -10,9 +10,8 @@ import msgspec
 import pytest
 
 from rmpa.web import limits
-from rmpa.web.metrics import exposition
-from rmpa.web.server.figures import Figures, web_metrics
-from rmpa.web.server.metrics_process import make_metrics
+from rmpa.web.api import exposition, make_metrics
+from rmpa.web.server.access import Figures, web_metrics
 from tests.web.snapshots import FULL
 
 if TYPE_CHECKING:

@@ -23,20 +23,17 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
 from rmpa.web.hub.requests import DeleteParam, ParamsChanged, SetParam
-from rmpa.web.hub.rights import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
-from rmpa.web.monitor.io import questions
-from rmpa.web.monitor.io.log_feed import LogFeed
-from rmpa.web.monitor.io.questions import Answers
-from rmpa.web.monitor.io.resource_watch import ResourceWatch
-from rmpa.web.monitor.io.values import MessageValues
+from rmpa.web.monitor import questions
+from rmpa.web.monitor.monitor import LogFeed
+from rmpa.web.monitor.questions import Answers
+from rmpa.web.monitor.resources import MessageValues, ResourceWatch
 from rmpa.web.monitor.session import Question
+from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.hub_setup import make_hub
-from rmpa.web.server.process import TokenAccess, WebSetup
-from rmpa.web.server.server import WebServer
-from rmpa.web.server.tls import CertificateFiles
+from rmpa.web.server.app import WebServer
+from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.hub.client import FakeClient, local_core, node, running_hub
 from tests.web.snapshots import FULL as SNAPSHOT

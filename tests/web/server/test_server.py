@@ -13,10 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.web import limits
+from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.app import HEADERS, OPENER_POLICY
-from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.server import WebServer
+from rmpa.web.server.app import HEADERS, OPENER_POLICY, WebServer
 from tests.web.snapshots import FULL
 
 if TYPE_CHECKING:

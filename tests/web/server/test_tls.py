@@ -14,10 +14,10 @@ import pytest
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.trust.store import MemberFiles, TrustStore
 from rmpa.web import limits
+from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.auth import AccessPolicy, own_names
-from rmpa.web.server.server import WebServer
-from rmpa.web.server.tls import CertificateFiles, ServerCertificate, certificate_files, tls_context
+from rmpa.web.server.app import WebServer
+from rmpa.web.server.process import CertificateFiles, ServerCertificate, certificate_files, tls_context
 from tests.ros.node.peers import DEADLINE
 from tests.web.snapshots import FULL as SNAPSHOT
 

@@ -9,8 +9,8 @@ import pytest
 
 from rmpa.config.settings import WebSettings
 from rmpa.core.errors import StartError
+from rmpa.web.server.access import token_from
 from rmpa.web.server.process import access_of, address_of
-from rmpa.web.server.token_file import token_from
 
 if TYPE_CHECKING:
     from pathlib import Path

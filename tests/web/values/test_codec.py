@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from rmpa.core.limits import MIB
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types
 from rmpa.ros.types.messages import MessageError, MessageType
-from rmpa.web.values import limits
-from rmpa.web.values.codec import MessageCodec, codec_for
+from rmpa.web import limits
+from rmpa.web.values.values import MessageCodec, codec_for
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
 from tests.web.values.filled import filled
 

@@ -1,8 +1,4 @@
-"""One client of the Foxglove WebSocket protocol: its frames in, frames and requests to the hub out; no I/O.
-
-``FoxgloveSession`` decodes no message: payloads cross as they come from TCPROS. Definitions, the graph, parameters
-and services come from the hub (``web.hub.requests``); a hub that has not answered delays only what it was asked for.
-"""
+"""The connection graph that a Foxglove client is told: which nodes publish, subscribe and serve what."""
 
 from __future__ import annotations
 
@@ -16,18 +12,82 @@ from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.channels import ChannelTable
-from rmpa.web.foxglove.connection_graph import ConnectionGraph
-from rmpa.web.foxglove.parameters import ParameterRequests
-from rmpa.web.foxglove.protocol import BinaryFrame, Capability, FoxgloveFrame, StatusLevel
+from rmpa.web.foxglove.channels import ChannelTable, ParameterRequests
+from rmpa.web.foxglove.protocol import (
+    AdvertisedService,
+    BinaryFrame,
+    Capability,
+    ConnectionGraphUpdate,
+    FoxgloveFrame,
+    PublishedTopic,
+    StatusLevel,
+    SubscribedTopic,
+)
 from rmpa.web.hub import requests
-from rmpa.web.hub.rights import CONTROL_REMEDY, READ_REMEDY
+from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_REMEDY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
-    from rmpa.web.hub.requests import Payload
-    from rmpa.web.hub.rights import Rights
+    from rmpa.web.hub.node_link import Rights
+    from rmpa.web.hub.requests import GraphChanged, Payload
+
+_UNCHANGED: Final = ConnectionGraphUpdate(
+    published_topics=(), subscribed_topics=(), advertised_services=(), removed_topics=(), removed_services=()
+)
+
+
+class ConnectionGraph:
+    """The graph as one client has been told it; ``update`` is what differs since."""
+
+    def __init__(self) -> None:
+        self._publishers: dict[str, tuple[str, ...]] = {}
+        self._subscribers: dict[str, tuple[str, ...]] = {}
+        self._providers: dict[str, tuple[str, ...]] = {}
+
+    def update(self, graph: GraphChanged) -> ConnectionGraphUpdate | None:
+        """The changes that lead to this graph; ``None`` without any. A topic without nodes counts as removed."""
+        publishers = {topic.name: topic.publishers for topic in graph.topics if topic.publishers}
+        subscribers = {topic.name: topic.subscribers for topic in graph.topics if topic.subscribers}
+        providers = {service.name: service.providers for service in graph.services}
+        before = self._publishers.keys() | self._subscribers.keys()
+        removed = before - publishers.keys() - subscribers.keys()
+        update = ConnectionGraphUpdate(
+            published_topics=tuple(
+                PublishedTopic(name=name, publisher_ids=ids)
+                for name, ids in _changed(self._publishers, publishers, removed)
+            ),
+            subscribed_topics=tuple(
+                SubscribedTopic(name=name, subscriber_ids=ids)
+                for name, ids in _changed(self._subscribers, subscribers, removed)
+            ),
+            advertised_services=tuple(
+                AdvertisedService(name=name, provider_ids=ids)
+                for name, ids in _changed(self._providers, providers, self._providers.keys() - providers.keys())
+            ),
+            removed_topics=tuple(sorted(removed)),
+            removed_services=tuple(sorted(self._providers.keys() - providers.keys())),
+        )
+        self._publishers, self._subscribers, self._providers = publishers, subscribers, providers
+        return update if update != _UNCHANGED else None
+
+
+def _changed(
+    before: Mapping[str, tuple[str, ...]], now: Mapping[str, tuple[str, ...]], removed: Iterable[str]
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Entries that are new or differ, and with no node those that ended while their name remains in the graph."""
+    yield from ((name, ids) for name, ids in now.items() if before.get(name) != ids)
+    gone = before.keys() - now.keys() - set(removed)
+    yield from ((name, ()) for name in sorted(gone))
+
+
+# One client of the Foxglove WebSocket protocol: its frames in, frames and requests to the hub out; no I/O.
+#
+# ``FoxgloveSession`` decodes no message: payloads cross as they come from TCPROS. Definitions, the graph,
+# parameters
+# and services come from the hub (``web.hub.requests``); a hub that has not answered delays only what it was asked
+# for.
+
 
 CLOCK: Final = ("/clock", "rosgraph_msgs/Clock")
 """The topic that gives the time where ``use_sim_time`` is set, and its type."""

@@ -5,26 +5,397 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final, TypeVar
 
+from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RmpaError
+from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response
+from rmpa.ros.node.fetch_type import fetch_type
+from rmpa.ros.types.definitions import UnknownTypeError, known_text
+from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
+from rmpa.ros.types.installed import ServiceType, known_services
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
 from rmpa.web import limits
-from rmpa.web.hub.graph_table import GraphTable, rows_of
+from rmpa.web.hub.requests import GraphService, GraphTopic
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.observe.control import GraphRows
     from rmpa.ros.node.node import Node
-    from rmpa.web.hub.clients import Key
-    from rmpa.web.hub.node_link import NodeLink
-    from rmpa.web.hub.requests import GraphService, GraphTopic
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+    from rmpa.web.hub.node_link import Key, NodeLink
     from rmpa.web.hub.services import FoundService
 
+
+# The topics, services and nodes of the graph, from rows of the agent or from the master's own answers; no I/O.
+
+
+_Rows = dict[str, tuple[str, ...]]
+_T = TypeVar("_T")
+_KNOWN_TYPES: Final = {"/rosout": "rosgraph_msgs/Log", "/rosout_agg": "rosgraph_msgs/Log"}
+"""Types where the master has none: clients tell ROS 1 by that of ``/rosout``."""
+
+
+class GraphTable:
+    """The graph as it was last told. What did not change costs next to nothing.
+
+    Args:
+        found: ``(service)``: its type and URI as far as known, else two empty texts.
+        services_changed: ``(names)``: services that have other providers than before, or were registered anew.
+    """
+
+    def __init__(
+        self, found: Callable[[str], tuple[str, str]], services_changed: Callable[[Iterable[str]], None]
+    ) -> None:
+        self._found = found
+        self._services_changed = services_changed
+        self._rows: dict[str, TopicRow] = {}
+        self._seen: dict[str, dict[str, None]] = {}
+        self._nodes: Sequence[str] | None = None
+        self.topics: Mapping[str, GraphTopic] = {}
+        """By name, in order of names; replaced by each change, so that it may be kept."""
+        self.services: Mapping[str, GraphService] = {}
+        """Likewise."""
+
+    @property
+    def nodes(self) -> Sequence[str]:
+        """In order of names."""
+        if self._nodes is None:
+            found = {node for row in self._rows.values() for node in (*row.publishers, *row.subscribers)}
+            self._nodes = sorted(found.union(*(service.providers for service in self.services.values())))
+        return self._nodes
+
+    def update(self, rows: GraphRows) -> bool:
+        """Take rows; returns whether the graph differs from what it was."""
+        topics = _differing(self._rows, rows.topics)
+        services = [row for row in rows.services if not rows.whole or self._other_providers(row)]
+        if rows.whole:
+            names = {row.name for row in rows.topics}
+            topics += [TopicRow(name, "", (), ()) for name in self._rows if name not in names]
+            names = {row.name for row in rows.services}
+            services += [ServiceRow(name, ()) for name in self.services if name not in names]
+        if not topics and not services:
+            return False
+        self._nodes = None
+        for row in topics:
+            self._keep(row)
+        if topics:
+            self.topics = _updated(self.topics, {row.name: self._topic(row.name) for row in topics})
+        if services:
+            self._services_changed([row.name for row in services])
+            self.services = _updated(self.services, {row.name: self._service(row) for row in services})
+        return True
+
+    def saw_type(self, topic: str, type_: str) -> bool:
+        """A publisher of a topic has this type; the master knows one only. Returns whether the graph differs now."""
+        seen = self._seen.setdefault(topic, {})
+        if type_ in seen or len(seen) >= limits.SEEN_TYPES_MAX:
+            return False
+        seen[type_] = None
+        known = self.topics.get(topic)
+        if known is None or type_ in known.types:
+            return False
+        self.topics = _updated(self.topics, {topic: self._topic(topic)})
+        return True
+
+    def found_services(self) -> None:
+        """Types of services became known."""
+        rows = (ServiceRow(service.name, service.providers) for service in self.services.values())
+        self.services = {row.name: service for row in rows if (service := self._service(row))}
+
+    def _other_providers(self, row: ServiceRow) -> bool:
+        known = self.services.get(row.name)
+        return set(row.providers) != set(known.providers if known else ())
+
+    def _keep(self, row: TopicRow) -> None:
+        if row.publishers or row.subscribers:
+            self._rows[row.name] = row
+        else:
+            self._rows.pop(row.name, None)
+        if not row.publishers:
+            self._seen.pop(row.name, None)
+
+    def _topic(self, name: str) -> GraphTopic | None:
+        row = self._rows.get(name)
+        if row is None:
+            return None
+        types = dict.fromkeys(() if row.type in (ANY, "") else (row.type,)) | self._seen.get(name, {})
+        known = tuple(types) or ((_KNOWN_TYPES[name],) if name in _KNOWN_TYPES else ())
+        return GraphTopic(name, known, tuple(sorted(row.publishers)), tuple(sorted(row.subscribers)))
+
+    def _service(self, row: ServiceRow) -> GraphService | None:
+        if not row.providers:
+            return None
+        type_, uri = self._found(row.name)
+        return GraphService(row.name, type_, tuple(sorted(row.providers)), uri)
+
+
+def rows_of(state: XmlRpcValue, types: XmlRpcValue) -> GraphRows:
+    """All rows, from the answers of a master.
+
+    Args:
+        state: The value of ``getSystemState``; what is malformed in it is left out.
+        types: The value of ``getTopicTypes``, likewise.
+    """
+    tables = state if isinstance(state, list) and len(state) == 3 else [[], [], []]
+    publishers, subscribers, services = map(_table, tables)
+    known: dict[str, str] = {}
+    for row in types if isinstance(types, list) else ():
+        match row:
+            case [str(name), str(type_)]:
+                known[name] = type_
+    return GraphRows(
+        whole=True,
+        topics=tuple(
+            TopicRow(name, known.get(name, ANY), publishers.get(name, ()), subscribers.get(name, ()))
+            for name in publishers.keys() | subscribers.keys()
+        ),
+        services=tuple(ServiceRow(name, providers) for name, providers in services.items()),
+    )
+
+
+def _table(value: XmlRpcValue) -> _Rows:
+    found: _Rows = {}
+    for row in value if isinstance(value, list) else ():
+        match row:
+            case [str(name), list(nodes)]:
+                found[name] = tuple(str(node) for node in nodes)
+    return found
+
+
+def _differing(known: Mapping[str, TopicRow], rows: Iterable[TopicRow]) -> list[TopicRow]:
+    return [row for row in rows if known.get(row.name) != row]
+
+
+def _updated(before: Mapping[str, _T], changes: Mapping[str, _T | None]) -> dict[str, _T]:
+    """A copy in order of names with these changes; ``None`` removes."""
+    made = dict(before)
+    for name, value in changes.items():
+        if value is None:
+            made.pop(name, None)
+        else:
+            made[name] = value
+    if all(name in before for name in changes):
+        return made
+    return {name: made[name] for name in sorted(made)}
+
+
+# Definitions of message and service types: those that rmpa brings, this machine's, and those of publishers.
+
+
 _log = logging.getLogger(__name__)
+
+
+class TypeLibrary:
+    """All types that are known, and those that clients wait for.
+
+    A publisher's own definition replaces another version of the same name, because its messages have that form.
+
+    Args:
+        link: Has the node, whose publishers are asked.
+    """
+
+    def __init__(self, link: NodeLink) -> None:
+        self._link = link
+        self._messages: OrderedDict[str, MessageType] = OrderedDict()
+        self._versions: OrderedDict[tuple[str, str], MessageType] = OrderedDict()
+        self._services: OrderedDict[str, ServiceType] = OrderedDict()
+        self._missing: OrderedDict[tuple[str, bool], tuple[float, RmpaError]] = OrderedDict()
+        self._finding: dict[str, asyncio.Future[MessageType]] = {}
+        self._wanted: dict[str, dict[Key, Callable[[MessageType], None]]] = {}
+        self._asked = asyncio.Semaphore(limits.DESCRIBE_AT_ONCE)
+        self._searches = TokenBucket(limits.SEARCH_RATE, limits.SEARCH_BURST)
+
+    # --- at once, for the sessions ---------------------------------------------------------------------------
+
+    def message(self, name: str) -> MessageType:
+        """A message type that is known or on this machine; its first search reads files.
+
+        Raises:
+            DefinitionError: It is not found; the error is repeated within ``limits.PROBE_RETRY``.
+        """
+        kind = self._messages.get(name)
+        if kind is None:
+            self._check_missing(name, service=False)
+            if known_text(name) is None:
+                self._search()
+            try:
+                kind = MessageType(name) if known_text(name) is not None else find_message_type(name)
+            except RmpaError as error:
+                if isinstance(error, UnknownTypeError) and error.fetchable:
+                    self._start_finding(name)  # a publisher may tell it, for the next question
+                raise self._remember(name, error, service=False) from None
+            self._keep(name, kind)
+        return kind
+
+    def at_hand(self, name: str) -> MessageType | None:
+        """A message type as ``message`` finds it, or ``None``."""
+        try:
+            return self.message(name)
+        except RmpaError:
+            return None
+
+    def version(self, name: str, md5sum: str) -> MessageType:
+        """The version of a message type that a publisher has; that of ``message`` where its md5 sum is not known.
+
+        Modules may have been built with different versions of one type.
+
+        Raises:
+            DefinitionError: As for ``message``.
+        """
+        return self._versions.get((name, md5sum)) or self.message(name)
+
+    def seen_version(self, name: str, md5sum: str) -> MessageType | None:
+        """The version of a message type with that md5 sum, if it is known."""
+        return self._versions.get((name, md5sum))
+
+    def service(self, name: str) -> ServiceType:
+        """A service type; as ``message``."""
+        kind = self._services.get(name)
+        if kind is None:
+            self._check_missing(name, service=True)
+            if name not in known_services():
+                self._search()
+            try:
+                kind = ServiceType(name) if name in known_services() else find_service_type(name)
+            except RmpaError as error:
+                raise self._remember(name, error, service=True) from None
+            self._services[name] = kind
+            if len(self._services) > ros_limits.TYPES_FOUND_MAX:
+                self._services.popitem(last=False)
+        return kind
+
+    # --- with time --------------------------------------------------------------------------------------------
+
+    async def find_message(self, name: str) -> MessageType:
+        """A message type that is known, on this machine, or told by a publisher.
+
+        Raises:
+            DefinitionError: None of them has it.
+            UnreachableError: The master does not answer.
+        """
+        kind = self._messages.get(name)
+        if kind is not None:
+            return kind
+        return await asyncio.shield(self._start_finding(name))
+
+    async def find_service(self, name: str) -> ServiceType:
+        """A service type that is known or on this machine.
+
+        Raises:
+            DefinitionError: It is not found.
+        """
+        if name not in self._services:
+            self._check_missing(name, service=True)
+            try:
+                self._services[name] = await asyncio.to_thread(find_service_type, name)
+            except RmpaError as error:
+                raise self._remember(name, error, service=True) from None
+        return self._services[name]
+
+    def learn(self, header: Mapping[str, str]) -> None:
+        """Take the definition of a publisher's header."""
+        name = header.get("type", "")
+        known = self._messages.get(name)
+        md5sum = header.get("md5sum", "")
+        if not name or (known is not None and known.md5sum == md5sum) or (name, md5sum) in self._versions:
+            return
+        if not header.get("message_definition"):
+            return
+        try:
+            kind = type_of_header(header)
+        except RmpaError as error:
+            _log.debug("! the definition of %s by %s: %s", name, header.get("callerid"), error)
+            return
+        self._keep(name, kind)
+
+    def want(self, key: Key, name: str, known: Callable[[MessageType], None]) -> None:
+        """Call ``known`` once when a message type becomes known that was not found."""
+        self._wanted.setdefault(name, {})[key] = known
+
+    def forget_client(self, number: int) -> None:
+        """Drop what a client wanted."""
+        for name, wanted in [*self._wanted.items()]:
+            for key in [key for key in wanted if key[0] == number]:
+                del wanted[key]
+            if not wanted:
+                del self._wanted[name]
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """The message types that clients wait for."""
+        return tuple(self._wanted)
+
+    async def close(self) -> None:
+        """End all searches."""
+        finding = [*self._finding.values()]
+        for each in finding:
+            each.cancel()
+        await asyncio.gather(*finding, return_exceptions=True)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _start_finding(self, name: str) -> asyncio.Future[MessageType]:
+        finding = self._finding.get(name)
+        if finding is None:
+            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
+
+            def found(finding: asyncio.Future[MessageType]) -> None:
+                del self._finding[name]
+                if not finding.cancelled():
+                    finding.exception()  # nothing may wait for it
+
+            finding.add_done_callback(found)
+        return finding
+
+    async def _find(self, name: str) -> MessageType:
+        async with self._asked:
+            try:
+                kind = await asyncio.to_thread(find_message_type, name)
+            except UnknownTypeError as error:
+                node = self._link.need()
+                fetched = await fetch_type(node.master_uri, node.name, name) if error.fetchable else None
+                if fetched is None:
+                    raise
+                kind = fetched.kind
+            return self._messages.get(name) or self._keep(name, kind)
+
+    def _keep(self, name: str, kind: MessageType) -> MessageType:
+        self._messages[name] = kind
+        self._versions[name, kind.md5sum] = kind
+        while len(self._versions) > ros_limits.TYPES_FOUND_MAX:
+            self._versions.popitem(last=False)
+        self._missing.pop((name, False), None)
+        while len(self._messages) > ros_limits.TYPES_FOUND_MAX:
+            self._messages.popitem(last=False)
+        for known in self._wanted.pop(name, {}).values():
+            known(kind)
+        return kind
+
+    def _search(self) -> None:
+        """Count a search on this machine, which reads files, and walks through all packages for an unknown type.
+
+        Raises:
+            RmpaError: There were too many at once; the event loop serves robots too.
+        """
+        if not self._searches.take(asyncio.get_running_loop().time()):
+            raise RmpaError("too many types were searched for at once; ask again in a second")
+
+    def _check_missing(self, name: str, *, service: bool) -> None:
+        when, error = self._missing.get((name, service), (0.0, None))
+        if error is not None and asyncio.get_running_loop().time() - when < limits.PROBE_RETRY:
+            raise error.with_traceback(None)
+
+    def _remember(self, name: str, error: RmpaError, *, service: bool) -> RmpaError:
+        self._missing[name, service] = asyncio.get_running_loop().time(), error
+        while len(self._missing) > ros_limits.TYPES_MISSING_MAX:
+            self._missing.popitem(last=False)
+        return error
 
 
 class GraphWatch:

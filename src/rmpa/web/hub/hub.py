@@ -14,29 +14,19 @@ from typing import TYPE_CHECKING, Any, Self
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web import limits
 from rmpa.web.hub import requests
-from rmpa.web.hub.assets import read_asset
-from rmpa.web.hub.client_counts import ClientCounts
-from rmpa.web.hub.clients import OWN_CLIENT, HubClient
-from rmpa.web.hub.graph import GraphWatch
-from rmpa.web.hub.node_link import NodeLink
-from rmpa.web.hub.params import ParamMirror
-from rmpa.web.hub.publishers import Publishers
-from rmpa.web.hub.rights import CONTROL_REMEDY, EVERYTHING, READ_REMEDY
-from rmpa.web.hub.ros_time import RosTime
-from rmpa.web.hub.served import ServedServices
-from rmpa.web.hub.services import ServiceCalls
+from rmpa.web.hub.graph import GraphWatch, TypeLibrary
+from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, OWN_CLIENT, READ_REMEDY, HubClient, NodeLink
+from rmpa.web.hub.publishers import ClientCounts, ParamMirror, Publishers, RosTime
+from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics
-from rmpa.web.hub.types import TypeLibrary
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.clients import Key, Receive
-    from rmpa.web.hub.node_link import MakeNode, Where
+    from rmpa.web.hub.node_link import Key, MakeNode, NodeRules, Receive, Rights, Where
     from rmpa.web.hub.requests import HubRequest
-    from rmpa.web.hub.rights import NodeRules, Rights
 
 _log = logging.getLogger(__name__)
 

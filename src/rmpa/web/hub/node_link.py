@@ -6,22 +6,320 @@ import asyncio
 import contextlib
 import functools
 import logging
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 
+from rmpa.config.peer_rules import Access
 from rmpa.core.counters import logged_failure
-from rmpa.core.errors import RmpaError, UnreachableError
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros.master.parameters import canonical, leaves
 from rmpa.web import limits
-from rmpa.web.hub.rights import EVERYTHING
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable
 
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.rights import NodeRules
+    from rmpa.trust.documents import Permissions
+    from rmpa.web.hub.requests import Answer, ParamValue
+
+
+# The messages that wait for one client: a queue for each subscription, bounded in bytes, served in turn. No I/O.
+#
+# Higher priorities go first; the subscriptions of one priority take turns, a message each, so that a map does not
+# hold
+# up commands. Beyond a bound the oldest message of the subscription with the most bytes is dropped, of the lowest
+# priority first. Handle 0 is for all that is no message of a subscription: it goes before all else and is never
+# dropped; a client that lets it grow beyond the bound does not read at all, and is to be disconnected
+# (``overflow``).
+
+
+_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class _Queue(Generic[_T]):
+    handle: int
+    priority: int
+    entries: deque[tuple[_T, int]] = field(default_factory=deque)
+    size: int = 0
+
+
+class FairQueue(Generic[_T]):
+    """The queues of one client.
+
+    Args:
+        total_bytes: Bytes of all entries together. One message always fits where no other waits.
+        subscription_bytes: Bytes of one subscription; its newest message always fits.
+    """
+
+    def __init__(
+        self,
+        total_bytes: int = limits.CLIENT_QUEUE_BYTES,
+        subscription_bytes: int = limits.SUBSCRIPTION_QUEUE_BYTES,
+    ) -> None:
+        self._total = total_bytes
+        self._each = subscription_bytes
+        self._urgent: deque[tuple[_T, int]] = deque()
+        self._urgent_bytes = 0
+        self._data_bytes = 0
+        self._queues: dict[int, _Queue[_T]] = {}
+        self._turns: dict[int, deque[_Queue[_T]]] = {}
+        """The subscriptions that have entries, by priority, in the order of their turns."""
+        self.dropped: Counter[int] = Counter()
+        """Messages dropped so far, by handle, of the present subscriptions."""
+        self.dropped_total = 0
+        """Messages dropped so far, those of ended subscriptions included."""
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to send."""
+        return bool(self._urgent or self._turns)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that wait."""
+        return self._urgent_bytes + self._data_bytes
+
+    @property
+    def overflow(self) -> bool:
+        """Whether the entries of handle 0 alone exceed the bound."""
+        return self._urgent_bytes > self._total
+
+    @property
+    def waiting(self) -> Mapping[int, int]:
+        """Messages that wait, by handle."""
+        return {queue.handle: len(queue.entries) for queue in self._queues.values() if queue.entries}
+
+    def push(self, handle: int, entry: _T, size: int, priority: int = 0) -> int:
+        """Add an entry; returns the number of older ones that were dropped for it.
+
+        Args:
+            handle: The subscription; 0 for an entry that is never dropped.
+            entry: What is to be sent.
+            size: Its bytes.
+            priority: Of the subscription; a higher one is served first.
+        """
+        if handle == 0:
+            self._urgent.append((entry, size))
+            self._urgent_bytes += size
+            return self._make_room(None)
+        queue = self._queues.get(handle)
+        if queue is None:
+            queue = self._queues[handle] = _Queue(handle, priority)
+        if not queue.entries:
+            queue.priority = priority
+            self._turns.setdefault(priority, deque()).append(queue)
+        queue.entries.append((entry, size))
+        queue.size += size
+        self._data_bytes += size
+        dropped = 0
+        while queue.size > self._each and len(queue.entries) > 1:
+            self._drop_oldest(queue)
+            dropped += 1
+        return dropped + self._make_room(queue)
+
+    def pop(self) -> _T | None:
+        """The next entry; ``None`` where there is none."""
+        if self._urgent:
+            entry, size = self._urgent.popleft()
+            self._urgent_bytes -= size
+            return entry
+        if not self._turns:
+            return None
+        priority = max(self._turns)
+        turns = self._turns[priority]
+        queue = turns.popleft()
+        entry, size = queue.entries.popleft()
+        queue.size -= size
+        self._data_bytes -= size
+        if queue.entries:
+            turns.append(queue)
+        elif not turns:
+            del self._turns[priority]
+        return entry
+
+    def end(self, handle: int) -> None:
+        """Forget a subscription, and what waits for it."""
+        self.dropped.pop(handle, None)
+        queue = self._queues.pop(handle, None)
+        if queue is not None and queue.entries:
+            self._data_bytes -= queue.size
+            self._forget_turn(queue)
+
+    def clear(self) -> None:
+        """Forget everything that waits."""
+        self._urgent.clear()
+        self._turns.clear()
+        self._queues.clear()
+        self._urgent_bytes = self._data_bytes = 0
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _make_room(self, newest: _Queue[_T] | None) -> int:
+        """Drop until all together fit; the newest message stays where it is the only one."""
+        dropped = 0
+        while self.bytes > self._total and self._turns:
+            turns = self._turns[min(self._turns)]
+            fullest = max(turns, key=lambda queue: queue.size)
+            if fullest is newest and len(fullest.entries) == 1:
+                if len(self._turns) == 1 and len(turns) == 1 and not self._urgent:
+                    break
+                # Others of the same or a higher priority wait: the newest gives way if it alone has this priority.
+                others = [queue for queue in turns if queue is not newest]
+                fullest = max(others, key=lambda queue: queue.size) if others else fullest
+            self._drop_oldest(fullest)
+            dropped += 1
+        return dropped
+
+    def _drop_oldest(self, queue: _Queue[_T]) -> None:
+        _, size = queue.entries.popleft()
+        queue.size -= size
+        self._data_bytes -= size
+        self.dropped[queue.handle] += 1
+        self.dropped_total += 1
+        if not queue.entries:
+            self._forget_turn(queue)
+
+    def _forget_turn(self, queue: _Queue[_T]) -> None:
+        turns = self._turns[queue.priority]
+        turns.remove(queue)
+        if not turns:
+            del self._turns[queue.priority]
+
+
+# What clients may do: kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``.
+
+
+_WHO: Final = "the web server"
+_NODE: Final = "web"
+"""The name of ``rmpa web`` for the rules."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """What clients may do beyond reading topics and the graph; nothing unless it is said.
+
+    Attributes:
+        view: Read parameters, and files of ROS packages.
+        control: Publish, call and offer services, set parameters, choose a Smart Resource's profile and context.
+        drive: Command a robot by the monitor's joystick.
+        command_age: Seconds that what a client publishes, calls and sets may be old; 0: any age.
+    """
+
+    view: bool = False
+    control: bool = False
+    drive: bool = False
+    command_age: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class NodeRules:
+    """What the node of ``rmpa web`` may do, by names: for ``[[permission]]`` it is the module ``web``.
+
+    Args:
+        permissions: Judges; ``None``: it may do everything.
+    """
+
+    permissions: Permissions | None = None
+
+    def check(self, access: Access, name: str) -> None:
+        """Check one name.
+
+        Raises:
+            PeerRefused: It may not; the text has the rule.
+        """
+        if self.permissions is not None:
+            decision = self.permissions.judge(access, _NODE, _resolved(name))
+            if not decision.allowed:
+                raise PeerRefused(_WHO, f"{_NODE} may not {access} {name}", decision.rule)
+
+    def check_param_change(self, name: str, value_of: Callable[[str], ParamValue], after: ParamValue = None) -> None:
+        """Check each parameter that a change of a name replaces, makes or removes; raises as ``check``.
+
+        Args:
+            name: A parameter, or a namespace, which is changed as a whole.
+            value_of: Returns the present value of a name; ``None`` if there is none.
+            after: Its next value; ``None``: it is deleted.
+        """
+        if self.permissions is None:
+            return
+        if (key := _bad_key(after)) is not None:
+            # A core tells /motors/limit of the change where a key below /speed is that name.
+            text = f"{_NODE} may not set {name}: the key {key[:80]!r} is not one part of a name"
+            raise PeerRefused(_WHO, text, "write a namespace as a value of values")
+        name = _resolved(name)
+        values = value_of(name), after
+        changed = {leaf for value in values for leaf, each in leaves(name, value) if each is not None}
+        # A parameter that stands where a namespace is needed is replaced by one.
+        above = [name[:at] for at in range(1, len(name)) if name[at] == "/"]
+        changed |= {each for each in above if not isinstance(value_of(each), Mapping | None)}
+        for each in sorted(changed) or [name]:
+            self.check(Access.PARAM, each)
+
+    def visible(self, values: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
+        """Those of some parameters that clients may read.
+
+        Args:
+            values: Values by global names; a namespace is a mapping.
+        """
+        if self.permissions is None:
+            return values
+        shown = {name: self._pruned(name, value) for name, value in values.items()}
+        return {name: value for name, value in shown.items() if value is not _HIDDEN}
+
+    def visible_tree(self, tree: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
+        """The same of a tree of parameters, whose keys are names below the root."""
+        if self.permissions is None:
+            return tree
+        return {name[1:]: value for name, value in self.visible({f"/{key}": tree[key] for key in tree}).items()}
+
+    def _pruned(self, name: str, value: ParamValue) -> ParamValue:
+        """A parameter without what is denied; ``_HIDDEN``: nothing is left."""
+        if not isinstance(value, Mapping):
+            try:
+                self.check(Access.PARAM, name)
+            except PeerRefused:
+                return _HIDDEN
+            return value
+        pruned = {key: self._pruned(f"{name}/{key}", each) for key, each in value.items()}
+        kept = {key: each for key, each in pruned.items() if each is not _HIDDEN}
+        return kept if kept or not value else _HIDDEN
+
+
+_HIDDEN: Final[ParamValue] = object()  # type: ignore[assignment] # it is compared by identity, and never shown
+
+
+def _resolved(name: str) -> str:
+    """A name as the core resolves it: ``//a/`` is ``/a``, and so is ``a``."""
+    return canonical(f"/{name}")
+
+
+def _bad_key(value: ParamValue) -> str | None:
+    """A key in a namespace, at any depth, that a core takes for another name than that of a parameter in it."""
+    if not isinstance(value, Mapping):
+        return None
+    for key, each in value.items():
+        if not key or "/" in key:
+            return key
+        if (inner := _bad_key(each)) is not None:
+            return inner
+    return None
+
+
+EVERYTHING = NodeRules()
+READ_ONLY = Rights()
+FULL = Rights(view=True, control=True)
+"""Everything but ``drive``, which has a setting of its own."""
+CONTROL_REMEDY = "start rmpa web with --control, and give its token"
+"""For clients that want to change something."""
+READ_REMEDY = "send the token of rmpa web; where it has none, start it with --token-file FILE or --control"
+"""For clients that want to read what only clients with the token may."""
+
 
 _log = logging.getLogger(__name__)
-_T = TypeVar("_T")
+
 _U = TypeVar("_U")
 
 MakeNode: TypeAlias = "Callable[[str, Callable[[str, XmlRpcValue], None]], Node]"
@@ -242,3 +540,36 @@ class EndingRegistrations(Generic[_T]):
     def _closed(self, name: str, registration: Registration[_T]) -> None:
         if self._registrations.get(name) is registration:
             del self._registrations[name]
+
+
+# A client as the hub knows it, and the key of what it has asked for.
+
+
+Key: TypeAlias = "tuple[int, int]"
+"""The number of a client and one of its handles: unique in the hub."""
+OWN_CLIENT: Final = 0
+"""The number of the hub itself, and of what it keeps for all clients; clients count from 1."""
+Receive: TypeAlias = "Callable[[Answer], None]"
+
+
+@dataclass(slots=True, eq=False)
+class HubClient:
+    """One client.
+
+    Args:
+        number: Never used again.
+        name: For logs and lists.
+        rights: What it may do.
+        receive: Takes answers; it must not raise.
+    """
+
+    number: int
+    name: str
+    rights: Rights
+    receive: Receive
+    subscriptions: dict[int, str] = field(default_factory=dict)
+    """The topics by handle."""
+    publishers: dict[int, str] = field(default_factory=dict)
+    """The published topics by handle."""
+    services: dict[int, str] = field(default_factory=dict)
+    """The served services by handle."""

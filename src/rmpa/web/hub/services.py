@@ -1,23 +1,248 @@
-"""Services that clients call: a few open connections to each server, shared by all clients."""
+"""Files of ROS packages, for clients that draw a robot: ``package://NAME/PATH``."""
 
 from __future__ import annotations
 
 import asyncio
+import functools
+import itertools
+import os
+from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from rmpa.config.peer_rules import Access
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.endpoints import probe
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
+from rmpa.web.hub.node_link import EndingRegistrations, Registration
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.ros.node.node import Node, Service
+    from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
-    from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.node_link import Key, NodeLink
     from rmpa.web.hub.requests import Payload
+
+_SCHEME: Final = "package://"
+_MANIFESTS: Final = ("package.xml", "manifest.xml")
+
+
+class AssetError(RmpaError):
+    """A file cannot be had."""
+
+
+def read_asset(uri: str, most: int, environ: Mapping[str, str]) -> bytes:
+    """Read a file of a package; this blocks.
+
+    Args:
+        uri: ``package://NAME/PATH``.
+        most: Bytes.
+        environ: Has ROS_PACKAGE_PATH and CMAKE_PREFIX_PATH.
+
+    Raises:
+        AssetError: There is no such package or file, or it is outside of the package.
+        LimitExceeded: The file is larger than ``most``.
+    """
+    package, _, path = uri.removeprefix(_SCHEME).partition("/")
+    if not uri.startswith(_SCHEME) or not package or not path or "\0" in path:
+        raise AssetError(f"{uri[:200]!r} is not the file of a package; write package://NAME/PATH")
+    try:
+        return _find(package, path, most, environ)
+    except OSError as error:  # such as a name that is too long
+        raise AssetError(f"{uri[:200]} cannot be read: {error.strerror}") from error
+
+
+def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> bytes:
+    found = False
+    for folder in _folders(package, environ):
+        found = True
+        root = folder.resolve()
+        file = (root / path).resolve()
+        if not file.is_relative_to(root):
+            raise AssetError(f"{path[:200]} is outside of its package {package[:200]}")
+        if file.is_file():
+            return _read(file, most)
+    if found:
+        raise AssetError(f"package {package} has no file {path[:200]}")
+    raise AssetError(f"package {package[:200]} is not found; source its workspace where rmpa web starts")
+
+
+def _read(file: Path, most: int) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size > most:
+                raise LimitExceeded(f"asset {file.name}", size, most)
+            return stream.read(most)
+    except OSError as error:
+        raise AssetError(f"{file.name} cannot be read: {error.strerror}") from error
+
+
+def _folders(package: str, environ: Mapping[str, str]) -> Iterator[Path]:
+    """The folders of a package, best first."""
+    if package in (".", "..") or os.sep in package:
+        return
+    sourced = [entry for entry in environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if entry]
+    prefixes = [entry for entry in environ.get("CMAKE_PREFIX_PATH", "").split(os.pathsep) if entry]
+    roots = [*map(Path, sourced), *(Path(prefix, "share") for prefix in prefixes), Path("/usr/share")]
+    for root in roots:
+        if _is_package(root / package):
+            yield root / package
+    for entry in sourced:
+        yield from _walk(Path(entry), package)
+
+
+def _walk(root: Path, package: str) -> Iterator[Path]:
+    """The folders of this name below ``root`` that are packages, nearest first; none is within another package."""
+    waiting = deque([root])
+    for _ in range(limits.PACKAGES_WALKED):
+        if not waiting:
+            return
+        folder = waiting.popleft()
+        try:
+            below = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir() and entry.name[0] != ".")
+        except OSError:
+            continue
+        for each in map(Path, below):
+            if _is_package(each):
+                if each.name == package and each.parent != root:
+                    yield each
+            elif not (each / "CATKIN_IGNORE").exists():
+                waiting.append(each)
+
+
+def _is_package(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in _MANIFESTS)
+
+
+# Services that clients offer: the node serves them, and hands each call to its client.
+
+
+@dataclass(slots=True, eq=False)
+class _Served:
+    name: str
+    key: Key
+    kind: ServiceType
+    request: Callable[[int, bytes], None]
+    failed: Callable[[RmpaError], None]
+    registration: Registration[Service] | None = None
+    calls: dict[int, asyncio.Future[Payload]] = field(default_factory=dict)
+
+
+class ServedServices:
+    """All services that clients offer.
+
+    Args:
+        link: Has the node.
+    """
+
+    def __init__(self, link: NodeLink) -> None:
+        self._link = link
+        self._served: dict[str, _Served] = {}
+        self._ending: EndingRegistrations[Service] = EndingRegistrations()
+        self._numbers = itertools.count(1)
+
+    def serve(
+        self,
+        key: Key,
+        name: str,
+        kind: ServiceType,
+        request: Callable[[int, bytes], None],
+        failed: Callable[[RmpaError], None],
+    ) -> None:
+        """Offer a service; a client that offers it already loses it, which may have gone without a word.
+
+        Args:
+            key: The client and its handle.
+            name: The global name.
+            kind: Its type.
+            request: ``(call, payload)``: hands a call to the client, which answers by ``respond``.
+            failed: Called where the service cannot be registered, or another client offers it; it has then ended.
+
+        Raises:
+            PeerRefused: The rules deny it.
+        """
+        self._link.rules.check(Access.SERVE, name)
+        if (old := self._served.get(name)) is not None:
+            self._refused(old, RmpaError(f"another client offers {name} now"))
+        served = self._served[name] = _Served(name, key, kind, request, failed)
+        served.registration = Registration(
+            self._link,
+            name,
+            functools.partial(self._register, served),
+            _withdraw,
+            functools.partial(self._refused, served),
+            after=self._ending.take(name),
+        )
+
+    def respond(self, key: Key, name: str, call: int, *, ok: bool, response: Payload | str) -> None:
+        """Answer a call; one that has ended is ignored."""
+        served = self._served.get(name)
+        future = served.calls.get(call) if served is not None and served.key == key else None
+        if future is None or future.done():
+            return
+        if ok and not isinstance(response, str):
+            future.set_result(response)
+        else:
+            future.set_exception(RmpaError(str(response)))
+
+    def end(self, key: Key, name: str) -> None:
+        """End a service; its open calls fail."""
+        served = self._served.get(name)
+        if served is not None and served.key == key:
+            self._end(served)
+
+    async def close(self) -> None:
+        """End all, after the node was closed."""
+        for served in [*self._served.values()]:
+            self._end(served)
+        await self._ending.closed()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    async def _register(self, served: _Served, node: Node) -> Service:
+        handler = functools.partial(self._call, served)
+        return await node.advertise_service(
+            served.name, served.kind, handler, timeout=limits.SERVED_TIMEOUT, raw=True
+        )
+
+    async def _call(self, served: _Served, request: bytes) -> Payload:
+        if len(served.calls) >= limits.SERVED_CALLS_MAX:
+            raise RmpaError(f"{len(served.calls)} calls of {served.name} wait for its client, which is the limit")
+        number = next(self._numbers)
+        future: asyncio.Future[Payload] = asyncio.get_running_loop().create_future()
+        served.calls[number] = future
+        try:
+            served.request(number, request)
+            return await future
+        finally:
+            del served.calls[number]
+
+    def _refused(self, served: _Served, error: RmpaError) -> None:
+        if self._served.get(served.name) is served:
+            self._end(served)
+            served.failed(error)
+
+    def _end(self, served: _Served) -> None:
+        del self._served[served.name]
+        for future in served.calls.values():
+            if not future.done():
+                future.set_exception(RmpaError(f"the client that offers {served.name} has ended it"))
+        if served.registration is not None:
+            self._ending.end(served.name, served.registration)
+
+
+async def _withdraw(service: Service) -> None:
+    await service.close()
+
+
+# Services that clients call: a few open connections to each server, shared by all clients.
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,15 +7,20 @@ import re
 import struct
 from array import array
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
+
+import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.web.monitor import limits
+from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from rmpa.web.hub.requests import Payload
+    from rmpa.web.hub.requests import Payload, ReceivedMessage
+    from rmpa.web.monitor.messages import Drive, Watch
+
+    Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
 IMAGE_HEADER: Final = struct.Struct("<BBHHHIQ")
 """Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC): in front of an image's bytes."""
@@ -191,3 +196,353 @@ def _depth_picture(width: int, height: int, encoding: str, step: int, data: Payl
     scale = 254 / (most - least) if most > least else 254.0
     pixels = bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
     return Picture("mono8", -(-width // every), len(rows), pixels, every)
+
+
+# Which commands of a page's joystick drive the robot; no I/O.
+#
+# TCP keeps over a cut what the page has sent, and delivers all of it when the cable is back, long after the stick
+# was
+# let go. So each command says when it was made, and what may be older than ``limits.DRIVE_TIMEOUT`` is dropped.
+#
+# The two clocks need not agree. Each ``tick`` has the server's clock; the page takes the one that came fastest
+# among
+# the last few, and its own clock counts on from it. A command's ``at`` is then the server's clock at its making,
+# less
+# the time that this tick took: ``now - at`` is never less than the command's age, and in a steady network it is the
+# round trip. A tick that was held up, or a clock that stood still while the page's machine slept, makes commands
+# seem
+# older, never newer.
+
+
+class Joystick:
+    """The holds of one page's stick. A hold is from the touch of the stick until it is let go."""
+
+    def __init__(self) -> None:
+        self._hold = 0
+        self._number = 0
+        self._released = 0
+        self._until = 0.0
+        self._topic = ""
+        self._told_late = False
+
+    @property
+    def topic(self) -> str:
+        """The topic that is driven; empty while the robot is stopped."""
+        return self._topic
+
+    @property
+    def due(self) -> float | None:
+        """When the robot is to be stopped, if no further command comes."""
+        return self._until if self._topic else None
+
+    def takes(self, command: Drive, now: float) -> bool:
+        """Whether a command is to be obeyed: it is not too old, and of the present hold or a later one."""
+        if abs(now - command.at) > limits.DRIVE_TIMEOUT:
+            return False
+        if command.hold <= self._released or (command.hold, command.n) <= (self._hold, self._number):
+            return False
+        self._hold, self._number = command.hold, command.n
+        self._told_late = False
+        return True
+
+    def drive(self, topic: str, now: float) -> bool:
+        """A command is obeyed; returns whether it may move the robot.
+
+        The first one after a stop only arms: one command alone, whatever kept it, moves nothing.
+        """
+        armed, self._topic = self._topic == topic, topic
+        self._until = now + limits.DRIVE_TIMEOUT
+        return armed
+
+    def is_new_late(self, command: Drive, now: float) -> bool:
+        """Whether a refused command is the first since the last obeyed one that came too late."""
+        told, self._told_late = self._told_late, self._told_late or now - command.at > limits.DRIVE_TIMEOUT
+        return self._told_late and not told
+
+    def release(self, hold: int) -> None:
+        """The stick was let go: nothing more of that hold is obeyed."""
+        self._released = max(self._released, hold)
+
+    def stop(self) -> str:
+        """The robot stops; returns the topic that was driven, or nothing."""
+        topic, self._topic = self._topic, ""
+        return topic
+
+
+# Differences of two states as JSON merge patches (RFC 7396).
+#
+# A state is a tree of JSON values whose objects have no member that is null: there a missing member says "not
+# known".
+# So a null in a patch always removes. Arrays are replaced as a whole.
+
+
+Value: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
+    bool, int, float, str, list["Value"], dict[str, "Value"], None
+]
+Tree: TypeAlias = dict[str, Value]
+
+_MISSING: Final = object()
+
+
+def difference(old: Mapping[str, Value], new: Mapping[str, Value]) -> Tree:
+    """The merge patch that makes ``new`` of ``old``; empty where they are equal.
+
+    Parts that are the same object in both cost nothing. ``1``, ``1.0`` and ``True`` are different values.
+    """
+    patch: Tree = {}
+    for key, value in new.items():
+        before = old.get(key, _MISSING)
+        if before is value:
+            continue
+        if isinstance(value, dict) and isinstance(before, dict):
+            if inner := difference(before, value):
+                patch[key] = inner
+        elif not _same(before, value):
+            patch[key] = value
+    patch.update((key, None) for key in old if key not in new)
+    return patch
+
+
+def apply(state: Value, patch: Value) -> Value:
+    """``state`` with a merge patch applied, as RFC 7396 describes it; neither argument is changed."""
+    if not isinstance(patch, dict):
+        return patch
+    result: Tree = dict(state) if isinstance(state, dict) else {}
+    for key, value in patch.items():
+        if value is None:
+            result.pop(key, None)
+        else:
+            result[key] = apply(result.get(key), value)
+    return result
+
+
+def without_nulls(value: object) -> Value:
+    """A value for a state: without members that are null, arrays as lists, NaN and infinities left out as unknown.
+
+    In an array, what is unknown stays, as null.
+    """
+    if isinstance(value, dict):
+        members = ((str(key), without_nulls(inner)) for key, inner in value.items())
+        return {key: inner for key, inner in members if inner is not None}
+    if isinstance(value, list | tuple):
+        return [without_nulls(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return str(value)
+
+
+def _same(one: object, other: object) -> bool:
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    return one == other
+
+
+# Figures that change only when there is something to see.
+
+
+def rounded(value: float, digits: int = 3) -> float:
+    """``value`` with so many significant digits."""
+    if value == 0 or not math.isfinite(value):
+        return 0.0
+    return float(f"{value:.{digits}g}")
+
+
+def steady_figure(
+    before: float | None, value: float | None, share: float = limits.STEADY, least: float = 0.0
+) -> float | None:
+    """The figure to show in place of ``before``, which is shown now.
+
+    Args:
+        before: What is shown; ``None`` for nothing.
+        value: The new value; ``None`` where it is not known.
+        share: Of the figure that is shown; a smaller change is not shown.
+        least: A smaller change than this is not shown either.
+    """
+    if value is None or not math.isfinite(value):
+        return None
+    if before is not None and before != 0:
+        change = abs(value - before)
+        if change <= abs(before) * share or change <= least:
+            return before
+    return rounded(value)
+
+
+class Steady:
+    """Keeps the figures that are shown, by key, and gives a new one only for a change that can be seen."""
+
+    def __init__(self) -> None:
+        self._shown: dict[str, float] = {}
+        self._used: set[str] = set()
+
+    def figure(self, key: str, value: float | None, share: float = limits.STEADY, least: float = 0.0) -> float | None:
+        """The figure to show under this key; the other arguments are those of ``steady_figure``."""
+        shown = steady_figure(self._shown.get(key), value, share, least)
+        if shown is None:
+            self._shown.pop(key, None)
+        else:
+            self._used.add(key)
+            self._shown[key] = shown
+        return shown
+
+    def moment(self, key: str, value: float | None) -> float | None:
+        """A moment in seconds since the epoch, which is computed from a moving age; kept within half a second."""
+        if value is None:
+            return None
+        self._used.add(key)
+        before = self._shown.get(key)
+        if before is not None and abs(value - before) < 0.5:
+            return before
+        self._shown[key] = shown = round(value, 1)
+        return shown
+
+    def sweep(self) -> None:
+        """Forget what was not shown since the last call."""
+        self._shown = {key: value for key, value in self._shown.items() if key in self._used}
+        self._used.clear()
+
+
+# Samples of a plot between two messages to the browser: bounded, and without losing a peak.
+
+
+Sample: TypeAlias = tuple[float, list[float | None]]
+"""A moment in seconds since the epoch, and a value for each line; ``None`` where there is none."""
+
+
+class SampleBuffer:
+    """Keeps samples until they are taken.
+
+    Of more than ``most`` samples, each pair of neighbours becomes one or two: for each line the least and the
+    greatest value stay, at the moments of the pair. So a peak of one message is still seen.
+
+    Args:
+        lines: The number of values of a sample.
+        most: Samples that are kept; even.
+    """
+
+    def __init__(self, lines: int, most: int = limits.POINTS_MAX) -> None:
+        self._lines = lines
+        self._most = most
+        self._samples: list[Sample] = []
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def add(self, moment: float, values: Sequence[float | None]) -> None:
+        """Add a sample; NaN and infinities count as no value."""
+        clean = [value if value is not None and math.isfinite(value) else None for value in values[: self._lines]]
+        self._samples.append((moment, clean))
+        if len(self._samples) > 2 * self._most:
+            self._samples = self._thinned()
+
+    def take(self) -> list[list[float | None]]:
+        """Columns: the moments, then the values of each line; the buffer is empty then."""
+        while len(self._samples) > self._most:
+            self._samples = self._thinned()
+        samples, self._samples = self._samples, []
+        if not samples:
+            return []
+        moments: list[float | None] = [round(moment, 4) for moment, _ in samples]
+        return [moments, *([values[line] for _, values in samples] for line in range(self._lines))]
+
+    def _thinned(self) -> list[Sample]:
+        """Half as many samples: of each four neighbours the extremes of each line, at the first and last moment."""
+        made: list[Sample] = []
+        for start in range(0, len(self._samples), 4):
+            part = self._samples[start : start + 4]
+            if len(part) < 3:
+                made += part
+                continue
+            first: list[float | None] = []
+            last: list[float | None] = []
+            for line in range(self._lines):
+                known = [(values[line], at) for at, (_, values) in enumerate(part) if values[line] is not None]
+                least = min(known, default=(None, 0), key=lambda pair: pair[0] or 0.0)
+                most = max(known, default=(None, 0), key=lambda pair: pair[0] or 0.0)
+                early, late = (least, most) if least[1] <= most[1] else (most, least)
+                first.append(early[0])
+                last.append(late[0])
+            made += [(part[0][0], first), (part[-1][0], last)]
+        return made
+
+
+# What one client sees of the messages of topics: paced, newest first, bounded.
+
+
+class WatchState:
+    """One watch: the newest message, or samples of its fields, until the next frame is due.
+
+    Args:
+        wanted: What the client asked for.
+        decode: Gives a message's values: dicts, lists, numbers, strings; bytes for arrays of bytes.
+    """
+
+    def __init__(self, wanted: Watch, decode: Decode) -> None:
+        self.wanted = wanted
+        self._decode = decode
+        self._newest: ReceivedMessage | None = None
+        self._paths = tuple(field_path(field) for field in wanted.fields)
+        self._samples = SampleBuffer(len(self._paths))
+        self._sent = -1e9
+
+    def receive(self, message: ReceivedMessage) -> None:
+        """Keep a message; a plot takes its numbers at once, all others decode only what is sent.
+
+        Raises:
+            RmpaError: It cannot be decoded.
+        """
+        self._newest = message
+        if self._paths:
+            values = self._decode(message)
+            self._samples.add(message.stamp_ns * 1e-9, [number_at(values, path) for path in self._paths])
+
+    def due(self, now: float) -> float | None:
+        """When the next frame may be sent; ``None`` while there is nothing to send."""
+        waiting = len(self._samples) > 0 if self._paths else self._newest is not None
+        return max(now, self._sent + 1 / self.wanted.rate) if waiting else None
+
+    def frames(self, now: float) -> Iterator[str | bytes]:
+        """The frame that is due.
+
+        Raises:
+            RmpaError: The message cannot be shown in that way; the text says why.
+        """
+        message, self._newest = self._newest, None
+        self._sent = now
+        if message is None and not self._paths:
+            return
+        head = {"id": self.wanted.id}
+        if self._paths:
+            yield _text({"op": "points", **head, "columns": self._samples.take()})
+            return
+        if message is None:
+            return
+        values = self._decode(message)
+        about = head | {"stamp": message.stamp_ns / 1e9, "type": message.type}
+        if self.wanted.how == "image":
+            yield _picture(message, values).frame(self.wanted.id, message.stamp_ns)
+        elif self.wanted.how == "scan":
+            yield _text({"op": "scan", **about, "scan": scan(values)})
+        else:
+            yield _text({"op": "value", **about, "size": len(message.payload), "value": cut(values)})
+
+
+def _picture(message: ReceivedMessage, values: Any) -> Any:
+    try:
+        if message.type == "sensor_msgs/CompressedImage":
+            return compressed_picture(str(values["format"]), values["data"])
+        if message.type == "sensor_msgs/Image":
+            width, height, step = (int(values[name]) for name in ("width", "height", "step"))
+            return raw_picture(width, height, str(values["encoding"]), step, values["data"])
+    except (KeyError, TypeError, ValueError):
+        pass
+    raise RemoteProtocolError(f"{message.type} is not an image")
+
+
+def _text(message: dict[str, Any]) -> str:
+    return msgspec.json.encode(message).decode()

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, TypeAlias
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.web.monitor import limits
+from rmpa.web import limits
 
 VERSION: Final = 1
 SUBPROTOCOL: Final = "rmpa.monitor.v1"

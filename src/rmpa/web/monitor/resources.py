@@ -1,18 +1,37 @@
-"""What the monitor knows of a Smart Resource, from the topics that it publishes about itself."""
+"""The Smart Resources of all modules, from the topics that they publish about themselves."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import itertools
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.web.monitor.patch import without_nulls
+from rmpa.bridge.proxies import proxied_peer
+from rmpa.core.errors import RmpaError
+from rmpa.core.limits import KIB
+from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
+from rmpa.resource.run.descriptor import Descriptor
+from rmpa.resource.run.reconfigure import CONFIG_TYPE
+from rmpa.resource.run.runtime import LEVEL_FOR
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.web import limits
+from rmpa.web.hub.node_link import OWN_CLIENT
+from rmpa.web.monitor.live import without_nulls
+from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
-    from rmpa.web.monitor.patch import Tree
-    from rmpa.web.monitor.steady import Steady
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.requests import GraphTopic, Payload, ReceivedMessage
+    from rmpa.web.monitor.live import Steady, Tree
+
+
+# What the monitor knows of a Smart Resource, from the topics that it publishes about itself.
 
 
 class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
@@ -129,3 +148,270 @@ def resource_flows(facts: Iterable[ResourceFacts], own: str, steady: Steady) -> 
             if rate is not None:
                 flow["rate"] = rate + (sum_ if isinstance(sum_, float) else 0.0)
     return found
+
+
+# The values of messages, decoded once for all pages.
+
+
+_OVERHEAD: Final = 64 * KIB
+"""Bytes that an entry counts beside its payload, so that small messages do not gather."""
+
+
+class MessageValues:
+    """Decodes messages of the hub. Pages that watch the same topic get its message at nearly the same time.
+
+    Args:
+        hub: Knows the types.
+    """
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._last: OrderedDict[int, tuple[Payload, Any]] = OrderedDict()
+        self._bytes = 0
+
+    def of(self, message: ReceivedMessage) -> Any:
+        """The values of a message; they are shared, and must not be changed.
+
+        Raises:
+            RmpaError: Its type is not known, or its bytes are not a message of that type.
+        """
+        key = id(message.payload)
+        known = self._last.get(key)
+        if known is not None and known[0] is message.payload:  # an object's id is used again once it has gone
+            return known[1]
+        values = codec_for(self._hub.types.version(message.type, message.md5sum)).json_values(message.payload)
+        if known is not None:
+            self._bytes -= len(known[0]) + _OVERHEAD
+        self._last[key] = message.payload, values
+        self._last.move_to_end(key)
+        self._bytes += len(message.payload) + _OVERHEAD
+        while self._bytes > limits.VALUES_BYTES:
+            _, (payload, _) = self._last.popitem(last=False)
+            self._bytes -= len(payload) + _OVERHEAD
+        return values
+
+
+_TEXT: Final = "std_msgs/String"
+_ALWAYS: Final = {DESCRIPTOR: _TEXT}
+"""Topics below each resource, with their types, that are always followed."""
+_SHOWN: Final = {"state": _TEXT, "profile": _TEXT, "context": _TEXT, "quality": ARRAY_TYPE}
+"""Those that are followed while pages are open."""
+_LOOKED_AT: Final = {"decision": _TEXT, "responses": ARRAY_TYPE, "parameter_updates": CONFIG_TYPE}
+"""Those of a resource that a page shows."""
+_FIRST_HANDLE: Final = 1000
+_GRAPH: Final = 999
+_BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
+
+
+@dataclass(slots=True, eq=False)
+class _Path:
+    """The subscriptions below one path; several modules may have a resource of that path."""
+
+    handles: dict[str, int] = field(default_factory=dict)
+    publishers: frozenset[str] = frozenset()
+    """The nodes that publish the descriptor."""
+    looked: float = -1e9
+
+
+class ResourceWatch:
+    """Follows the resources of the graph.
+
+    Args:
+        hub: Subscribes to their topics.
+        values: Decodes their messages.
+        clock: Monotonic seconds.
+        now: Seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        values: MessageValues,
+        clock: Callable[[], float] = time.monotonic,
+        now: Callable[[], float] = time.time,
+    ) -> None:
+        self._hub = hub
+        self._values = values
+        self._clock = clock
+        self._now = now
+        self._numbers = itertools.count(_FIRST_HANDLE)
+        self._paths: dict[str, _Path] = {}
+        self._wanted = False
+        self._since: dict[str, tuple[str, float]] = {}
+        self._heard: dict[str, ResourceFacts] = {}
+        """By key, those included whose descriptor has not come yet."""
+
+    @property
+    def facts(self) -> dict[str, ResourceFacts]:
+        """The resources, by ``ResourceFacts.key``."""
+        return {key: facts for key, facts in self._heard.items() if facts.descriptor}
+
+    def start(self) -> None:
+        """Begin to follow the graph."""
+        self._hub.graph.follow((OWN_CLIENT, _GRAPH), self._graph_changed)
+
+    def close(self) -> None:
+        """End all subscriptions."""
+        self._hub.graph.unfollow((OWN_CLIENT, _GRAPH))
+        for path in [*self._paths]:
+            self._forget(path)
+
+    def show_all(self, *, wanted: bool) -> None:
+        """Whether the state of each resource is shown anywhere."""
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._follow_all()
+
+    def look(self, key: str) -> None:
+        """A page shows this resource: follow all that it says, for ``limits.LOOK_KEPT`` from now on."""
+        facts = self.facts.get(key)
+        path = self._paths.get(facts.name) if facts is not None else None
+        if path is not None and facts is not None:
+            path.looked = self._clock()
+            self._follow(facts.name, path)
+
+    def alarms(self) -> list[Tree]:
+        """The alarms that stand, for the state."""
+        standing: list[Tree] = []
+        for key, facts in self.facts.items():
+            level = facts.level
+            since = self._stands_since(key, facts)
+            if level in _BAD:
+                standing.append({
+                    "id": key,
+                    "module": facts.peer or "",
+                    "resource": key,
+                    "level": level,
+                    "text": str((facts.health or {}).get("message", "")),
+                    "at": round(since, 1),
+                })  # fmt: skip
+        return standing
+
+    def _stands_since(self, key: str, facts: ResourceFacts) -> float:
+        """Since when a resource has its level: as it says itself, or else since it was heard with it."""
+        before = self._since.get(key)
+        if before is None or before[0] != facts.level:
+            lasted = facts.quality(LEVEL_FOR) or 0.0
+            before = self._since[key] = facts.level, self._now() - max(0.0, lasted)
+        return before[1]
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _graph_changed(self) -> None:
+        ending = f"/{DESCRIPTOR}"
+        present = {
+            name.removesuffix(ending): topic
+            for name, topic in self._hub.graph.topics.items()
+            if name.endswith(ending) and topic.publishers and _TEXT in topic.types
+        }
+        for path in self._paths.keys() - present.keys():
+            self._forget(path)
+        for path, topic in present.items():
+            if path not in self._paths and len(self._paths) < limits.RESOURCES_MAX:
+                self._paths[path] = _Path()
+            self._keep_publishers(path, topic)
+        self._follow_all()
+
+    def _keep_publishers(self, path: str, topic: GraphTopic) -> None:
+        there, publishers = self._paths.get(path), frozenset(topic.publishers)
+        if there is None or there.publishers == publishers:
+            return
+        if there.publishers and publishers - there.publishers:
+            # A source that is back sends the same latched messages, which a subscription has had: begin anew.
+            self._unsubscribe(path, there)
+        there.publishers = publishers
+        peers = {proxied_peer(node) for node in publishers}
+        for key, facts in [*self._heard.items()]:
+            if facts.name == path and facts.peer not in peers:
+                del self._heard[key]
+                self._since.pop(key, None)
+
+    def _follow_all(self) -> None:
+        for name, path in self._paths.items():
+            self._follow(name, path)
+
+    def _follow(self, name: str, path: _Path) -> None:
+        wanted = dict(_ALWAYS)
+        if self._wanted:
+            wanted |= _SHOWN
+            if self._clock() - path.looked < limits.LOOK_KEPT:
+                wanted |= _LOOKED_AT
+        for topic in path.handles.keys() - wanted.keys():
+            self._hub.topics.unsubscribe((OWN_CLIENT, path.handles.pop(topic)), f"{name}/{topic}")
+        for topic in wanted.keys() - path.handles.keys():
+            handle = path.handles[topic] = next(self._numbers)
+
+            def take(message: ReceivedMessage, topic: str = topic) -> None:
+                self._take(name, topic, message)
+
+            self._hub.topics.subscribe(
+                (OWN_CLIENT, handle), f"{name}/{topic}", wanted[topic], take, lambda _error: None
+            )
+
+    def _unsubscribe(self, name: str, path: _Path) -> None:
+        for topic, handle in path.handles.items():
+            self._hub.topics.unsubscribe((OWN_CLIENT, handle), f"{name}/{topic}")
+        path.handles.clear()
+
+    def _forget(self, name: str) -> None:
+        self._unsubscribe(name, self._paths.pop(name))
+        for key in [key for key, facts in self._heard.items() if facts.name == name]:
+            del self._heard[key]
+            self._since.pop(key, None)
+
+    def _take(self, name: str, topic: str, message: ReceivedMessage) -> None:
+        peer = proxied_peer(message.source)
+        key = f"{peer}:{name}" if peer else name
+        try:
+            values = self._values.of(message)
+            facts = self._heard.get(key) or ResourceFacts(name=name, peer=peer)
+            if topic == DESCRIPTOR:
+                self._heard[key] = msgspec.structs.replace(facts, **_described(values["data"]))
+            else:  # latched ones may come before the descriptor
+                self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
+        except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
+            return  # another program's topic of that name
+
+
+def _described(text: str) -> dict[str, Any]:
+    """What a descriptor says."""
+    descriptor = Descriptor.parse(text)
+    return {
+        "descriptor": msgspec.to_builtins(descriptor),
+        "contexts": tuple(map(msgspec.to_builtins, descriptor.contexts)),
+    }
+
+
+def _said(facts: ResourceFacts, topic: str, values: Any) -> dict[str, Any]:
+    """What a message says of a resource: members of ``ResourceFacts``."""
+    if topic in ("state", "profile", "context"):
+        return {topic: str(values["data"])}
+    if topic == "decision":
+        decision = msgspec.json.decode(values["data"] or "{}")
+        is_shown = isinstance(decision, dict) and _depth(decision, limits.DECISION_DEPTH) <= limits.DECISION_DEPTH
+        return {"decision": decision if is_shown else facts.decision}
+    if topic == "responses":
+        return {"clients": tuple(map(_status, values["status"]))}
+    if topic == "parameter_updates":
+        pairs = [pair for kind in ("bools", "ints", "strs", "doubles") for pair in values[kind]]
+        return {"parameters": {pair["name"]: pair["value"] for pair in pairs}}
+    statuses = [*map(_status, values["status"]), facts.health]
+    return {"health": statuses[0]}
+
+
+def _depth(value: Any, most: int) -> int:
+    """How many objects and arrays are within each other, counted up to one more than ``most``."""
+    if most < 0 or not isinstance(value, dict | list):
+        return 0
+    inner = value.values() if isinstance(value, dict) else value
+    return 1 + max((_depth(each, most - 1) for each in inner), default=0)
+
+
+def _status(values: Any) -> dict[str, Any]:
+    """A ``diagnostic_msgs/DiagnosticStatus`` as ``rmpa resource info --json`` has it."""
+    return {
+        "name": values["name"],
+        "level": DiagnosticLevel(values["level"] & 3).name,
+        "message": values["message"],
+        "values": {pair["key"]: pair["value"] for pair in values["values"]},
+    }

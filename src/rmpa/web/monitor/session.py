@@ -14,9 +14,9 @@ import msgspec
 from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
+from rmpa.web import limits
 from rmpa.web.hub import requests
-from rmpa.web.monitor import limits
-from rmpa.web.monitor.joystick import Joystick
+from rmpa.web.monitor.live import Joystick, WatchState, difference
 from rmpa.web.monitor.messages import (
     VERSION,
     Ack,
@@ -29,16 +29,13 @@ from rmpa.web.monitor.messages import (
     Watch,
     parse,
 )
-from rmpa.web.monitor.patch import difference
-from rmpa.web.monitor.watches import WatchState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rmpa.web.hub.node_link import Rights
     from rmpa.web.hub.requests import ReceivedMessage
-    from rmpa.web.hub.rights import Rights
-    from rmpa.web.monitor.patch import Tree, Value
-    from rmpa.web.monitor.watches import Decode
+    from rmpa.web.monitor.live import Decode, Tree, Value
 
 QUESTIONS: Mapping[str, str] = {
     "why": "",

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import msgspec
 
-from rmpa.web.monitor import limits
-from rmpa.web.monitor.nodes import NodeEntries, node_detail
-from rmpa.web.monitor.patch import Tree, Value, without_nulls
+from rmpa.web import limits
+from rmpa.web.monitor.live import Steady, Tree, Value, steady_figure, without_nulls
+from rmpa.web.monitor.questions import NodeEntries, node_detail
 from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
-from rmpa.web.monitor.steady import Steady, steady_figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

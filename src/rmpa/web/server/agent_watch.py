@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from rmpa.core.errors import RmpaError, UnreachableError
+import msgspec
+
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import SnapshotDecoder
-from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision, SnapshotDecoder
+from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.trust.joining import TrustStatus
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
+    from pathlib import Path
 
+    from rmpa.observe.control_client import FoundAgent
     from rmpa.observe.snapshot import Snapshot
+    from rmpa.web.hub.graph import GraphWatch
 
 _log = logging.getLogger(__name__)
 
@@ -203,3 +210,191 @@ class ControlReader:
         if self._client is not None:
             self._client.close()
             self._client = None
+
+
+# Changes of the graph as the agent tells them, so that the hub has them at once and need not read all of it.
+
+
+_T = TypeVar("_T")
+
+
+class GraphSignal:
+    """Waits for changes at the control socket, one question after the other, and gives them to the graph.
+
+    An older agent, and one whose core is another program, tells only that there is a change: then the master is asked
+    for the graph. While no agent answers, the master is asked again and again.
+
+    Args:
+        environ: Says where the sockets are.
+        agent: Returns the agent's name; ``None``: the one that ``choose_agent`` finds.
+        graph: Takes the changes.
+    """
+
+    def __init__(self, environ: Mapping[str, str], agent: Callable[[], str | None], graph: GraphWatch) -> None:
+        self._environ = environ
+        self._agent = agent
+        self._graph = graph
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin, in a task."""
+        self._task = asyncio.get_running_loop().create_task(self._run(), name="wait for changes of the graph")
+
+    async def close(self) -> None:
+        """End."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    async def _run(self) -> None:
+        while True:
+            try:
+                await self._follow()
+            except (RmpaError, OSError, EOFError, asyncio.LimitOverrunError) as error:
+                _log.debug("! changes of the graph are not told: %s", error)
+            finally:
+                self._graph.lose()
+            await asyncio.sleep(limits.NODE_RETRY)
+
+    async def _follow(self) -> None:
+        master = await self._graph.master()
+        agent = await asyncio.to_thread(choose_agent, self._environ, self._agent())
+        # Only the first answer, and one after more changes than the agent keeps, has the whole graph.
+        async with control_stream(agent.path) as (reader, writer):
+            known: int | None = None
+            while True:
+                args: dict[str, object] = {"after": known, "wait": limits.GRAPH_WAIT, "rows": True}
+                async with asyncio.timeout(limits.GRAPH_WAIT + limits.WEB_AGENT_TIMEOUT):
+                    told = await ask(reader, writer, ControlRequest("graph", args), GraphRevision)
+                known = await self._take(told, known, master)
+
+    async def _take(self, told: GraphRevision, known: int | None, master: str) -> int:
+        if told.rows is None:
+            if told.revision != known:
+                self._graph.look()
+            self._graph.told = True
+        elif not same_core(told.core_uri, master):
+            raise RemoteProtocolError(f"the agent's core is {told.core_uri}, and this node's {master}")
+        elif told.revision != known:
+            loop = asyncio.get_running_loop()
+            began = loop.time()
+            self._graph.take(told.rows)
+            # Changes of the next moment come together: in a storm of them, half of the time is spent here.
+            await asyncio.sleep(max(limits.GRAPH_GATHER, loop.time() - began))
+        return told.revision
+
+
+@contextlib.asynccontextmanager
+async def control_stream(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A connection to an agent's control socket."""
+    reader, writer = await asyncio.open_unix_connection(path, limit=observe_limits.CONTROL_REPLY_MAX)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+async def ask(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: ControlRequest, kind: type[_T]
+) -> _T:
+    """The agent's answer to a request.
+
+    Raises:
+        RemoteProtocolError: It is refused, or of another kind.
+    """
+    writer.write(request.serialize())
+    reply = ControlReply.parse(await reader.readuntil(b"\n"))
+    if not reply.ok:
+        raise RemoteProtocolError(reply.error)
+    try:
+        return msgspec.convert(reply.value, kind)
+    except msgspec.ValidationError as error:
+        raise RemoteProtocolError(f"the agent answers {request.op} in another way: {error}") from None
+
+
+# Whether a server fits the agent that it speaks to: it is never less secure than that.
+
+
+class TrustWatch:
+    """Notices an agent that is secured in another way than this server: the server is then to be made anew.
+
+    It holds a connection to the agent's control socket, whose end tells that the agent may be another one now: also
+    one of another name that took over the core, since the server's node stays registered there.
+
+    Args:
+        environ: Says where the sockets are.
+        agent: The agent's name; ``None``: the one that ``choose_agent`` finds.
+        fits: Whether this server may speak to an agent; ``None``: one without trust.
+    """
+
+    def __init__(
+        self, environ: Mapping[str, str], agent: str | None, fits: Callable[[TrustStatus | None], bool]
+    ) -> None:
+        self._environ = environ
+        self._agent = agent
+        self._core = ""
+        self._fits = fits
+        self._loop = asyncio.get_running_loop()
+        self._task: asyncio.Task[None] | None = None
+        self.misfit = asyncio.Event()
+        """Set once an agent answers that this server may not speak to."""
+
+    def start(self) -> None:
+        """Begin, in a task."""
+        self._task = self._loop.create_task(self._run(), name="watch whether the agent is secured")
+
+    async def close(self) -> None:
+        """End."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    def check(self, snapshot: Snapshot) -> None:
+        """Check the agent that sent a snapshot; may be called in any thread.
+
+        Raises:
+            PeerRefused: This server may not show it.
+        """
+        if not self._fits(snapshot.trust):
+            self._loop.call_soon_threadsafe(self.misfit.set)
+            problem = "is secured, and this server begins anew with its certificate and permissions"
+            raise PeerRefused(f"agent {snapshot.agent.name}", problem, "ask again")
+
+    async def _run(self) -> None:
+        pause = limits.TRUST_RETRY
+        while not self.misfit.is_set():
+            try:
+                await self._follow()
+                pause = limits.TRUST_RETRY
+            except (RmpaError, OSError, EOFError, TimeoutError, asyncio.LimitOverrunError) as error:
+                _log.debug("! whether the agent is secured is not known: %s", error)
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, limits.NODE_RETRY)
+
+    async def _follow(self) -> None:
+        """Ask one run of an agent, and wait for its end."""
+        agent = await asyncio.to_thread(self._find)
+        async with control_stream(agent.path) as (reader, writer):
+            async with asyncio.timeout(limits.WEB_AGENT_TIMEOUT):
+                status = await ask(reader, writer, ControlRequest("trust", {"what": "status"}), TrustStatus)
+            if not self._fits(status if status.on else None):
+                self.misfit.set()
+                return
+            self._agent = self._agent or agent.name
+            await reader.read()  # idle connections are ended, too: then it is asked again
+
+    def _find(self) -> FoundAgent:
+        """The agent; where it does not run, one that has its core."""
+        agents = find_agents(self._environ)
+        found = next((agent for agent in agents if agent.name == self._agent), None)
+        for agent in agents if found is None and self._core else ():
+            with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+                if same_core(client.agent().core_uri, self._core):
+                    return agent
+        if found is None:
+            found = choose_agent(self._environ, self._agent)
+        with ControlClient(found.path) as client:
+            self._core = client.agent().core_uri
+        return found

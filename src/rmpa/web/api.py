@@ -1,27 +1,189 @@
-"""The agent's snapshot as Prometheus metrics, for ``/metrics``.
+"""The REST API: parts of the agent's snapshot as JSON; no I/O.
 
-Names, units and types are as in prometheus.io/docs/practices/naming: base units, ``_total`` for counters, times as
-seconds since the epoch, quantiles as summaries. Labels name peers, topics, nodes and services, whose numbers are
-bounded (``limits.METRIC_…``): ``rmpa_metrics_omitted`` says how many are left out. A counter of a link or a route
-begins at 0 when that is opened anew, which PromQL's ``rate`` understands.
+The types are those of ``observe.snapshot``, as ``--json`` of the commands gives them. Errors are problem details
+(RFC 9457).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, TypeVar
+import asyncio
+import difflib
+import os
+import pickle
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from urllib.parse import unquote
 
+import msgspec
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from rmpa.core.identity import is_legal_name
+from rmpa.observe.snapshot import Snapshot
 from rmpa.web import limits
+from rmpa.web.server.access import web_metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot
+    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo
+    from rmpa.web.server.access import Figures
+
+PREFIX: Final = "/api/v1"
+"""Begins each path; a later version that breaks clients has another number."""
+_JSON: Final = "application/json"
+_PROBLEM_JSON: Final = "application/problem+json"
+_NAME: Final = "{name}"
+
+
+class Problem(msgspec.Struct, kw_only=True, frozen=True):
+    """Why a request has no result (RFC 9457).
+
+    Attributes:
+        title: What happened, the same for all errors of this status.
+        status: The HTTP status.
+        detail: What happened with this request, and what to do.
+    """
+
+    title: str
+    status: int
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class RestResponse:
+    """An HTTP response: status, body, its type, and further headers."""
+
+    status: int
+    body: bytes
+    content_type: str = _JSON
+    headers: tuple[tuple[str, str], ...] = ()
+
+
+class _Missing(NamedTuple):
+    """No resource has the name that was asked for; ``names`` are those that there are."""
+
+    what: str
+    name: str
+    names: tuple[str, ...]
+
+
+def _peer(snapshot: Snapshot, name: str) -> object:
+    found = next((each for each in snapshot.peers if each.name == name), None)
+    return found or _Missing("peer", name, tuple(each.name for each in snapshot.peers))
+
+
+def _topic(snapshot: Snapshot, name: str) -> object:
+    wanted = _global(name)
+    found = next((each for each in snapshot.topics if each.name == wanted), None)
+    return found or _Missing("topic", wanted, tuple(each.name for each in snapshot.topics))
+
+
+def _service(snapshot: Snapshot, name: str) -> object:
+    wanted = _global(name)
+    found = tuple(each for each in snapshot.services if each.name == wanted)
+    return found or _Missing("service", wanted, tuple(each.name for each in snapshot.services))
+
+
+def _global(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
+
+
+_RESOURCES: Final[Mapping[str, Callable[[Snapshot, str], object]]] = {
+    "/snapshot": lambda s, _: s,
+    "/agent": lambda s, _: s.agent,
+    "/peers": lambda s, _: s.peers,
+    "/peers/{name}": _peer,
+    "/topics": lambda s, _: s.topics,
+    "/topics/{name}": _topic,
+    "/services": lambda s, _: s.services,
+    "/services/{name}": _service,
+    "/counters": lambda s, _: s.counters,
+    "/notes": lambda s, _: s.notes,
+    "/unreachable": lambda s, _: s.unreachable,
+}
+"""What each path below ``PREFIX`` gives."""
+
+
+def respond(path: str, snapshot: Snapshot | None, why: str = "") -> RestResponse:
+    """The response to a request by GET or HEAD.
+
+    Args:
+        path: Percent-encoded, without the query. Slashes of a topic's or a service's name need no encoding.
+        snapshot: The newest; ``None`` while the agent does not answer.
+        why: Why it does not, and what to do, where that is known.
+    """
+    read, name = _find(path)
+    if read is None:
+        return problem(404, f"there is no {_short(path)}; below {PREFIX} there are {', '.join(_RESOURCES)}")
+    if snapshot is None:
+        return problem(503, why or "the agent does not answer; start it with rmpa up, or look at its log")
+    result = read(snapshot, name)
+    if isinstance(result, _Missing):
+        return problem(404, _missing(result))
+    return RestResponse(200, msgspec.json.encode(result))
+
+
+def _find(path: str) -> tuple[Callable[[Snapshot, str], object] | None, str]:
+    below = path.removeprefix(PREFIX)
+    if below == path or len(path) > limits.REST_PATH_MAX:
+        return None, ""
+    if below in _RESOURCES and _NAME not in below:
+        return _RESOURCES[below], ""
+    kind, _, rest = below.removeprefix("/").partition("/")
+    read = _RESOURCES.get(f"/{kind}/{_NAME}")
+    return (read, unquote(rest, errors="replace")) if read and rest else (None, "")
+
+
+def _missing(missing: _Missing) -> str:
+    text = f"there is no {missing.what} {_short(missing.name)}"
+    near = difflib.get_close_matches(missing.name, missing.names[: limits.REST_NAMES_COMPARED], 1)
+    if near:
+        return f"{text}; did you mean {near[0]}?"
+    if missing.what != "peer" and not is_legal_name(missing.name):
+        return f"{text}: that is not a ROS name"
+    return f"{text}; {PREFIX}/{missing.what}s lists all"
+
+
+def _short(text: str) -> str:
+    return ascii(text if len(text) <= 80 else f"{text[:80]}…")
+
+
+_TITLES: Final = {
+    400: "Bad request",
+    401: "A token is needed",
+    403: "Refused",
+    404: "Not found",
+    405: "Method not allowed",
+    413: "Too large",
+    500: "Internal error",
+    503: "The agent does not answer",
+}
+
+
+def detail_of(response: RestResponse) -> str:
+    """The text of a response that ``problem`` made."""
+    return msgspec.json.decode(response.body, type=Problem).detail
+
+
+def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> RestResponse:
+    """The problem details of a status, as a response."""
+    body = msgspec.json.encode(Problem(title=_TITLES[status], status=status, detail=detail))
+    return RestResponse(status, body, _PROBLEM_JSON, headers)
+
+
+# The agent's snapshot as Prometheus metrics, for ``/metrics``.
+#
+# Names, units and types are as in prometheus.io/docs/practices/naming: base units, ``_total`` for counters, times
+# as
+# seconds since the epoch, quantiles as summaries. Labels name peers, topics, nodes and services, whose numbers are
+# bounded (``limits.METRIC_…``): ``rmpa_metrics_omitted`` says how many are left out. A counter of a link or a route
+# begins at 0 when that is opened anew, which PromQL's ``rate`` understands.
+
 
 PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")
 """The values of ``PeerInfo.state``."""
@@ -319,3 +481,57 @@ def _key(topic: str, route: RouteInfo) -> tuple[str, str, str, str]:
 
 def _at(taken: float, ago: float | None) -> float | None:
     return None if ago is None else round(taken - ago, 3)
+
+
+# The text of ``/metrics`` of a large graph, made in a process of its own: ``python -m`` this module.
+#
+# Thousands of topics take some 0.5 s. A thread of the server would share its interpreter lock with all live
+# clients,
+# whose messages then wait for it again and again. The process costs its start, and runs with less priority than
+# them.
+
+
+_NICE: Final = 5
+
+
+async def make_metrics(snapshot: Snapshot | None, accept: str, figures: Figures) -> tuple[bytes, str]:
+    """The body of ``/metrics`` and its content type; see ``metrics.exposition``."""
+    if snapshot is not None and sum(len(each.routes) for each in snapshot.topics) > limits.METRIC_ROUTES_IN_THREAD:
+        made = await _in_process(pickle.dumps((msgspec.json.encode(snapshot), accept, figures)))
+        if made is not None:
+            return made
+    return await asyncio.to_thread(exposition, snapshot, accept, tuple(web_metrics(figures)))
+
+
+async def _in_process(asked: bytes) -> tuple[bytes, str] | None:
+    """The answer of a process; ``None`` where it fails, as without memory for it."""
+    try:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", __name__, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+        )
+    except OSError:
+        return None
+    try:
+        async with asyncio.timeout(limits.METRIC_PROCESS_TIMEOUT):
+            answer, _ = await process.communicate(asked)
+    except TimeoutError:
+        return None
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    kind, _, body = answer.partition(b"\n")
+    return (body, kind.decode()) if process.returncode == 0 else None
+
+
+def main() -> None:
+    """Read the question from the standard input, and write the content type and the body."""
+    os.nice(_NICE)
+    encoded, accept, figures = pickle.loads(sys.stdin.buffer.read())  # noqa: S301 - of the server that started it
+    snapshot = msgspec.json.decode(encoded, type=Snapshot)
+    body, kind = exposition(snapshot, accept, tuple(web_metrics(figures)))
+    sys.stdout.buffer.write(kind.encode() + b"\n" + body)
+
+
+if __name__ == "__main__":
+    main()
