@@ -15,9 +15,10 @@ import pytest
 
 import rmpa
 from rmpa.config.read import SCHEMAS
-from rmpa.core import limits as sizes
 from rmpa.core.limits import KIB, MIB
-from rmpa.web import limits as monitor_limits
+
+_SIZES: Final = {"KIB", "MIB", "INT32_MIN", "INT32_MAX", "UINT32_MAX"}
+"""Units and ranges of numbers, which bound nothing."""
 
 
 def all_limits() -> dict[str, list[float]]:
@@ -27,17 +28,17 @@ def all_limits() -> dict[str, list[float]]:
     for file in (*root.glob("*/limits.py"), *root.glob("gateway/*/limits.py")):
         room = ".".join(file.parent.relative_to(root).parts)
         for name, value in vars(import_module(f"rmpa.{room}.limits")).items():
-            if name.isupper() and not hasattr(sizes, name):
+            if name.isupper() and name not in _SIZES:
                 found.setdefault(name, []).append(value)
     return found
 
 
 LIMITS: Final = all_limits()
-PAGES: Final = {name: value for name, value in vars(monitor_limits).items() if name.isupper()}
-"""Of the monitor's pages; docs/design/monitor-protocol.md has all of them."""
-PAGE: Final = Path(__file__).parents[2] / "docs" / "limits.md"
+DOCS: Final = Path(__file__).parents[2] / "docs"
+PAGE: Final = DOCS / "limits.md"
+OTHERS: Final = (DOCS / "rosbridge.md", DOCS / "design" / "monitor-protocol.md")
+"""Pages with the bounds of one protocol, whose tests compare the figures."""
 INTERNAL: Final = {
-    "ADVERTISED_MAX",
     "ADVERTISEMENT_MAX",
     "ANSWER_ADDRESSES_MAX",
     "ASK_BYTES_MAX",
@@ -125,6 +126,16 @@ INTERNAL: Final = {
     "CLOSE_MAX",
     "FLUSH_MAX",
     "RECONNECT_MAX",
+    "CODECS_MAX",
+    "FRAGMENTED_MESSAGES_MAX",
+    "ID_MAX",
+    "INLINE_MAX",
+    "NAME_MAX",
+    "TEXT_MAX",
+    "TYPE_SIZE_MAX",
+    "TYPE_VALUES_MAX",
+    "WRITTEN_MAX",
+    "ZENOH_KEY_MAX",
 }
 """Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
 
@@ -167,8 +178,8 @@ def test_each_row_has_the_codes_figure(row: Row) -> None:
     names = re.findall(r"`([A-Z_0-9]+)`", row.name)
     assert names, f"line {row.line}: no name in the last column"
     for name in names:
-        assert name in LIMITS or name in PAGES, f"line {row.line}: there is no {name} in any limits.py"
-        values = LIMITS[name] if name in LIMITS else [PAGES[name]]
+        assert name in LIMITS, f"line {row.line}: there is no {name} in any limits.py"
+        values = LIMITS[name]
         fits = any(row.default in figures(value) for value in values)
         assert fits, f"line {row.line}: {name} is {values}, not {row.default}"
 
@@ -184,6 +195,8 @@ def test_each_row_names_existing_settings(row: Row) -> None:
 
 def test_no_bound_is_missing() -> None:
     shown = {name for row in rows() for name in re.findall(r"`([A-Z_0-9]+)`", row.name)}
+    for page in OTHERS:
+        shown.update(re.findall(r"\| `([A-Z_0-9]+)` \|", page.read_text(encoding="utf-8")))
     bounds = {name for name in LIMITS if name.endswith("_MAX")}
     missing = bounds - shown - INTERNAL
     assert not missing, f"add a row to {PAGE.name}, or to INTERNAL here: {', '.join(sorted(missing))}"
