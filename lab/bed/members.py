@@ -10,8 +10,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from rmpa.trust import limits
-from rmpa.trust.certificates import CURVE, issue, make_ca, make_request, read_request
-from rmpa.trust.documents import KeyList, sign
+from rmpa.trust.certificates import CURVE, KeyList, issue, make_ca, make_request, read_request, sign
 from rmpa.trust.packets import GroupKey
 from rmpa.trust.store import MemberFiles, TrustStore
 

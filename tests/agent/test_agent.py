@@ -15,7 +15,7 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.bridge import limits
-from rmpa.bridge.proxies import proxied_node
+from rmpa.bridge.policy import proxied_node
 from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.control_client import ControlClient

@@ -23,7 +23,7 @@ from rmpa.core.contract import ContractRule, Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
 from rmpa.ros.wire.xmlrpc import serialize_response
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.agent.test_agent import Sink, node, running, settings, until
 from tests.agent.test_services import serving
 from tests.agent.test_services_direct import about, transport

@@ -22,16 +22,16 @@ from rmpa.ros.node.node import Node
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
 from rmpa.trust.authority import found_mesh
-from rmpa.trust.certificates import page_hosts
-from rmpa.trust.documents import DocumentKind, Notice
+from rmpa.trust.certificates import DocumentKind
 from rmpa.trust.joining import join_mesh
+from rmpa.trust.permissions import Notice, page_hosts
 from rmpa.trust.tokens import Token
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from rmpa.trust.joining import TrustStatus
+    from rmpa.trust.permissions import TrustStatus
     from rmpa.trust.store import MemberFiles
 
 DEADLINE = 30.0

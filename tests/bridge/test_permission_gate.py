@@ -16,7 +16,7 @@ from rmpa.config.peer_rules import Access, PermissionRule
 from rmpa.config.read import load_settings
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from pathlib import Path

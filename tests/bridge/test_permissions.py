@@ -30,7 +30,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
 from rmpa.core.counters import Counters
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.bridge.test_relay import Map
 
 TYPE = "a/B"

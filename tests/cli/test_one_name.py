@@ -23,7 +23,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.discovery.network import list_interfaces
-from rmpa.trust.certificates import host_names, page_hosts
+from rmpa.trust.permissions import host_names, page_hosts
 from tests.cli.conftest import DEADLINE, end, free_port, until
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rmpa.cli.options import flatten, pick, shorten, to_text
+from rmpa.cli.messages import fill_stamps, flatten, pick, read_values, shorten, to_text
 from rmpa.cli.output import Column, duration, print_error, print_table, printable, read_name, size
-from rmpa.cli.topic import facts, fill_stamps, read_values
+from rmpa.cli.topic import facts
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.observe.snapshot import RouteInfo
 from tests.observe.samples import DIRECT

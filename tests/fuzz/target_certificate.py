@@ -7,8 +7,17 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import RemoteProtocolError
 
 try:
-    from rmpa.trust.certificates import ca_public_key, make_request, read_request, verify
-    from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
+    from rmpa.trust.certificates import (
+        DenyList,
+        KeyList,
+        ca_public_key,
+        make_request,
+        read_deny_list,
+        read_key_list,
+        read_request,
+        sign,
+        verify,
+    )
     from rmpa.trust.packets import GroupKey
     from tests.trust.authority import WALL, Authority, new_key
 except ImportError:  # the extra "trust" is not installed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.trust.authority import CertificateGrant, Join, JoinRefused, Renew, decode_message, encode_message
+from rmpa.trust.tokens import CertificateGrant, Join, JoinRefused, Renew, decode_message, encode_message
 
 SEEDS: list[bytes] = [
     b"",

@@ -9,7 +9,7 @@ from rmpa.config.read import parse_config
 from rmpa.config.settings import TrustSettings
 from rmpa.config.values import BadValue
 from rmpa.core.errors import ConfigError
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 SEEDS: list[bytes] = [
     b"",

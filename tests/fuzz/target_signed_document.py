@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.trust.documents import read_document, read_have
+from rmpa.trust.permissions import read_document, read_have
 
 try:
-    from rmpa.trust.documents import DenyList, KeyList, read_deny_list, read_key_list, sign
+    from rmpa.trust.certificates import DenyList, KeyList, read_deny_list, read_key_list, sign
     from rmpa.trust.packets import GroupKey
     from tests.trust.authority import Authority
 except ImportError:  # the extra "trust" is not installed

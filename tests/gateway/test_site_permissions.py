@@ -7,7 +7,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import SitePermissions
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 
 def site_permissions(counters: Counters, *rules: PermissionRule) -> SitePermissions:

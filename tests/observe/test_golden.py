@@ -14,10 +14,10 @@ import click
 import msgspec
 import pytest
 
-from rmpa.cli.doctor import _json as doctor_json
-from rmpa.cli.doctor import _lines as doctor_lines
-from rmpa.cli.doctor import _stage_lines as why_lines
-from rmpa.cli.doctor import _summary as doctor_summary
+from rmpa.cli.agent import _json as doctor_json
+from rmpa.cli.agent import _lines as doctor_lines
+from rmpa.cli.agent import _stage_lines as why_lines
+from rmpa.cli.agent import _summary as doctor_summary
 from rmpa.observe.doctor.agents import judge_agents
 from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_rights, judge_shell
 from rmpa.observe.doctor.network import (

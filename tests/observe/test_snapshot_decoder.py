@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.observe.control import ControlReply, SnapshotDecoder
 from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
-from rmpa.trust.joining import TrustStatus
+from rmpa.trust.permissions import TrustStatus
 from tests.web.snapshots import AGENT, peer
 
 if TYPE_CHECKING:

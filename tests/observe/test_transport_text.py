@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from rmpa.observe.health import fallbacks, route_texts, stuck, subscriber_text
+from rmpa.observe.why.diagnosis import fallbacks, route_texts, stuck, subscriber_text
 from tests.observe.samples import DIRECT, VIEWER
 
 SAID = "a node /viewer of another module is connected already"

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from rmpa.runtime.process import in_thread
+from rmpa.runtime.accept import in_thread
 
 WHERE: contextvars.ContextVar[str] = contextvars.ContextVar("where", default="nowhere")
 

@@ -21,7 +21,7 @@ from rmpa.trust import limits
 from rmpa.trust.certificates import (
     URN,
     CertificateError,
-    TrustReason,
+    DenyList,
     ca_public_key,
     check_ca,
     issue,
@@ -29,7 +29,7 @@ from rmpa.trust.certificates import (
     read_request,
     verify,
 )
-from rmpa.trust.documents import DenyList
+from rmpa.trust.permissions import TrustReason
 from rmpa.trust.tokens import fingerprint_of
 from tests.fuzz import target_certificate
 from tests.trust.authority import WALL, Authority, new_key

@@ -14,15 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.trust import limits
-from rmpa.trust.documents import (
-    DenyEntry,
-    DenyList,
-    DocumentError,
-    KeyList,
-    read_deny_list,
-    read_key_list,
-    sign,
-)
+from rmpa.trust.certificates import DenyEntry, DenyList, DocumentError, KeyList, read_deny_list, read_key_list, sign
 from rmpa.trust.packets import GroupKey
 from tests.trust.authority import WALL, Authority, new_key
 

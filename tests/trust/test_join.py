@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.trust.authority import (
+from rmpa.trust.tokens import (
     CertificateGrant,
     Join,
     JoinMessage,

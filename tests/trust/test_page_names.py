@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.trust import limits
-from rmpa.trust.certificates import host_names, page_hosts, server_names
+from rmpa.trust.permissions import host_names, page_hosts, server_names
 
 
 @pytest.mark.parametrize(

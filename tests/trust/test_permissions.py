@@ -13,7 +13,7 @@ from rmpa.config.read import load_settings
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import ConfigError
 from rmpa.trust import limits
-from rmpa.trust.documents import PermissionDecision, Permissions
+from rmpa.trust.permissions import PermissionDecision, Permissions
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.bridge.messages import Notification, decode, encode
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.trust.documents import DOCUMENTS, DocumentSpreading, Notice, have_args, read_document, read_have
+from rmpa.trust.permissions import DOCUMENTS, DocumentSpreading, Notice, have_args, read_document, read_have
 
 
 @dataclass

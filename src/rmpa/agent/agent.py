@@ -27,12 +27,12 @@ from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.discovery.network import list_interfaces
-from rmpa.observe.control import GraphRevisions
-from rmpa.observe.control_client import ControlClient, SiteRequests, find_agents, runtime_dir
+from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlOperations, ControlServer, control_access
 from rmpa.observe.health import Diagnostics
 from rmpa.observe.peer_info import INFO
-from rmpa.observe.snapshot_builder import SnapshotBuilder, SnapshotSources
+from rmpa.observe.peers_section import SiteRequests
+from rmpa.observe.snapshot_builder import GraphRevisions, SnapshotBuilder, SnapshotSources
 from rmpa.observe.topics_section import PeerClocks
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
@@ -44,8 +44,7 @@ from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tcp_connections import may_end_connections
-from rmpa.trust.certificates import host_names, page_hosts
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions, host_names, page_hosts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.observe.control_server import Handler
     from rmpa.observe.snapshot import AgentInfo
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 
 # What the user is told at the start about settings of permissions that do not do what they seem to.
@@ -366,7 +365,7 @@ class Agent:
             _log.warning("! %s; %s (docs/systemd.md)", text, remedy)
 
     def apply_settings(self, settings: Settings) -> None:
-        """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""
+        """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""
         before, self._settings = self._settings, settings
         if not before.allows_direct:
             self._warn_of_stale_connections()

@@ -1,4 +1,7 @@
-"""Limits of what an agent runs beside itself. Seconds."""
+"""The process of an agent: start, end, reload of settings, and the web server that runs beside it.
+
+Limits of what an agent runs beside itself. Seconds.
+"""
 
 from __future__ import annotations
 

@@ -20,8 +20,17 @@ from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.trust import limits
-from rmpa.trust.documents import DocumentSpreading, Notice, have_args, read_document, read_have
-from rmpa.trust.joining import InviteReply, JoinStep, TrustReply, TrustStatus
+from rmpa.trust.permissions import (
+    DocumentSpreading,
+    InviteReply,
+    JoinStep,
+    Notice,
+    TrustReply,
+    TrustStatus,
+    have_args,
+    read_document,
+    read_have,
+)
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
@@ -33,7 +42,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Clock
     from rmpa.core.identity import Identity
     from rmpa.trust.authority import MeshAuthority
-    from rmpa.trust.documents import DocumentKind
+    from rmpa.trust.certificates import DocumentKind
     from rmpa.trust.joining import JoinServer
     from rmpa.trust.membership import Membership
 
@@ -97,7 +106,7 @@ class AgentTrust(Part):
         hosts: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:
         from rmpa.trust.authority import MeshAuthority  # noqa: PLC0415
-        from rmpa.trust.documents import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
+        from rmpa.trust.certificates import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
         from rmpa.trust.joining import JoinServer  # noqa: PLC0415
 
         self.membership = membership

@@ -1,4 +1,7 @@
-"""The bridge of one agent: its parts connect the local core with the links of the mesh."""
+"""The bridge of one agent, and its watch over peers of the same kind, which drive each other by equal names.
+
+The bridge of one agent: its parts connect the local core with the links of the mesh.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import DataReceiver
+from rmpa.bridge.driver import PeerRpc
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import OWN_NODE, Needs, PermissionGate, Policy, Relay, is_own
 from rmpa.bridge.proxies import Names, ProxyNodes
-from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, guarded
 from rmpa.bridge.topics.part import Topics
 from rmpa.config.peer_rules import Access
@@ -33,10 +36,10 @@ if TYPE_CHECKING:
     from rmpa.config.settings import PeerRule, Settings
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.master.parameters import GraphChange, GraphState
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.documents import Permissions
+    from rmpa.trust.permissions import Permissions
 
 _log = logging.getLogger(__name__)
 

@@ -68,8 +68,8 @@ SERVICE_LATENCIES: Final = 512
 AUDIENCE_MAX: Final = 64
 """Nodes subscribed to one topic that are named to the agent of its publisher."""
 AUDIENCES_MAX: Final = 1024
-"""Connections that represent the subscribers of one peer (``bridge.topics.audience``): enough for 512 action servers
-of one module."""
+"""Connections that represent the subscribers of one peer (``bridge.topics.subscribers``): enough for 512 action
+servers of one module."""
 ASK_NAME_MAX: Final = 64
 """Characters in the name of a request between agents."""
 ASKS_AT_ONCE: Final = 64

@@ -288,7 +288,7 @@ class ServiceClosed(msgspec.Struct, frozen=True, tag_field="op", tag="service_cl
 
 
 class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
-    """A request of one agent to another; ``bridge.session.peer_rpc`` finds its handler.
+    """A request of one agent to another; ``bridge.driver`` finds its handler.
 
     Args:
         number: Identifies the request at the requesting agent.

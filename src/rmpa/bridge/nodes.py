@@ -1,4 +1,6 @@
-"""Nodes of which nothing crosses: each peer is told of them, and they stand in every graph by their proxies.
+"""The nodes of peers: those of which nothing crosses, questions about them, and ``rosnode kill`` of proxies.
+
+Nodes of which nothing crosses: each peer is told of them, and they stand in every graph by their proxies.
 
 Topics and services bring the proxies of their nodes. A node that only subscribes, or whose services stay home, would
 not be known to ``rosnode`` in the other modules. Its proxy is registered with one service of its own,
@@ -16,8 +18,8 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, Policy, is_own
-from rmpa.bridge.proxies import ProxyCallbacks, proxied_node
+from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, Policy, is_own, proxied_node
+from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config import limits as config_limits
@@ -37,12 +39,12 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.part import Topics
     from rmpa.config.settings import Settings
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode

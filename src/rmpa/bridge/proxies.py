@@ -1,4 +1,6 @@
-"""Translates names between a peer's graph and the local one: pure functions of the ``[[peer]]`` rules.
+"""The proxies that stand for a peer's nodes here, and the names of each source at a peer and here.
+
+Translates names between a peer's graph and the local one: pure functions of the ``[[peer]]`` rules.
 
 *Wire* names are those that cross: topics and services as the module has them that publishes or provides them. ::
 
@@ -20,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 from weakref import WeakValueDictionary
 
-from rmpa.bridge.policy import OWN_NODE
+from rmpa.bridge.policy import proxy_name, proxy_prefix
 from rmpa.config import limits
 from rmpa.config.peer_rules import PEER
 from rmpa.config.rules import CLOCK
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Origin
     from rmpa.config.settings import PeerRule
     from rmpa.core.counters import Counters
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
 
 
@@ -152,41 +154,58 @@ def _renamed(name: str, source: str, target: str) -> str | None:
     return target[:-3] + name[len(stem) :] or None
 
 
-# The names of proxies in the local graph.
+# Names the proxies: one namespace for each module that has nodes in the local graph.
 
 
-def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
-    """The namespace of one peer's proxies: ``/rmpa/<name>``.
+class ProxyNamespaces:
+    """The namespaces of peers and of relayed modules; no two modules share one."""
 
-    Args:
-        peer: The peer.
-        taken: Prefixes of other modules. Two modules of one name must not share a prefix, or their proxies would
-            replace each other in the graph.
-    """
-    prefix = f"{OWN_NODE}/{peer.name}"
-    if prefix in taken:
-        address, port = peer.guid.endpoint
-        prefix = f"{prefix}_{address.replace('.', '_')}_{port}"
-    return prefix
+    def __init__(self) -> None:
+        self._linked: dict[int, tuple[str, str]] = {}
+        """The module's instance and its namespace, by the session's number."""
+        self._relayed: dict[str, str] = {}
+        """The namespace of each relayed module, by its instance."""
+        self._reserved: set[str] = set()
+        """The instances whose namespaces are kept while they have no proxy."""
 
+    def add(self, peer: int, identity: Identity) -> str:
+        """Return the namespace of a peer, which is reserved until ``remove``."""
+        instance = identity.instance.hex()
+        prefix = proxy_prefix(identity, self._taken(instance))
+        self._linked[peer] = (instance, prefix)
+        return prefix
 
-def proxy_name(prefix: str, node: str) -> str:
-    """The name of a node's proxy: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
-    return prefix + node
+    def remove(self, peer: int) -> None:
+        """Release the namespace of a peer that is gone for good."""
+        self._linked.pop(peer, None)
 
+    def relayed_name(self, origin: Origin, *, reserve: bool = False) -> str:
+        """The name of a relayed node's proxy, made by the same rules as for linked modules.
 
-def proxied_node(name: str) -> tuple[str, str] | None:
-    """The peer's name and the node that a proxy stands for; ``None`` for a node of this module."""
-    if not name.startswith(OWN_NODE + "/"):
-        return None
-    peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
-    return (peer, slash + node) if node else None
+        Args:
+            origin: Its module and node.
+            reserve: Whether the namespace is kept for good.
+        """
+        if reserve:
+            self._reserved.add(origin.instance)
+        prefix = self._relayed.get(origin.instance)
+        if prefix is None:
+            module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
+            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._taken(origin.instance))
+        return proxy_name(prefix, origin.node)
 
+    def forget_unused(self, names: Collection[str]) -> None:
+        """Forget the relayed modules that have no proxy among ``names``."""
+        self._relayed = {
+            instance: prefix
+            for instance, prefix in self._relayed.items()
+            if instance in self._reserved or any(name.startswith(f"{prefix}/") for name in names)
+        }
 
-def proxied_peer(name: str) -> str | None:
-    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
-    proxy = proxied_node(name)
-    return proxy[0] if proxy is not None else None
+    def _taken(self, instance: str) -> set[str]:
+        """The namespaces that other modules have."""
+        linked = {prefix for other, prefix in self._linked.values() if other != instance}
+        return linked | {prefix for other, prefix in self._relayed.items() if other != instance}
 
 
 # Makes the proxy nodes; where possible, all of them share one pair of listening sockets.
@@ -510,57 +529,3 @@ class PeerProxies:
             self.problems[node] = text
             level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is reported for the process
             _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)
-
-
-# Names the proxies: one namespace for each module that has nodes in the local graph.
-
-
-class ProxyNamespaces:
-    """The namespaces of peers and of relayed modules; no two modules share one."""
-
-    def __init__(self) -> None:
-        self._linked: dict[int, tuple[str, str]] = {}
-        """The module's instance and its namespace, by the session's number."""
-        self._relayed: dict[str, str] = {}
-        """The namespace of each relayed module, by its instance."""
-        self._reserved: set[str] = set()
-        """The instances whose namespaces are kept while they have no proxy."""
-
-    def add(self, peer: int, identity: Identity) -> str:
-        """Return the namespace of a peer, which is reserved until ``remove``."""
-        instance = identity.instance.hex()
-        prefix = proxy_prefix(identity, self._taken(instance))
-        self._linked[peer] = (instance, prefix)
-        return prefix
-
-    def remove(self, peer: int) -> None:
-        """Release the namespace of a peer that is gone for good."""
-        self._linked.pop(peer, None)
-
-    def relayed_name(self, origin: Origin, *, reserve: bool = False) -> str:
-        """The name of a relayed node's proxy, made by the same rules as for linked modules.
-
-        Args:
-            origin: Its module and node.
-            reserve: Whether the namespace is kept for good.
-        """
-        if reserve:
-            self._reserved.add(origin.instance)
-        prefix = self._relayed.get(origin.instance)
-        if prefix is None:
-            module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
-            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._taken(origin.instance))
-        return proxy_name(prefix, origin.node)
-
-    def forget_unused(self, names: Collection[str]) -> None:
-        """Forget the relayed modules that have no proxy among ``names``."""
-        self._relayed = {
-            instance: prefix
-            for instance, prefix in self._relayed.items()
-            if instance in self._reserved or any(name.startswith(f"{prefix}/") for name in names)
-        }
-
-    def _taken(self, instance: str) -> set[str]:
-        """The namespaces that other modules have."""
-        linked = {prefix for other, prefix in self._linked.values() if other != instance}
-        return linked | {prefix for other, prefix in self._relayed.items() if other != instance}

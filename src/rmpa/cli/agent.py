@@ -1,24 +1,25 @@
-"""``rmpa up``: the agent of this machine."""
+"""Commands about this machine's agent: ``rmpa up``, ``reload``, ``config``, ``name``, ``doctor`` and ``why``.
+
+``rmpa up``: the agent of this machine.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import gc
-import importlib.util
 import logging
 import os
-import signal
 import socket
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.options import agent_option, config_option, json_option, setting_options
-from rmpa.cli.output import Column, print_json, print_line, print_table, printable, warn
+from rmpa.cli.options import FiniteRange, agent_option, completes, config_option, json_option, setting_options
+from rmpa.cli.output import LEVEL_COLOURS, Column, print_json, print_line, print_table, printable, read_name, warn
 from rmpa.cli.peer import connect
 from rmpa.config.module_name import (
     GATEWAY_SUFFIX,
@@ -31,100 +32,26 @@ from rmpa.config.module_name import (
     toml_value,
 )
 from rmpa.config.read import load_settings
-from rmpa.config.settings import SETTINGS, WebSettings
-from rmpa.config.values import HOST, BadValue
+from rmpa.config.settings import SETTINGS
 from rmpa.core.counters import configure_logging
-from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_problem
+from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
-from rmpa.observe.control_client import ControlClient, find_agents, with_running
+from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, with_running
+from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel, exit_code
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.runtime.process import LogWriter
-from rmpa.trust.joining import TrustStatus
+from rmpa.trust.permissions import TrustStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rmpa.config.module_name import ModuleName, NameFacts
     from rmpa.config.read import Loaded
     from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
-    from rmpa.web.server.process import Address, WebSetup
-
-
-# ``rmpa core``: the ROS core alone, in place of ``roscore``.
-
-
-def _default_port() -> int:
-    """The port of ``ROS_MASTER_URI`` if its host is this machine, as for roscore; else 11311."""
-    from rmpa.ros.core.embedded import DEFAULT_PORT
-    from rmpa.ros.http.rpc import is_own_name, split_uri
-
-    try:
-        host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))
-    except UnreachableError:
-        return DEFAULT_PORT
-    return port if is_own_name(host) or host.startswith("127.") else DEFAULT_PORT
-
-
-@click.command()
-@click.option(
-    "-p",
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=None,
-    help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
-)
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
-)
-@click.option("--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host.")
-@click.option(
-    "--keep",
-    type=click.Choice(["auto", "always", "never"]),
-    default="auto",
-    show_default=True,
-    help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
-)
-@click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
-@click.option("--debug", is_flag=True, help="Log every call.")
-def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
-    """Run a ROS core: master, parameter server and /rosout, as roscore does."""
-    from rmpa.runtime.accept import raise_file_limit
-
-    level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
-    raise_file_limit()
-    asyncio.run(_run(host, _default_port() if port is None else port, advertise, keep=keep))
-
-
-async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
-    from rmpa import __version__
-    from rmpa.config.module_name import core_file
-    from rmpa.ros.core.embedded import ROS_VERSION, RosCore
-
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
-    core = RosCore(
-        host,
-        port,
-        advertised_host=advertise,
-        on_shutdown=lambda _: ended.set(),
-        state=core_file(os.environ, port),
-        keep=keep,
-    )
-    await core.start()
-    click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")
-    click.echo(f"ROS_MASTER_URI={core.uri}")
-    click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
-    click.echo("started core service [/rosout]")
-    if core.stored is not None and (text := core.stored.restored()):
-        click.echo(text)
-    sys.stdout.flush()
-    await ended.wait()
-    click.echo("shutting down")
-    await core.close()
+    from rmpa.observe.peer_info import Check
 
 
 # ``rmpa reload``: let the agent read its settings again.
@@ -159,7 +86,7 @@ def reload(check: bool, as_json: bool, agent: str | None) -> int:
     elif reply.problem:
         click.echo(f"rmpa: {printable(reply.problem)}", err=True)
     else:
-        print_line(_summary(reply, check=check))
+        print_line(_reload_summary(reply, check=check))
         for note in reply.notes:
             warn(note)
         for key in reply.restart:
@@ -167,7 +94,7 @@ def reload(check: bool, as_json: bool, agent: str | None) -> int:
     return 2 if reply.problem else 0
 
 
-def _summary(reply: ReloadReply, *, check: bool) -> str:
+def _reload_summary(reply: ReloadReply, *, check: bool) -> str:
     where = reply.file or "no file"
     if not reply.changed:
         return f"{where}: nothing {'would change' if check else 'has changed'}"
@@ -238,7 +165,7 @@ def schema() -> None:
 # The module that a command beside an agent is about: its name, settings and files, and its agent if that runs.
 
 
-_log = logging.getLogger(__name__)
+_module_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,7 +274,160 @@ def keep_first_name(settings: Settings, facts: NameFacts) -> None:
             return
         keep_name(directory, name)
     except RmpaError as error:
-        _log.warning("! the name %s is not kept: %s", name, error)
+        _module_log.warning("! the name %s is not kept: %s", name, error)
+
+
+# ``rmpa doctor``: checks this machine for what would keep modules apart.
+
+
+DOCTOR_EPILOG = """\
+\b
+Exit codes: 0 nothing fails (there may be warnings); 1 something does.
+
+\b
+Examples:
+  rmpa doctor
+  sudo rmpa doctor                reads the firewall's rules too
+  rmpa doctor --listen 30         and `rmpa doctor` on another machine: do multicasts get through?
+  rmpa doctor --json | jq '.[] | select(.level == "fail")'
+"""
+
+
+@click.command(epilog=DOCTOR_EPILOG)
+@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@click.option("-q", "--quiet", is_flag=True, help="Only what fails, or may.")
+@click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines.")
+@json_option
+def doctor(config: str | None, quiet: bool, listen: float | None, as_json: bool) -> int:
+    """Check this machine: settings, agents, network, ROS environment, clock and rights.
+
+    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
+    checks that it comes back. To see whether a switch or a firewall in between drops it, run it with --listen on one
+    machine and meanwhile without on the other, then the other way round.
+    """
+    from rmpa.observe.doctor.checks import examine, look_at
+
+    found, shown = [], []
+    for check in examine(look_at(os.environ, config, listen or 0.0)):
+        found.append(check)
+        if not quiet or check.level in (WARN, FAIL):
+            shown.append(check)
+            if not as_json:
+                click.echo("\n".join(_lines(check)))
+    if as_json:
+        print_json([*map(_json, shown)])
+    else:
+        click.echo(_summary(found))
+    return exit_code(found)
+
+
+def _json(check: Check) -> dict[str, str]:
+    keys = {"check": check.name, "subject": check.where, "level": check.level, "text": check.text}
+    return keys | ({"remedy": check.remedy} if check.remedy else {})
+
+
+def _lines(check: Check) -> list[str]:
+    mark = click.style(f"{check.level.value:<7}", fg=LEVEL_COLOURS[check.level])
+    what = f"{check.name} {check.where}".strip()
+    lines = [f"{mark}  {printable(what)}: {printable(check.text)}"]
+    if check.remedy:
+        lines.append(f"{'':<9}{printable(check.remedy)}")
+    return lines
+
+
+def _summary(found: Sequence[Check]) -> str:
+    counts = Counter(check.level for check in found)
+    words = [f"{counts[level]} {level.value}" for level in CheckLevel if counts[level]]
+    return f"{len(found)} answers: {', '.join(words)}"
+
+
+# ``rmpa why``: the stage at which a topic of a peer, or a service, stops.
+
+
+WHY_EPILOG = """\
+\b
+Exit codes: 0 it flows, on every way if there are several, or no node subscribes and nothing is in its way;
+1 it does not flow, and the first stage that fails says why.
+
+\b
+Examples:
+  rmpa why joystick:/cmd          why /cmd of joystick does not come here
+  rmpa why /odom                  every way of /odom, in and out
+  rmpa why arm:/move              why the service /move of arm cannot be called here
+  rmpa why --module arm           why the module arm is not linked, or slow
+  rmpa why joystick:/cmd --json | jq '.[].stages[-1]'
+"""
+
+_WELL: Final = {"service": "it can be called", "module": "it is linked"}
+"""What is said of a thing by its kind when no stage fails."""
+
+
+@click.command(epilog=WHY_EPILOG)
+@click.argument("name", metavar="[PEER:]NAME", shell_complete=completes("topic"))
+@click.option("-s", "--service", is_flag=True, help="A service is meant, though a topic has that name.")
+@click.option("-m", "--module", is_flag=True, help="NAME is a module: its link is checked.")
+@json_option
+@agent_option
+def why(name: str, service: bool, module: bool, as_json: bool, agent: str | None) -> int:
+    """Say why a topic of a peer does not arrive here, a service cannot be called, or a module is not linked.
+
+    Both agents are asked, stage by stage from the publisher to the reader; messages are watched for a second, and
+    a service's server is probed.
+    PEER is a name or a GUID. Without PEER every module that publishes the topic is checked, and for one of this
+    module's own topics every peer says how it arrives there.
+    """
+    if module:
+        args: dict[str, object] = {"module": name}
+    else:
+        wanted = read_name(name)
+        args = {"name": wanted.name, "peer": wanted.peer, "service": service}
+    with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
+        if not module and any(peer.name == name for peer in client.snapshot(topics=()).peers):
+            raise ConfigError("NAME", f"{name} is a module", f"`rmpa why --module {name}` says how it is linked")
+        found = client.call("why", tuple[Diagnosis, ...], **args)
+    if as_json:
+        print_json(found)
+    else:
+        for number, diagnosis in enumerate(found):
+            if number:
+                click.echo()
+            for line in _stage_lines(diagnosis):
+                click.echo(line)
+    return why_exit_code(found)
+
+
+def why_exit_code(diagnoses: Sequence[Diagnosis]) -> int:
+    """0 if messages or calls get through on every path that was asked about, else 1."""
+    return 0 if diagnoses and all(diagnosis.flows for diagnosis in diagnoses) else 1
+
+
+def _stage_lines(diagnosis: Diagnosis) -> list[str]:
+    of = f" of {diagnosis.node}" if diagnosis.node else ""
+    way = f" from {diagnosis.peer}" if diagnosis.peer and diagnosis.kind != "module" else ""
+    to = f" to {diagnosis.to}" if diagnosis.to else ""
+    lines = [printable(f"{diagnosis.name}{of}{way}{to}:")]
+    width = max((len(stage.name) for stage in diagnosis.stages), default=0)
+    lines += [_line(stage, width) for stage in diagnosis.stages]
+    failed = diagnosis.failed
+    if diagnosis.unasked:
+        lines.append(_paint("nothing is in its way: it flows as soon as a node subscribes", WARN))
+    elif failed is None:
+        lines.append(_paint(_WELL.get(diagnosis.kind, "it flows"), OK))
+    else:
+        lines.append(_paint(printable(f"it stops at: {failed.name}"), FAIL))
+        if failed.remedy:
+            lines.append(printable(f"what to do: {failed.remedy}"))
+    return lines
+
+
+def _line(stage: Check, width: int) -> str:
+    mark = _paint(f"{stage.level.value:<7}", stage.level)
+    advice = f" ({stage.remedy})" if stage.remedy and stage.level is WARN else ""
+    return f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}"
+
+
+def _paint(text: str, level: CheckLevel) -> str:
+    return click.style(text, fg=LEVEL_COLOURS[level])
 
 
 _up_log = logging.getLogger("rmpa.up")
@@ -394,175 +474,3 @@ def up(**options: object) -> int:
         return run(loaded.settings, load, partial(keep_first_name, loaded.settings, loaded.name_facts))
     finally:
         writer.close()
-
-
-# ``rmpa web``: this module's state for browsers and programs, over HTTP.
-
-
-_web_log = logging.getLogger("rmpa.web")
-_LIBRARIES = ("aiohttp", "cbor2", "prometheus_client")
-_DEFAULTS = WebSettings()
-WEB_EPILOG = """\
-\b
-[web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
-It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by its
-[[permission]], and begins anew where the agent comes back secured.
-
-\b
-Examples:
-  rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
-  rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
-  rmpa up --web                   the agent starts it, and again if it ends
-  curl -s localhost:8480/api/v1/peers | jq '.[].name'
-"""
-
-
-@click.command(epilog=WEB_EPILOG)
-@click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]")
-@click.option(
-    "--listen",
-    metavar="ADDRESS",
-    help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
-)
-@click.option(
-    "--token-file",
-    metavar="FILE",
-    help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
-)
-@click.option(
-    "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
-)
-@click.option(
-    "--control",
-    is_flag=True,
-    help="Let clients publish, call and offer services, and set parameters; they then need the token.",
-)
-@click.option(
-    "--cert",
-    metavar="FILE",
-    help="HTTPS with this certificate (PEM). [default: the module's, if secured]",
-)
-@click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]")
-@click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
-@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
-@click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
-@click.option("--insecure", is_flag=True, help="Start without an agent although other modules here have keys.")
-@agent_option
-@json_option
-def web(
-    port: int | None,
-    listen: str | None,
-    token_file: str | None,
-    hosts: tuple[str, ...],
-    control: bool,
-    cert: str | None,
-    key: str | None,
-    drive: bool,
-    config: str | None,
-    with_agent: bool,
-    insecure: bool,
-    agent: str | None,
-    as_json: bool,
-) -> int:
-    """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
-
-    It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
-    """
-    _check_libraries()
-
-    def with_options(given: WebSettings) -> WebSettings:
-        return replace(
-            given,
-            port=given.port if port is None else port,
-            listen=given.listen if listen is None else _host("--listen", listen),
-            token_file=given.token_file if token_file is None else token_file,
-            control=given.control or control,
-            cert=given.cert if cert is None else cert,
-            key=given.key if key is None else key,
-            drive=given.drive or drive,
-            hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
-        )
-
-    def make() -> tuple[Module, WebSetup]:
-        module = find_module(agent, {"config": config}, os.environ, "--agent")
-        settings = module.loaded.settings
-        settings = replace(settings, web=with_options(settings.web))
-        if insecure:
-            settings = replace(settings, trust=replace(settings.trust, insecure=True))
-        return module, _setup(module, settings)
-
-    module, setup = make()
-    log = setup.settings
-    configure_logging(log.log_level, sys.stderr, as_json=log.log_json)
-    for note in module.loaded.notes:
-        _web_log.warning("%s", note)
-    from rmpa.web.server.process import serve
-
-    def announce(address: Address) -> None:
-        _announce(address, as_json=as_json)
-
-    def load() -> WebSetup:
-        return make()[1]
-
-    while True:
-        pinned = module.name if module.chosen.source.said else None
-        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=load)):
-            return 0
-        module, setup = make()
-
-
-def _setup(module: Module, settings: Settings) -> WebSetup:
-    """What the server of a module is made of; it is as secure as the module's agent.
-
-    Raises:
-        RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
-    """
-    from rmpa.trust.store import TrustStore, check_open
-    from rmpa.web.server.process import WebSetup, access_of, certificate_files
-
-    store = TrustStore(module.state, module.name) if module.state is not None else None
-    trusted = module.secured or (store is not None and store.exists)
-    if not trusted and module.socket is None:
-        check_open(settings.trust, module.state, module.name, os.environ, "--agent")
-    own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
-    if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
-        theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
-        settings = replace(settings, trust=theirs.settings.trust)
-    files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
-    access = access_of(settings.web, module.name, os.environ, settings.state_dir)
-    folder = str(store.folder) if store is not None else ""
-    return WebSetup(settings, access, files, trusted, module.name, folder)
-
-
-def _check_libraries() -> None:
-    missing = [name for name in _LIBRARIES if not _is_there(name)]
-    if missing:
-        raise ConfigError("rmpa web", f"{' and '.join(missing)} not installed", "run pip install 'rmpa[web]'")
-
-
-def _is_there(name: str) -> bool:
-    try:
-        return importlib.util.find_spec(name) is not None
-    except ValueError:  # it was taken out of sys.modules
-        return False
-
-
-def _host(option: str, text: str) -> str:
-    try:
-        return HOST.read(text)
-    except BadValue as error:
-        raise ConfigError(option, error.problem, error.remedy) from None
-
-
-def _announce(address: Address, *, as_json: bool) -> None:
-    if as_json:
-        from rmpa.cli.output import print_json
-
-        print_json({"url": address.url, "token_file": address.token_file})
-    else:
-        click.echo(address.url)
-        if address.is_new:
-            click.echo(f"the token is kept in {address.token_file}; it is not printed again")
-        elif address.token_file:
-            click.echo(f"clients need the token of {address.token_file}")
-    sys.stdout.flush()

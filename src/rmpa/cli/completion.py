@@ -80,7 +80,7 @@ def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
             found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
 
     # Imported here, not in the thread: the time that this takes is not the agent's.
-    from rmpa.cli import output as graph  # noqa: F401
+    from rmpa.cli import output, param, resource  # noqa: F401
 
     if kind in _BY_NODE:
         from rmpa.ros.node import node  # noqa: F401
@@ -106,7 +106,7 @@ def _graph(ctx: click.Context) -> Graph:
 
 def _of_peer(name: str, node: str) -> str:
     """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
-    from rmpa.bridge.proxies import proxied_peer
+    from rmpa.bridge.policy import proxied_peer
 
     peer = proxied_peer(node)
     return name if peer is None else f"{peer}:{name}"
@@ -143,7 +143,7 @@ def _services(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _nodes(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.bridge.proxies import proxied_node
+    from rmpa.bridge.policy import proxied_node
 
     for node in _graph(ctx).nodes:
         proxy = proxied_node(node)

@@ -1,44 +1,45 @@
-"""``rmpa gateway``: joins this network's modules with other sites and with ROS 2, over Zenoh."""
+"""Programs beside the agent: ``rmpa gateway`` (with ``zenoh-config``), ``rmpa web`` and ``rmpa core``.
+
+``rmpa gateway``: joins this network's modules with other sites and with ROS 2, over Zenoh.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import gc
 import importlib.util
 import logging
 import os
+import signal
 import socket
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 import click
-import msgspec
 
-from rmpa.cli.agent import find_name
+from rmpa.cli.agent import find_module, find_name
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.options import agent_option, config_option, json_option, setting_options
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, warn
+from rmpa.cli.output import warn
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import HOST, BadValue
 from rmpa.core.counters import configure_logging
-from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError
+from rmpa.core.errors import ConfigError, StartError, UnreachableError
 from rmpa.core.identity import peer_name_from
-from rmpa.observe import limits
-from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.control_client import INFO, REPORT, ControlClient, choose_agent, find_agents
-from rmpa.observe.peer_info import SitesReport
+from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.process import LogWriter
-from rmpa.trust.joining import TrustStatus
+from rmpa.trust.permissions import TrustStatus
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.cli.agent import Module
     from rmpa.config.read import Given, Loaded
     from rmpa.config.settings import Settings
-    from rmpa.observe.peer_info import SiteInfo
+    from rmpa.web.server.process import Address, WebSetup
 
 _log = logging.getLogger("rmpa.gateway")
 _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
@@ -48,7 +49,7 @@ _OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled", 
 COMMANDS: Final = {
     "zenoh-config": ("rmpa.cli.gateway", "Print a configuration for zenohd, Zenoh's own router."),
 }
-EPILOG = """\
+GATEWAY_EPILOG = """\
 \b
 The gateway is a peer of the mesh with a core of its own, beside this machine's agent. It reads the same rmpa.toml and
 RMPA_* variables, but its name, its core's address and the mesh's port only from its own options.
@@ -72,7 +73,7 @@ _options = setting_options(
 )
 
 
-@click.group(cls=LazyGroup, commands_at=COMMANDS, epilog=EPILOG, invoke_without_command=True)
+@click.group(cls=LazyGroup, commands_at=COMMANDS, epilog=GATEWAY_EPILOG, invoke_without_command=True)
 @_options
 @config_option
 @click.pass_context
@@ -211,176 +212,245 @@ def _is_there(name: str) -> bool:
         return False
 
 
-# ``rmpa site list|info``: other sites that gateways join.
+# ``rmpa web``: this module's state for browsers and programs, over HTTP.
 
 
-_T = TypeVar("_T")
-_COLOURS: Final = {"this site": "green", "joined": "green", "no gateway": "yellow", "unreachable": "red"}
-_COLUMNS: Final = (
-    *map(Column, ("SITE", "STATE")),
-    *(Column(title, right=True) for title in ("SINCE", "GATEWAYS", "MODULES", "SOURCES", "SHOWN")),
-    Column("BY"),
-)
-_MODULES: Final = (Column("  MODULE"), *(Column(title, right=True) for title in ("TOPICS", "SERVICES", "SHOWN")))
-_SOURCES: Final = tuple(map(Column, ("  NAME", "KIND", "TYPE", "MODULE", "NODE", "HERE")))
-
-name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
-
-
-def _connect(agent: str | None, name: str | None) -> ControlClient:
-    return ControlClient(choose_agent(os.environ, name or agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT)
-
-
-def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
-    try:
-        value: object = client.call("site", object, what=what, args=args)
-    except PeerRefused as error:
-        raise RmpaError(error.reason) from None  # the agent only passes on what a gateway says
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
-        raise RemoteProtocolError(f"the gateway answers in another way: {error}; is it another version?") from None
-
-
-@click.command(
-    "list",
-    epilog="""\
+_web_log = logging.getLogger("rmpa.web")
+_WEB_LIBRARIES = ("aiohttp", "cbor2", "prometheus_client")
+_DEFAULTS = WebSettings()
+WEB_EPILOG = """\
 \b
-Exit codes: 0 each site is joined; 1 one is not, or no gateway answers.
+[web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
+It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by its
+[[permission]], and begins anew where the agent comes back secured.
 
 \b
 Examples:
-  rmpa site list
-  rmpa site list --name store-gateway
-  rmpa site list --json | jq -r '.[].sites[].name'
-""",
-)
-@json_option
-@agent_option
-@name_option
-def list_(as_json: bool, agent: str | None, name: str | None) -> int:
-    """List this site and the others that its gateways join.
-
-    SOURCES are the topics (one for each publisher) and services that a site offers, SHOWN those that are in the
-    graph here. BY is the gateway that was asked; one that stands by shows nothing.
-    """
-    with _connect(agent, name) as client:
-        reports = _ask(client, REPORT, tuple[SitesReport, ...])
-        absent = "" if reports else _why_none(client)
-    if not reports:
-        warn(absent)
-    if as_json:
-        print_json(reports)
-    elif reports:
-        rows = [(report, site) for report in reports for site in report.sites]
-        print_table(
-            _COLUMNS,
-            [_row(report, site) for report, site in rows],
-            colours=[_COLOURS.get(s.state, "") for _, s in rows],
-        )
-        for report in reports:
-            if report.problem:
-                warn(f"{report.gateway}: {report.problem}")
-            if not any(site.state != "this site" for site in report.sites):
-                warn(f"{report.gateway} of site {report.site} knows no other site{_where(report)}")
-    well = all(s.state in ("this site", "joined") for report in reports for s in report.sites)
-    return 0 if reports and well and not any(report.problem for report in reports) else 1
-
-
-def _why_none(client: ControlClient) -> str:
-    """Why no gateway answers: this agent is a gateway whose session is not open, or it knows none."""
-    with contextlib.suppress(RmpaError):  # no gateway: it has no such operation
-        problem = str(client.call(GATEWAY_REPORT, dict[str, object]).get("problem", ""))
-        return f"{client.name} joins no site: {problem or 'it is a gateway without --site'}"
-    start = "start one with `rmpa gateway --site NAME`; in a secured mesh `relays` of [trust] names it"
-    return f"{client.name} is no gateway, and is linked to none: {start}"
-
-
-def _where(report: SitesReport) -> str:
-    if report.endpoints:
-        return f": it is connected to {', '.join(report.endpoints)}, where no other gateway is"
-    return ": it is connected to nothing; is the router of gateway.connect there?"
-
-
-def _row(report: SitesReport, site: SiteInfo) -> list[str]:
-    sources = sum(module.topics + module.services for module in site.modules)
-    shown = sum(module.shown for module in site.modules)
-    return [
-        site.name,
-        site.state,
-        duration(site.since_ago),
-        str(site.gateways),
-        str(len({module.name for module in site.modules})),
-        str(sources),
-        str(shown),
-        report.gateway + ("" if report.leads else " (stands by)"),
-    ]
-
-
-@click.command(
-    epilog="""\
-\b
-Exit codes: 0 the site is joined, or this one; 1 it is not there, or not known.
-
-\b
-Examples:
-  rmpa site info warehouse
-  rmpa site info warehouse --json | jq '.sites[0].sources[] | select(.here == "")'
+  rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
+  rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
+  rmpa up --web                   the agent starts it, and again if it ends
+  curl -s localhost:8480/api/v1/peers | jq '.[].name'
 """
+
+
+@click.command(epilog=WEB_EPILOG)
+@click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]")
+@click.option(
+    "--listen",
+    metavar="ADDRESS",
+    help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
 )
-@click.argument("site")
-@json_option
+@click.option(
+    "--token-file",
+    metavar="FILE",
+    help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
+)
+@click.option(
+    "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
+)
+@click.option(
+    "--control",
+    is_flag=True,
+    help="Let clients publish, call and offer services, and set parameters; they then need the token.",
+)
+@click.option(
+    "--cert",
+    metavar="FILE",
+    help="HTTPS with this certificate (PEM). [default: the module's, if secured]",
+)
+@click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]")
+@click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
+@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
+@click.option("--insecure", is_flag=True, help="Start without an agent although other modules here have keys.")
 @agent_option
-@name_option
-def info(site: str, as_json: bool, agent: str | None, name: str | None) -> int:
-    """Show the modules of SITE, what they offer, its name here, and why something does not cross."""
-    with _connect(agent, name) as client:
-        report = _ask(client, INFO, SitesReport, site=site)
-    found = next((each for each in report.sites if each.name == site), None)
-    if found is None:
-        raise RmpaError(_unknown(report, site))
-    if as_json:
-        print_json(report)
-    else:
-        _show(report, found)
-    return 0 if found.state in ("this site", "joined") else 1
+@json_option
+def web(
+    port: int | None,
+    listen: str | None,
+    token_file: str | None,
+    hosts: tuple[str, ...],
+    control: bool,
+    cert: str | None,
+    key: str | None,
+    drive: bool,
+    config: str | None,
+    with_agent: bool,
+    insecure: bool,
+    agent: str | None,
+    as_json: bool,
+) -> int:
+    """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
+    It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
+    """
+    _check_libraries()
 
-def _unknown(report: SitesReport, site: str) -> str:
-    known = [each.name for each in report.sites]
-    near = did_you_mean(site, known)
-    return f"{report.gateway} knows no site {printable(site)!r}; " + (
-        f"did you mean {near}?" if near else f"known are {', '.join(known)}"
-    )
-
-
-def _show(report: SitesReport, site: SiteInfo) -> None:
-    since = f" for {duration(site.since_ago)}" if site.since_ago is not None else ""
-    facts = [
-        ("Site", site.name),
-        ("State", site.state + since),
-        ("Gateways", str(site.gateways)),
-        ("Seen by", f"{report.gateway} of site {report.site}" + ("" if report.leads else ", which stands by")),
-        ("Connected", ", ".join(report.endpoints) or "to nothing"),
-    ]
-    if site.not_shown:
-        facts.append(("Kept out", f"{site.not_shown} topics and services, by rules or for their names"))
-    if site.beyond:
-        facts.append(("Limit", f"{site.beyond} topics and services were left out: the site has too many"))
-    for label, text in facts:
-        print_line(f"{label + ':':<10} {text}")
-    if site.modules:
-        click.echo("\nModules:")
-        rows = [[f"  {m.name}", str(m.topics), str(m.services), str(m.shown)] for m in site.modules]
-        print_table(_MODULES, rows)
-    if site.sources:
-        click.echo("\nTopics and services:")
-        print_table(
-            _SOURCES, [[f"  {s.name}", s.kind, s.type, s.module, s.node, s.here or "-"] for s in site.sources]
+    def with_options(given: WebSettings) -> WebSettings:
+        return replace(
+            given,
+            port=given.port if port is None else port,
+            listen=given.listen if listen is None else _host("--listen", listen),
+            token_file=given.token_file if token_file is None else token_file,
+            control=given.control or control,
+            cert=given.cert if cert is None else cert,
+            key=given.key if key is None else key,
+            drive=given.drive or drive,
+            hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
         )
-    for source in site.sources:
-        if source.problem:
-            warn(f"{source.name} of {source.module}: {source.problem}")
+
+    def make() -> tuple[Module, WebSetup]:
+        module = find_module(agent, {"config": config}, os.environ, "--agent")
+        settings = module.loaded.settings
+        settings = replace(settings, web=with_options(settings.web))
+        if insecure:
+            settings = replace(settings, trust=replace(settings.trust, insecure=True))
+        return module, _setup(module, settings)
+
+    module, setup = make()
+    log = setup.settings
+    configure_logging(log.log_level, sys.stderr, as_json=log.log_json)
+    for note in module.loaded.notes:
+        _web_log.warning("%s", note)
+    from rmpa.web.server.process import serve
+
+    def announce(address: Address) -> None:
+        _announce(address, as_json=as_json)
+
+    def load() -> WebSetup:
+        return make()[1]
+
+    while True:
+        pinned = module.name if module.chosen.source.said else None
+        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=load)):
+            return 0
+        module, setup = make()
+
+
+def _setup(module: Module, settings: Settings) -> WebSetup:
+    """What the server of a module is made of; it is as secure as the module's agent.
+
+    Raises:
+        RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
+    """
+    from rmpa.trust.store import TrustStore, check_open
+    from rmpa.web.server.process import WebSetup, access_of, certificate_files
+
+    store = TrustStore(module.state, module.name) if module.state is not None else None
+    trusted = module.secured or (store is not None and store.exists)
+    if not trusted and module.socket is None:
+        check_open(settings.trust, module.state, module.name, os.environ, "--agent")
+    own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
+    if trusted and module.config_file not in ("", own_file):  # the permissions are those that its agent reads
+        theirs = load_settings({"config": module.config_file}, os.environ, host_name=socket.gethostname())
+        settings = replace(settings, trust=theirs.settings.trust)
+    files = certificate_files(settings.web.cert, settings.web.key, store if trusted else None)
+    access = access_of(settings.web, module.name, os.environ, settings.state_dir)
+    folder = str(store.folder) if store is not None else ""
+    return WebSetup(settings, access, files, trusted, module.name, folder)
+
+
+def _check_libraries() -> None:
+    missing = [name for name in _WEB_LIBRARIES if not _is_there(name)]
+    if missing:
+        raise ConfigError("rmpa web", f"{' and '.join(missing)} not installed", "run pip install 'rmpa[web]'")
+
+
+def _host(option: str, text: str) -> str:
+    try:
+        return HOST.read(text)
+    except BadValue as error:
+        raise ConfigError(option, error.problem, error.remedy) from None
+
+
+def _announce(address: Address, *, as_json: bool) -> None:
+    if as_json:
+        from rmpa.cli.output import print_json
+
+        print_json({"url": address.url, "token_file": address.token_file})
+    else:
+        click.echo(address.url)
+        if address.is_new:
+            click.echo(f"the token is kept in {address.token_file}; it is not printed again")
+        elif address.token_file:
+            click.echo(f"clients need the token of {address.token_file}")
+    sys.stdout.flush()
+
+
+# ``rmpa core``: the ROS core alone, in place of ``roscore``.
+
+
+def _default_port() -> int:
+    """The port of ``ROS_MASTER_URI`` if its host is this machine, as for roscore; else 11311."""
+    from rmpa.ros.core.embedded import DEFAULT_PORT
+    from rmpa.ros.http.rpc import is_own_name, split_uri
+
+    try:
+        host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))
+    except UnreachableError:
+        return DEFAULT_PORT
+    return port if is_own_name(host) or host.startswith("127.") else DEFAULT_PORT
+
+
+@click.command()
+@click.option(
+    "-p",
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=None,
+    help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
+)
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
+)
+@click.option("--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host.")
+@click.option(
+    "--keep",
+    type=click.Choice(["auto", "always", "never"]),
+    default="auto",
+    show_default=True,
+    help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
+)
+@click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
+@click.option("--debug", is_flag=True, help="Log every call.")
+def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
+    """Run a ROS core: master, parameter server and /rosout, as roscore does."""
+    from rmpa.runtime.accept import raise_file_limit
+
+    level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
+    raise_file_limit()
+    asyncio.run(_run(host, _default_port() if port is None else port, advertise, keep=keep))
+
+
+async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
+    from rmpa import __version__
+    from rmpa.config.module_name import core_file
+    from rmpa.ros.core.embedded import ROS_VERSION, RosCore
+
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    core = RosCore(
+        host,
+        port,
+        advertised_host=advertise,
+        on_shutdown=lambda _: ended.set(),
+        state=core_file(os.environ, port),
+        keep=keep,
+    )
+    await core.start()
+    click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")
+    click.echo(f"ROS_MASTER_URI={core.uri}")
+    click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
+    click.echo("started core service [/rosout]")
+    if core.stored is not None and (text := core.stored.restored()):
+        click.echo(text)
+    sys.stdout.flush()
+    await ended.wait()
+    click.echo("shutting down")
+    await core.close()
 
 
 # ``rmpa gateway zenoh-config``: a configuration for zenohd as the router of a fleet.

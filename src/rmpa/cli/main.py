@@ -1,4 +1,7 @@
-"""The groups of commands: ``rmpa topic``, ``rmpa node`` and so on, with the module of each command."""
+"""The program ``rmpa``: all commands and groups, each imported when it is used.
+
+The groups of commands: ``rmpa topic``, ``rmpa node`` and so on, with the module of each command.
+"""
 
 from __future__ import annotations
 
@@ -184,7 +187,7 @@ topic: Final = _group(
                 "delay": "Show how old they are when they come; over the mesh by the link's clock too.",
             },
         ),
-        ("topic", {"pub": "Publish messages."}),
+        ("messages", {"pub": "Publish messages."}),
     ],
     f"\b\nA topic is written /name; PEER:/name means the sources of one peer alone.\n{_MASTER}",
 )
@@ -284,7 +287,7 @@ alarm: Final = _group(
     "See the alarms of resources, here and at peers.",
     [
         (
-            "doctor",
+            "messages",
             {
                 "list": "List the resources that are not well at present.",
                 "echo": "Print alarms as they are raised and cleared, until Ctrl-C.",
@@ -297,7 +300,7 @@ site: Final = _group(
     "See other sites that gateways join.",
     [
         (
-            "gateway",
+            "site",
             {
                 "list": "List this site and the others, and how they are.",
                 "info": "Show the modules of a site and what they offer.",
@@ -355,7 +358,7 @@ trust: Final = _group(
 _GROUPS = "rmpa.cli.main"
 COMMANDS = {
     "up": ("rmpa.cli.agent", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
-    "core": ("rmpa.cli.agent", "Run the ROS core alone: a drop-in for roscore."),
+    "core": ("rmpa.cli.gateway", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("rmpa.cli.run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": (_GROUPS, "See the peers that the agent knows."),
     "topic": (_GROUPS, "See topics, listen to them, publish on them."),
@@ -368,9 +371,9 @@ COMMANDS = {
     "alarm": (_GROUPS, "See the alarms of resources."),
     "site": (_GROUPS, "See other sites that gateways join, and values of modules that are off."),
     "trust": (_GROUPS, "Secure the mesh: who may join, and what other modules may do here."),
-    "why": ("rmpa.cli.doctor", "Say why a topic of a peer does not arrive, and what to do."),
-    "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
-    "web": ("rmpa.cli.agent", "Serve this module's state over HTTP: metrics, REST."),
+    "why": ("rmpa.cli.agent", "Say why a topic of a peer does not arrive, and what to do."),
+    "doctor": ("rmpa.cli.agent", "Check this machine: network, clock, rights, ROS environment."),
+    "web": ("rmpa.cli.gateway", "Serve this module's state over HTTP: metrics, REST."),
     "gateway": ("rmpa.cli.gateway", "Join this network's modules with other sites and with ROS 2, over Zenoh."),
     "config": ("rmpa.cli.agent", "Show the settings and where each comes from; print their JSON Schema."),
     "reload": ("rmpa.cli.agent", "Let the agent read its settings again."),

@@ -1,4 +1,7 @@
-"""``rmpa node ping|kill``: calls to the nodes themselves."""
+"""``rmpa node``: lists nodes, shows one, asks whether it answers, and ends it.
+
+``rmpa node ping|kill``: calls to the nodes themselves.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 
-from rmpa.bridge.policy import is_own
-from rmpa.bridge.proxies import proxied_node, proxied_peer
+from rmpa.bridge.policy import is_own, proxied_node, proxied_peer
 from rmpa.cli.options import (
     FiniteRange,
     GraphOptions,

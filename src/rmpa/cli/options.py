@@ -1,15 +1,15 @@
-"""Flags that several commands share."""
+"""Options and choices that several commands share.
+
+Flags that several commands share.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import functools
 import importlib
 import math
 import os
 import re
-import signal
 import sys
 from collections import Counter
 from dataclasses import dataclass
@@ -18,17 +18,13 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from rmpa.cli.output import printable, warn
 from rmpa.config.settings import SETTINGS
-from rmpa.core.errors import RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
 
-    from rmpa.cli.output import Graph, GraphName, Master
+    from rmpa.cli.output import Graph, Master
     from rmpa.config.schema import Setting
-    from rmpa.ros.node.node import Node, Received
-    from rmpa.ros.types.messages import Plain
 
 _T = TypeVar("_T")
 
@@ -264,213 +260,3 @@ def _matcher(pattern: str) -> Callable[[str], bool]:
         return lambda _: True
     compiled = re.compile(translate(pattern))
     return lambda name: compiled.match(name) is not None
-
-
-# Runs commands that end at Ctrl-C, at a count, or with their master: one anonymous ROS node, closed cleanly.
-
-
-class Enough(Exception):  # noqa: N818 - not an error
-    """``--count`` is reached: raised by a command's callback, caught around ``watch_topic``."""
-
-
-class StreamWatch:
-    """The end of a running command, and the error that its callbacks report."""
-
-    def __init__(self) -> None:
-        self._end = asyncio.Event()
-        self._error: BaseException | None = None
-
-    def finish(self, error: BaseException | None = None) -> None:
-        """End the command; it fails with the first error that is given."""
-        self._error = self._error or error
-        self._end.set()
-
-    async def finished(self, seconds: float | None = None) -> bool:
-        """Wait for the end, or for so many seconds; return whether the command ends.
-
-        Raises:
-            BaseException: The error that ``finish`` was given.
-        """
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._end.wait()
-        if self._error is not None:
-            raise self._error
-        return self._end.is_set()
-
-
-def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
-    """Run a coroutine to its end; Ctrl-C and SIGTERM cancel it, and its own clean-up runs."""
-    from rmpa.runtime.accept import raise_file_limit
-
-    async def run() -> None:
-        task = asyncio.current_task()
-        assert task is not None  # noqa: S101 - it is this one
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-        await body()
-
-    with contextlib.suppress(KeyboardInterrupt, asyncio.CancelledError):
-        raise_file_limit()
-        asyncio.run(run())
-
-
-async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[None]]) -> None:
-    """Run ``body`` with a node of a unique name at a master.
-
-    Raises:
-        UnreachableError: The master does not answer.
-    """
-    from rmpa.ros.node.node import Node
-
-    node = Node(name, master_uri=master.uri, anonymous=True)
-    try:
-        await node.__aenter__()
-    except UnreachableError:
-        raise master.unreachable() from None
-    try:
-        await body(node)
-    finally:
-        await node.close()
-
-
-async def watch_topic(
-    master: Master,
-    wanted: GraphName,
-    on_message: Callable[[Received], None],
-    body: Callable[[StreamWatch], Awaitable[None]],
-) -> None:
-    """Subscribe to a topic and run ``body``.
-
-    Args:
-        master: The master to ask.
-        wanted: The topic; with a peer only messages of that peer's nodes count.
-        on_message: Called for each message; an exception ends the command and is raised by ``watch.finished``.
-        body: Runs until the watch is finished.
-    """
-    watch = StreamWatch()
-
-    def take(received: Received) -> None:
-        if not wanted.matches(received.caller_id):
-            return
-        try:
-            on_message(received)
-        except BaseException as error:  # noqa: BLE001 - carried over to the command, which fails with it
-            watch.finish(error)
-
-    async def listen(node: Node) -> None:
-        subscriber = await node.subscribe(wanted.name, None, take)
-        stopped = asyncio.get_running_loop().create_task(_end_with(node, watch))
-        try:
-            await body(watch)
-        finally:
-            stopped.cancel()
-            for refusal in subscriber.refusals.values():
-                warn(refusal)
-
-    await with_node(master, "rmpa_topic", listen)
-
-
-async def _end_with(node: Node, watch: StreamWatch) -> None:
-    await node.stopped.wait()
-    watch.finish()
-
-
-# Messages as text: the YAML-like form and the CSV form of ``rostopic echo``, and single fields of a message.
-
-
-_PART: Final = re.compile(r"(?P<name>\w+)(?P<indices>(?:\[[0-9]+\])*)", re.ASCII)
-_TIME: Final = {"secs", "nsecs"}
-
-
-def pick(plain: Plain, path: list[str]) -> Plain:
-    """Return one field of a message.
-
-    Args:
-        plain: The message.
-        path: Names from the outside in, each perhaps with indices: ``["pose", "covariance[0]"]``.
-
-    Raises:
-        RmpaError: There is no such field or element.
-    """
-    for part in path:
-        match = _PART.fullmatch(part)
-        if match is None:
-            raise RmpaError(f"{part!r} is not a field; one looks like name or name[0]")
-        if not isinstance(plain, dict) or match["name"] not in plain:
-            known = ", ".join(plain) if isinstance(plain, dict) else "none"
-            raise RmpaError(f"no field {match['name']!r} in the message; it has {known}")
-        plain = plain[match["name"]]
-        for index in re.findall(r"[0-9]+", match["indices"]):
-            if not isinstance(plain, list) or int(index) >= len(plain):
-                raise RmpaError(f"no element {index} in {match['name']!r}")
-            plain = plain[int(index)]
-    return plain
-
-
-def shorten(plain: Plain, *, arrays: bool, strings: bool) -> Plain:
-    """A copy of a message in which a note of the length replaces each array, and each string, if wanted."""
-    if isinstance(plain, dict):
-        return {name: shorten(value, arrays=arrays, strings=strings) for name, value in plain.items()}
-    if isinstance(plain, list):
-        if arrays:
-            return _Note(f"<array length: {len(plain)}>")
-        return [shorten(value, arrays=arrays, strings=strings) for value in plain]
-    if isinstance(plain, str) and strings:
-        return _Note(f"<string length: {len(plain)}>")
-    return plain
-
-
-class _Note(str):
-    """A text in place of a value, printed without quotes."""
-
-    __slots__ = ()
-
-
-def to_text(plain: Plain, indent: str = "") -> str:
-    """A message in the format of ``rostopic echo``, with control characters escaped."""
-    if isinstance(plain, dict):
-        return "\n".join(_field(name, value, indent) for name, value in plain.items())
-    if isinstance(plain, list):
-        return indent + _scalar_list(plain)
-    return indent + _scalar(plain)
-
-
-def _field(name: str, value: Plain, indent: str) -> str:
-    if isinstance(value, dict):
-        return f"{indent}{name}:" + ("\n" + to_text(value, indent + "  ") if value else " {}")
-    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
-        return f"{indent}{name}:\n" + "\n".join(f"{indent}  -\n{to_text(item, indent + '    ')}" for item in value)
-    return f"{indent}{name}: {_scalar_list(value) if isinstance(value, list) else _scalar(value)}"
-
-
-def _scalar_list(values: list[Plain]) -> str:
-    if any(isinstance(value, dict) for value in values):
-        return "\n".join(f"-\n{to_text(value, '  ')}" for value in values)
-    return f"[{', '.join(map(_scalar, values))}]"
-
-
-def _scalar(value: Plain) -> str:
-    if isinstance(value, _Note):
-        return str(value)
-    if isinstance(value, str):
-        escaped = "\n".join(printable(line) for line in value.replace("\\", "\\\\").replace('"', '\\"').split("\n"))
-        return f'"{escaped}"' if "\n" not in value else '"' + escaped.replace("\n", "\\n") + '"'
-    return str(value)
-
-
-def flatten(plain: Plain, name: str = "field") -> Iterator[tuple[str, str]]:
-    """Columns and cells in the format of ``rostopic echo -p``: times in nanoseconds, elements of arrays numbered."""
-    if isinstance(plain, dict) and plain.keys() == _TIME:
-        secs, nsecs = plain["secs"], plain["nsecs"]
-        assert isinstance(secs, int)  # noqa: S101 - as to_plain makes them
-        assert isinstance(nsecs, int)  # noqa: S101 - likewise
-        yield name, str(secs * 1_000_000_000 + nsecs)
-    elif isinstance(plain, dict):
-        for field, value in plain.items():
-            yield from flatten(value, f"{name}.{field}")
-    elif isinstance(plain, list):
-        for index, value in enumerate(plain):
-            yield from flatten(value, f"{name}{index}")
-    else:
-        text = str(int(plain)) if isinstance(plain, bool) else str(plain)
-        yield name, printable(text) if isinstance(plain, str) else text

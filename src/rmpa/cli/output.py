@@ -1,4 +1,6 @@
-"""What commands print: lines, tables, JSON, and numbers with units.
+"""What commands print (lines, tables, JSON), and the graph and the master that they read.
+
+What commands print: lines, tables, JSON, and numbers with units.
 
 Colours are click's: it drops them where standard output is no terminal, and everywhere with ``NO_COLOR``.
 """
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
-from rmpa.bridge.proxies import proxied_node, proxied_peer
+from rmpa.bridge.policy import proxied_node, proxied_peer
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name

@@ -1,4 +1,7 @@
-"""``rmpa profile list|get|set|explain``."""
+"""``rmpa profile`` and ``rmpa resource info``: what a resource has chosen, and choices by hand.
+
+``rmpa profile list|get|set|explain``.
+"""
 
 from __future__ import annotations
 

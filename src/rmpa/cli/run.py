@@ -1,4 +1,7 @@
-"""``rmpa run``: runs the Smart Resources of a Python file, with the agent of their module."""
+"""``rmpa run`` runs the Smart Resources of a Python file; ``rmpa context`` switches their contexts.
+
+``rmpa run``: runs the Smart Resources of a Python file, with the agent of their module.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""``rmpa service call``: one call, with a request in YAML or JSON."""
+"""``rmpa service``: lists services, shows one, and calls it.
+
+``rmpa service call``: one call, with a request in YAML or JSON.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.messages import fill_stamps, read_values, to_text
 from rmpa.cli.options import (
     FiniteRange,
     GraphOptions,
@@ -17,7 +21,6 @@ from rmpa.cli.options import (
     graph_options,
     selection_options,
     summary,
-    to_text,
 )
 from rmpa.cli.output import (
     Column,
@@ -36,7 +39,6 @@ from rmpa.cli.output import (
     require_peer,
     warn,
 )
-from rmpa.cli.topic import fill_stamps, read_values
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api

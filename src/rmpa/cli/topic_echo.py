@@ -1,4 +1,7 @@
-"""``rmpa topic echo``: prints messages as they arrive."""
+"""``rmpa topic echo``, ``hz``, ``bw`` and ``delay``: what listens to messages.
+
+``rmpa topic echo``: prints messages as they arrive.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.bridge.proxies import proxied_node, proxied_peer
-from rmpa.cli.options import (
-    Enough,
-    GraphOptions,
-    StreamWatch,
-    completes,
-    flatten,
-    graph_options,
-    pick,
-    run_stream,
-    shorten,
-    to_text,
-    watch_topic,
-)
+from rmpa.bridge.policy import proxied_node, proxied_peer
+from rmpa.cli.messages import flatten, pick, shorten, to_text
+from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Graph, GraphName, print_json, read_graph, read_name, require_peer, size, warn_unpublished
+from rmpa.cli.resource import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic import arriving, bandwidth_text, latency_text, origin, rate_text
 from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary
 from rmpa.core.errors import RmpaError

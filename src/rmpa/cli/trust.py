@@ -1,4 +1,7 @@
-"""``rmpa trust``: what other modules may do here."""
+"""``rmpa trust``: a mesh's authority, this module's membership, and what others may do here.
+
+``rmpa trust``: what other modules may do here.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,14 @@ from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.observe.control_client import ControlClient
-from rmpa.trust.documents import Permissions, action_topics
-from rmpa.trust.joining import TrustReply, TrustStatus
+from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
 from rmpa.trust.store import TrustStore, modules_with_keys
 
 if TYPE_CHECKING:
     from rmpa.config.module_name import ModuleName
     from rmpa.trust.authority import MeshAuthority
-    from rmpa.trust.documents import PermissionDecision
     from rmpa.trust.membership import Membership
+    from rmpa.trust.permissions import PermissionDecision
 
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
 
@@ -394,7 +396,7 @@ def _renew_files(place: TrustPlace) -> TrustReply:
     else:
         import asyncio
 
-        from rmpa.trust.documents import DocumentKind
+        from rmpa.trust.certificates import DocumentKind
         from rmpa.trust.joining import renew_at_authority
 
         known = place.store.load_authority()

@@ -27,7 +27,7 @@ from rmpa.cli.trust import (
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.joining import InviteReply, JoinStep, TrustReply
+from rmpa.trust.permissions import InviteReply, JoinStep, TrustReply
 
 if TYPE_CHECKING:
     from rmpa.cli.trust import TrustPlace
@@ -325,7 +325,7 @@ def _write_request(place: TrustPlace, out: Path, *, as_json: bool) -> None:
     from rmpa.trust import certificates
     from rmpa.trust import store as files_of
     from rmpa.trust.authority import request_pem
-    from rmpa.trust.certificates import new_key, private_key
+    from rmpa.trust.membership import new_key, private_key
 
     pem = new_key()
     request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
@@ -352,10 +352,10 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
 
     from rmpa.trust import certificates
     from rmpa.trust import store as files_of
-    from rmpa.trust.authority import CertificateGrant
-    from rmpa.trust.certificates import private_key
     from rmpa.trust.joining import check_grant
+    from rmpa.trust.membership import private_key
     from rmpa.trust.store import MemberFiles
+    from rmpa.trust.tokens import CertificateGrant
 
     digits = re.sub(r"[\s:]", "", ca or "").lower()
     if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):

@@ -1,4 +1,6 @@
-"""Which module a command is about: one decision for all commands.
+"""Which module a command is about, where it keeps its state, and the text of docs/settings.md.
+
+Which module a command is about: one decision for all commands.
 
 ::
 

@@ -1,4 +1,6 @@
-"""The tables ``[[peer]]`` of ``rmpa.toml``: names and policy for single peers (docs/names.md).
+"""Rules about peers: ``[[peer]]``, ``[[permission]]`` and ``[[service]]``, and the policy of names.
+
+The tables ``[[peer]]`` of ``rmpa.toml``: names and policy for single peers (docs/names.md).
 
 Names that no topic can have, or that never cross, are refused. What two names do that become one shows at run time:
 the first stays, and the other one says why it is hidden.
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PolicySettings:
-    """The topics and types that may cross the mesh, by globs (``core.names.matches``).
+    """The topics and types that may cross the mesh, by globs (``core.identity.matches``).
 
     A topic crosses if one of ``allow`` matches it and none of ``deny``, its type likewise; of several policies each
     must let it cross.

@@ -1,4 +1,7 @@
-"""The file ``rmpa.toml``: parsed, and its shape checked against the settings that ``config.settings`` declares."""
+"""Reads the settings: from ``rmpa.toml``, the environment and options, each value with its source and line.
+
+The file ``rmpa.toml``: parsed, and its shape checked against the settings that ``config.settings`` declares.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The tables ``[[contract]]`` of ``rmpa.toml``: what topics need, in ROS 2's words (docs/contracts.md)."""
+"""Rules about topics and parameters in ``rmpa.toml``: ``[[contract]]``, ``[[param]]`` and ``[[gateway.rule]]``.
+
+The tables ``[[contract]]`` of ``rmpa.toml``: what topics need, in ROS 2's words (docs/contracts.md).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Declares settings: each once, as a field of a settings dataclass.
+"""Declares settings, each once, as a field of a settings dataclass; reads quantities with units.
+
+Declares settings: each once, as a field of a settings dataclass.
 
 ::
 

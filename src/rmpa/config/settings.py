@@ -1,6 +1,6 @@
 """The agent's settings: each is declared once here; ``config.schema`` says what follows from a declaration.
 
-``config.sources`` reads them from the file, the environment and the command line. The reference for users,
+``config.read`` reads them from the file, the environment and the command line. The reference for users,
 docs/settings.md, is made from this module by ``scripts/write-reference``.
 """
 

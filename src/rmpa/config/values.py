@@ -1,7 +1,7 @@
 """The types of values that settings have: how a raw value is read, and what JSON Schema says of it.
 
 A raw value is a string of a command-line option or an environment variable, or a value of a TOML file. A reader
-returns the typed value, or raises ``BadValue`` with what is wrong and what to write instead; ``config.sources`` adds
+returns the typed value, or raises ``BadValue`` with what is wrong and what to write instead; ``config.read`` adds
 where the value was written.
 """
 
@@ -56,7 +56,7 @@ class ValueType(Generic[_T_co]):
 
     Args:
         read: Reads a raw value; raises ``BadValue``.
-        json_schema: What a value may be in TOML. ``config.file`` checks the ``type`` in it before ``read`` is called.
+        json_schema: What a value may be in TOML. ``config.read`` checks the ``type`` in it before ``read`` is called.
         metavar: What ``--help`` shows for the value of an option.
     """
 
@@ -327,7 +327,7 @@ MULTICAST: Final = ValueType(read_multicast, {"type": ["boolean", "string"]}, "G
 
 
 def read_topic_glob(raw: object) -> str:
-    """A glob over topics, as ``core.names.matches`` reads it."""
+    """A glob over topics, as ``core.identity.matches`` reads it."""
     glob = read_text(raw).strip()
     if not _TOPIC_GLOB.fullmatch(glob):
         raise BadValue(
@@ -442,7 +442,7 @@ def read_keys(table: Mapping[str, object], keys: Iterable[RuleKey], example: str
     """The values of a table's keys, by name; keys that are missing are left out.
 
     Args:
-        table: As written; ``config.file`` has checked the names of its keys.
+        table: As written; ``config.read`` has checked the names of its keys.
         keys: Those that are known.
         example: What a complete table has, for the error about a required key that is missing.
     """

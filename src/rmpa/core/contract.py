@@ -195,7 +195,7 @@ class ContractRule:
     """One ``[[contract]]``: the topics that it fits, and the values that it sets.
 
     Args:
-        topics: Globs over topics (``core.names.matches``), one of which must fit; empty: any topic.
+        topics: Globs over topics (``core.identity.matches``), one of which must fit; empty: any topic.
         types: Globs over message types, likewise. A rule with both needs both to fit.
         values: The keys that it sets, named and typed as the fields of ``Contract``.
     """

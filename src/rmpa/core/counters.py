@@ -1,4 +1,7 @@
-"""Counters of refused and dropped things, and a log of refusals that is limited in rate."""
+"""What all rooms count and time with: counters, logs, rings of figures, timers, back-off, token buckets.
+
+Counters of refused and dropped things, and a log of refusals that is limited in rate.
+"""
 
 from __future__ import annotations
 
@@ -179,7 +182,7 @@ def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) 
 
     Args:
         level: As in ``Settings.log_level``.
-        stream: Usually stderr, for an agent through ``runtime.log_writer``; stdout is for a command's result.
+        stream: Usually stderr, for an agent through ``runtime.process``; stdout is for a command's result.
         as_json: JSON lines instead of text.
     """
     handler = logging.StreamHandler(stream)
@@ -516,7 +519,7 @@ _T = TypeVar("_T")
 
 
 class Yielder(Protocol):
-    """Iterates over items; between two of them data may be handled (``runtime.event_loop.yielding_to_data``).
+    """Iterates over items; between two of them data may be handled (``runtime.loop.yielding_to_data``).
 
     ``iter`` is a yielder that handles nothing. The items must not change meanwhile: pass a copy, or a collection that
     nothing else changes. The caller's own data must be consistent during the iteration.

@@ -1,4 +1,7 @@
-"""The identity of a peer, as in beacons and in the mesh's handshake."""
+"""The identity of a peer: GUID, names, and serial numbers that wrap.
+
+The identity of a peer, as in beacons and in the mesh's handshake.
+"""
 
 from __future__ import annotations
 

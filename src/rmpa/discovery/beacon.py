@@ -1,4 +1,6 @@
-"""The beacon: the packet by which peers announce themselves (docs/design/protocol.md, "Beacons").
+"""The beacon, senders that are no members of this mesh, and the events that discovery reports.
+
+The beacon: the packet by which peers announce themselves (docs/design/protocol.md, "Beacons").
 
 Errors that ``Beacon.parse`` raises, all of them the sender's fault::
 

@@ -1,4 +1,7 @@
-"""Runs the membership protocol: UDP sockets, timer, interfaces and seeds."""
+"""Runs the membership protocol on UDP sockets, and judges packets before they are parsed.
+
+Runs the membership protocol: UDP sockets, timer, interfaces and seeds.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,8 @@ from rmpa.discovery.network import (
 )
 from rmpa.runtime.loop import MachineTimer, SystemClock, yield_to_data
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.certificates import TrustReason, not_of_this_mesh
 from rmpa.trust.packets import KeyPurpose, Verdict
+from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
     import socket

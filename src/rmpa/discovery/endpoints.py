@@ -1,4 +1,7 @@
-"""One (address, port): decides which run that claims it is the live one (restart, late packet or conflict)."""
+"""The table of (address, port): which run that claims an address is the live one, and which runs have ended.
+
+One (address, port): decides which run that claims it is the live one (restart, late packet or conflict).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The machine's network interfaces: which there are, which we use, and when they change."""
+"""The network for discovery: interfaces, UDP sockets, and seeds that are resolved again and again.
+
+The machine's network interfaces: which there are, which we use, and when they change.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A service of a neighbour in the gateway's graph."""
+"""Topics and services of a neighbour in the gateway's graph, and taps that listen to the gateway's own.
+
+A service of a neighbour in the gateway's graph.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Relay
     from rmpa.bridge.proxies import PeerProxies
     from rmpa.gateway.neighbour import ForeignSource, MeshSource
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription

@@ -1,8 +1,10 @@
-"""What a neighbour of the gateway (other sites, ROS 2) carries between its graph and the gateway's own one.
+"""What passes between the gateway's graph and its neighbours: sources of the mesh, values of Zenoh, permissions.
+
+What a neighbour of the gateway (other sites, ROS 2) carries between its graph and the gateway's own one.
 
 The gateway is a peer of the mesh that relays. Its core has the proxies of the modules at its site, which are *mesh
 sources*; a neighbour carries those out. What a neighbour brings in are *foreign sources*; they become proxies in the
-same core, which the relay offers to the modules (``gateway.graph``).
+same core, which the relay offers to the modules (``gateway.own_graph``).
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from rmpa.bridge.topics.local import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
-from rmpa.trust.documents import refusal
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from rmpa.config.peer_rules import Access
     from rmpa.config.settings import Settings
     from rmpa.ros.master.parameters import GraphChange
-    from rmpa.trust.documents import PermissionDecision
+    from rmpa.trust.permissions import PermissionDecision
 
 
 class SourceKind(StrEnum):

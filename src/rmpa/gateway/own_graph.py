@@ -1,4 +1,7 @@
-"""The origin with which the relay offers what a neighbour of the gateway has. Pure."""
+"""The gateway's own graph for its neighbours: what is offered, with its origin.
+
+The origin with which the relay offers what a neighbour of the gateway has. Pure.
+"""
 
 from __future__ import annotations
 
@@ -173,7 +176,7 @@ class AgentGraph(Part):
     def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
         """Listen under the name that a foreign node has here, and drop what comes.
 
-        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.audience``.
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.subscribers``.
 
         Args:
             source: The topic.

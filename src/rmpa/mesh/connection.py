@@ -41,7 +41,7 @@ from rmpa.mesh.keepalive import (
     RestPace,
 )
 from rmpa.runtime import limits as runtime_limits
-from rmpa.trust.certificates import TrustReason
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity

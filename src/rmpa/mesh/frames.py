@@ -1,4 +1,6 @@
-"""Frames: the units of a connection's byte stream (docs/design/protocol.md, "Frames").
+"""Frames, the units of a connection's byte stream, and the handshake at its start (docs/design/protocol.md).
+
+Frames: the units of a connection's byte stream (docs/design/protocol.md, "Frames").
 
 ``Frame`` is the readable form, for all frames that are rare. The data path packs headers by ``pack_data_header`` and
 ``pack_fragment_header``, reads them by ``unpack_header``, and makes no objects.
@@ -16,7 +18,7 @@ from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolEr
 from rmpa.core.identity import SERIAL_MASK, Guid, Identity, peer_name_problem
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
-from rmpa.trust.certificates import TrustReason
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -1,4 +1,7 @@
-"""When one connection sends its next keepalive, and when the silence of the remote side ends it."""
+"""Keepalive and the peer's clock of a connection, and the events that connections and peering report.
+
+When one connection sends its next keepalive, and when the silence of the remote side ends it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.mesh import limits
 from rmpa.mesh.frames import PaceFlag, Refusal, Refuse
-from rmpa.trust.certificates import TrustReason
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity

@@ -33,7 +33,7 @@ from rmpa.mesh.keepalive import (
     PeerStatus,
     SocketAddress,
 )
-from rmpa.trust.certificates import NOT_OF_THIS_MESH, TrustReason
+from rmpa.trust.permissions import NOT_OF_THIS_MESH, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,7 +12,7 @@ A message counts as received when its last fragment is received; a message that 
 start. Messages that the sender dropped at its bounds show as a gap in the sequence, so the receiver knows exactly how
 many messages will never arrive.
 
-Sequence numbers have 32 bits and wrap (``core.serial_number``). An *epoch* identifies one run of a numbering: after a
+Sequence numbers have 32 bits and wrap (``core.identity``). An *epoch* identifies one run of a numbering: after a
 sender was given up, the next one has another epoch. Methods that run for each message contain the serial arithmetic
 inline, for speed.
 """

@@ -1,4 +1,7 @@
-"""The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler."""
+"""The server of the control socket, its operations, and the credentials of its callers.
+
+The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +39,10 @@ from rmpa.core.errors import (
 from rmpa.core.identity import is_global_name
 from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision, ReloadReply
-from rmpa.observe.control_client import PARAM as SITE_PARAM
 from rmpa.observe.control_client import NameLock
 from rmpa.observe.peer_info import INFO as AGENT_INFO
 from rmpa.observe.peer_info import ContractTerm, PeerAgent, read_site_module
+from rmpa.observe.peers_section import PARAM as SITE_PARAM
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import NodeLine, PeerNodes
@@ -54,7 +57,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.nodes import NodeRequests
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.observe.control_client import SiteRequests
+    from rmpa.observe.peers_section import SiteRequests
     from rmpa.observe.snapshot_builder import SnapshotBuilder
 
 

@@ -1,4 +1,9 @@
-"""The result of a check: one model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``."""
+"""What is shown of a peer, of sites and of a check's result.
+
+The peers in an agent's snapshot: each peer of the roster, its link and the link's lanes.
+
+Times are seconds; ``…_ago`` counts back from the snapshot.
+"""
 
 from __future__ import annotations
 
@@ -13,80 +18,132 @@ from rmpa.core.identity import peer_name_problem
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-
-class CheckLevel(StrEnum):
-    """How bad a result is."""
-
-    OK = "ok"
-    WARN = "warn"
-    """It works, or may work: the first thing to check when something fails."""
-    FAIL = "fail"
-    """Something cannot work like this. ERROR on ``/diagnostics``."""
-    SKIPPED = "skipped"
-    """It could not be checked."""
-    UNKNOWN = "unknown"
-    """The agent that knows the answer did not reply; the walk along a path goes on."""
-    STALE = "stale"
-    """It existed before, and is gone (REP 107)."""
+FOREIGN: Final = "foreign"
+"""The state of a module that is heard, or refuses this one, because it is not of this mesh."""
 
 
-OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL
-SKIPPED, UNKNOWN, STALE = CheckLevel.SKIPPED, CheckLevel.UNKNOWN, CheckLevel.STALE
-
-
-class Check(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One result of one check.
-
-    It crosses the mesh as a stage of ``rmpa why``, where ``level`` is called ``verdict``.
+class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One of the two lanes of a link.
 
     Attributes:
-        name: What was looked at: ``multicast``, ``clock``, a stage of a topic's path, a component of
-            ``/diagnostics``.
-        level: How bad it is.
-        text: What was seen, ready to read.
-        remedy: What to do, where something is to be done.
-        where: Which of several: an interface, a variable, a peer; empty where there is one only.
-        evidence: Figures by their name, as ``/diagnostics`` shows them; units stand in the names.
+        name: ``express`` (control and small messages) or ``bulk`` (large ones).
+        connected: Whether it has its TCP connection; messages for a lane without one wait.
+        unneeded: Whether it has none because nothing was sent on it yet; the first message dials it.
+        bytes_in: Bytes that its present connection has received.
+        bytes_out: Bytes that its present connection has sent.
+        queued: Bytes that wait in its send queue.
+        dropped: Messages dropped because it was too slow, since the link came up.
     """
 
     name: str
-    level: CheckLevel = msgspec.field(name="verdict")
-    text: str
-    remedy: str = ""
-    where: str = ""
-    evidence: dict[str, str] = {}
-
-    @classmethod
-    def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
-        """Split a message as ``message`` joins it: text after the first "; " replaces the given remedy."""
-        text, _, told = message.partition("; ")
-        return cls(name, level, text, told or remedy, where)
-
-    @property
-    def message(self) -> str:
-        """Text and remedy in one line."""
-        return f"{self.text}; {self.remedy}" if self.remedy else self.text
+    connected: bool
+    unneeded: bool = False
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
 
 
-def exit_code(checks: Iterable[Check]) -> int:
-    """The exit code of a command: 1 if something fails, else 0; warnings do not count."""
-    return int(any(check.level is FAIL for check in checks))
-
-
-# The terms of a topic's contract by the settings of a module, which the topic has before any route is open.
-
-
-class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
-    """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
+class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """The live link to a peer.
 
     Attributes:
-        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
-        rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
-            ``default``.
+        remote: ``address:port`` of the other end of the TCP connection.
+        dialled: Whether this agent dialled; else the peer did.
+        up_ago: Seconds since it came up.
+        rtt: The last round trip on the wire, seconds.
+        clock_offset: The peer's wall clock less this machine's, seconds.
+        clock_error: Bound of that offset's error, ± seconds.
+        bytes_in: Received since it came up.
+        bytes_out: Sent since it came up.
+        queued: Bytes in its send queues.
+        dropped: Messages dropped because the link was too slow.
+        heard_ago: Seconds since anything arrived.
+        rests: Whether the link is at rest: nothing depends on it, and keepalives come every 5 s, with more than 50
+            peers more rarely.
+        lease: Seconds of silence after which the link counts as lost.
+        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
     """
 
-    value: str | float | None
-    rule: str
+    remote: str
+    dialled: bool
+    up_ago: float
+    rtt: float | None = None
+    clock_offset: float | None = None
+    clock_error: float | None = None
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
+    heard_ago: float | None = None
+    rests: bool = False
+    lease: float = 1.0
+    lanes: tuple[LaneInfo, ...] = ()
+
+
+class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """What this module hides of a peer because a limit of its ``[limits]`` is exceeded.
+
+    Attributes:
+        kind: The limit: ``nodes``, ``topics`` or ``services``.
+        limit: Its value.
+        hidden: How many are hidden.
+        text: Ready to read, with the remedy.
+    """
+
+    kind: str
+    limit: int
+    hidden: int
+    text: str
+
+
+class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One peer of the roster.
+
+    Attributes:
+        name: Its name.
+        guid: Its GUID as text.
+        instance: The random id of its run, 32 hexadecimal digits.
+        addresses: Where it can be reached, best first.
+        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
+            ``conflict`` (shares a GUID or an address with another, so it cannot be linked); ``relayed`` (has no link;
+            another peer relays its topics); ``foreign`` (is not of this mesh).
+        since_ago: Seconds since it came into this state.
+        found_ago: Seconds since it was found.
+        beacon_ago: Seconds since its last beacon.
+        source: How it was found: ``multicast``, ``unicast``, ``seed``, ``gossip`` or ``link``.
+        link: The link, while there is one.
+        last_error: Why the last attempt or link failed, ready to read; empty if none did.
+        next_attempt: Seconds until the next attempt to dial.
+        conflicts: What is wrong with its identity or its names, each ready to read. Only in the state ``conflict``
+            they keep it from being linked; else its messages come.
+        topics_in: The number of topics that it offers.
+        topics_out: The number of topics that it is offered.
+        via: The name of the peer that relays its topics, if one does.
+        beyond: What this module hides of it by its limits.
+        direct_in: Subscribers here that are connected to its nodes directly.
+        direct_out: Its subscribers that may connect to nodes here directly.
+    """
+
+    name: str
+    guid: str
+    instance: str
+    state: str
+    since_ago: float
+    addresses: tuple[str, ...] = ()
+    found_ago: float | None = None
+    beacon_ago: float | None = None
+    source: str = ""
+    link: LinkInfo | None = None
+    last_error: str = ""
+    next_attempt: float | None = None
+    conflicts: tuple[str, ...] = ()
+    topics_in: int = 0
+    topics_out: int = 0
+    via: str = ""
+    beyond: tuple[BoundInfo, ...] = ()
+    direct_in: int = 0
+    direct_out: int = 0
 
 
 # What an agent tells its peers of itself: the answer to their question ``agent.info``.
@@ -222,134 +279,79 @@ def read_site_module(text: str) -> tuple[str, str]:
     return site, module
 
 
-# The peers in an agent's snapshot: each peer of the roster, its link and the link's lanes.
-#
-# Times are seconds; ``…_ago`` counts back from the snapshot.
+# The terms of a topic's contract by the settings of a module, which the topic has before any route is open.
 
 
-FOREIGN: Final = "foreign"
-"""The state of a module that is heard, or refuses this one, because it is not of this mesh."""
-
-
-class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One of the two lanes of a link.
+class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
+    """One term of a topic's contract by this module's settings; values of the operation ``contract``, by key.
 
     Attributes:
-        name: ``express`` (control and small messages) or ``bulk`` (large ones).
-        connected: Whether it has its TCP connection; messages for a lane without one wait.
-        unneeded: Whether it has none because nothing was sent on it yet; the first message dials it.
-        bytes_in: Bytes that its present connection has received.
-        bytes_out: Bytes that its present connection has sent.
-        queued: Bytes that wait in its send queue.
-        dropped: Messages dropped because it was too slow, since the link came up.
+        value: Its value; seconds, messages a second, or a word of docs/contracts.md.
+        rule: What sets it: ``rule 2: topics /cmd/**`` (the second ``[[contract]]``), ``[bridge] transport``, or
+            ``default``.
+    """
+
+    value: str | float | None
+    rule: str
+
+
+# The result of a check: one model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``.
+
+
+class CheckLevel(StrEnum):
+    """How bad a result is."""
+
+    OK = "ok"
+    WARN = "warn"
+    """It works, or may work: the first thing to check when something fails."""
+    FAIL = "fail"
+    """Something cannot work like this. ERROR on ``/diagnostics``."""
+    SKIPPED = "skipped"
+    """It could not be checked."""
+    UNKNOWN = "unknown"
+    """The agent that knows the answer did not reply; the walk along a path goes on."""
+    STALE = "stale"
+    """It existed before, and is gone (REP 107)."""
+
+
+OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL
+SKIPPED, UNKNOWN, STALE = CheckLevel.SKIPPED, CheckLevel.UNKNOWN, CheckLevel.STALE
+
+
+class Check(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One result of one check.
+
+    It crosses the mesh as a stage of ``rmpa why``, where ``level`` is called ``verdict``.
+
+    Attributes:
+        name: What was looked at: ``multicast``, ``clock``, a stage of a topic's path, a component of
+            ``/diagnostics``.
+        level: How bad it is.
+        text: What was seen, ready to read.
+        remedy: What to do, where something is to be done.
+        where: Which of several: an interface, a variable, a peer; empty where there is one only.
+        evidence: Figures by their name, as ``/diagnostics`` shows them; units stand in the names.
     """
 
     name: str
-    connected: bool
-    unneeded: bool = False
-    bytes_in: int = 0
-    bytes_out: int = 0
-    queued: int = 0
-    dropped: int = 0
-
-
-class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """The live link to a peer.
-
-    Attributes:
-        remote: ``address:port`` of the other end of the TCP connection.
-        dialled: Whether this agent dialled; else the peer did.
-        up_ago: Seconds since it came up.
-        rtt: The last round trip on the wire, seconds.
-        clock_offset: The peer's wall clock less this machine's, seconds.
-        clock_error: Bound of that offset's error, ± seconds.
-        bytes_in: Received since it came up.
-        bytes_out: Sent since it came up.
-        queued: Bytes in its send queues.
-        dropped: Messages dropped because the link was too slow.
-        heard_ago: Seconds since anything arrived.
-        rests: Whether the link is at rest: nothing depends on it, and keepalives come every 5 s, with more than 50
-            peers more rarely.
-        lease: Seconds of silence after which the link counts as lost.
-        lanes: Its lanes, ``express`` first; empty from an agent that does not report them.
-    """
-
-    remote: str
-    dialled: bool
-    up_ago: float
-    rtt: float | None = None
-    clock_offset: float | None = None
-    clock_error: float | None = None
-    bytes_in: int = 0
-    bytes_out: int = 0
-    queued: int = 0
-    dropped: int = 0
-    heard_ago: float | None = None
-    rests: bool = False
-    lease: float = 1.0
-    lanes: tuple[LaneInfo, ...] = ()
-
-
-class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What this module hides of a peer because a limit of its ``[limits]`` is exceeded.
-
-    Attributes:
-        kind: The limit: ``nodes``, ``topics`` or ``services``.
-        limit: Its value.
-        hidden: How many are hidden.
-        text: Ready to read, with the remedy.
-    """
-
-    kind: str
-    limit: int
-    hidden: int
+    level: CheckLevel = msgspec.field(name="verdict")
     text: str
+    remedy: str = ""
+    where: str = ""
+    evidence: dict[str, str] = {}
+
+    @classmethod
+    def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
+        """Split a message as ``message`` joins it: text after the first "; " replaces the given remedy."""
+        text, _, told = message.partition("; ")
+        return cls(name, level, text, told or remedy, where)
+
+    @property
+    def message(self) -> str:
+        """Text and remedy in one line."""
+        return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
 
-class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One peer of the roster.
-
-    Attributes:
-        name: Its name.
-        guid: Its GUID as text.
-        instance: The random id of its run, 32 hexadecimal digits.
-        addresses: Where it can be reached, best first.
-        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
-            ``conflict`` (shares a GUID or an address with another, so it cannot be linked); ``relayed`` (has no link;
-            another peer relays its topics); ``foreign`` (is not of this mesh).
-        since_ago: Seconds since it came into this state.
-        found_ago: Seconds since it was found.
-        beacon_ago: Seconds since its last beacon.
-        source: How it was found: ``multicast``, ``unicast``, ``seed``, ``gossip`` or ``link``.
-        link: The link, while there is one.
-        last_error: Why the last attempt or link failed, ready to read; empty if none did.
-        next_attempt: Seconds until the next attempt to dial.
-        conflicts: What is wrong with its identity or its names, each ready to read. Only in the state ``conflict``
-            they keep it from being linked; else its messages come.
-        topics_in: The number of topics that it offers.
-        topics_out: The number of topics that it is offered.
-        via: The name of the peer that relays its topics, if one does.
-        beyond: What this module hides of it by its limits.
-        direct_in: Subscribers here that are connected to its nodes directly.
-        direct_out: Its subscribers that may connect to nodes here directly.
-    """
-
-    name: str
-    guid: str
-    instance: str
-    state: str
-    since_ago: float
-    addresses: tuple[str, ...] = ()
-    found_ago: float | None = None
-    beacon_ago: float | None = None
-    source: str = ""
-    link: LinkInfo | None = None
-    last_error: str = ""
-    next_attempt: float | None = None
-    conflicts: tuple[str, ...] = ()
-    topics_in: int = 0
-    topics_out: int = 0
-    via: str = ""
-    beyond: tuple[BoundInfo, ...] = ()
-    direct_in: int = 0
-    direct_out: int = 0
+def exit_code(checks: Iterable[Check]) -> int:
+    """The exit code of a command: 1 if something fails, else 0; warnings do not count."""
+    return int(any(check.level is FAIL for check in checks))

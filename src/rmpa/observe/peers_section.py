@@ -1,28 +1,37 @@
-"""The parameters of a peer's module, read and written through this machine's agent."""
+"""The peers in the snapshot, the parameters of their modules, and questions about other sites.
+
+The peers' part of the snapshot: what discovery, mesh and bridge know of each.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.driver import UNKNOWN_QUESTION
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
-from rmpa.discovery import limits
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.config.peer_rules import Access
+from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.discovery import limits as discovery_limits
 from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerInfo
 from rmpa.observe.topics_section import direct_counts
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 from rmpa.runtime.loop import SystemClock, yield_to_data
-from rmpa.trust.certificates import not_of_this_mesh
+from rmpa.trust.permissions import not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
@@ -34,6 +43,9 @@ if TYPE_CHECKING:
     from rmpa.observe.control_client import ControlClient
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.runtime.stream import Stream
+
+
+# The parameters of a peer's module, read and written through this machine's agent.
 
 
 def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
@@ -139,10 +151,10 @@ def _unreachable_by_tcp(peer: PeerInfo) -> bool:
     """Whether its beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``."""
     return (
         peer.state == "linking"
-        and peer.since_ago >= limits.ADDRESS_SHARED_AFTER
+        and peer.since_ago >= discovery_limits.ADDRESS_SHARED_AFTER
         and peer.beacon_ago is not None
         # An agent that was killed sends no beacons after its link has fallen.
-        and peer.beacon_ago < peer.since_ago - limits.ADDRESS_SHARED_MARGIN
+        and peer.beacon_ago < peer.since_ago - discovery_limits.ADDRESS_SHARED_MARGIN
         and not _address(peer).startswith("127.")
     )
 
@@ -163,7 +175,150 @@ def _marked(peer: PeerInfo, holders: Sequence[PeerInfo], own: Collection[str]) -
     return msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text))
 
 
-# The peers' part of the snapshot: what discovery, mesh and bridge know of each.
+# Questions about other sites: a gateway answers them; another agent asks the gateways that it is linked to.
+
+
+REPORT: Final = "site.report"
+"""The request for a ``SitesReport`` without sources."""
+INFO: Final = "site.info"
+"""The request for a ``SitesReport`` of one site with its sources: ``{site}``."""
+PARAM: Final = "site.param"
+"""A request about parameters (``bridge.params.rules``) to a module: ``{site, module, what, key, text}``."""
+WHY: Final = "site.why"
+"""The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
+_ALL: Final = (REPORT, WHY)
+"""Those that every gateway answers for itself."""
+QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
+_SOURCES: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL),
+    "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
+)
+_PARAM: Final = Needs(
+    (Access.PARAM,),
+    "as `param.get` and its like, by this gateway, the other site's and the owner. None of this site",
+)
+_WAYS: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
+)
+
+
+class SiteAnswerer(Protocol):
+    """Answers questions about other sites: ``gateway.sites`` has it."""
+
+    def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Awaitable[Any]:
+        """The reply to one of ``QUESTIONS``, which tells ``asker``, a linked module, only what it may have.
+
+        Without ``asker`` this machine's user asks, who may have everything.
+
+        Raises:
+            RmpaError: It cannot be answered; the text says why.
+        """
+        ...
+
+
+class SiteRequests:
+    """The operation ``site`` of the control socket, and the peers' requests about sites.
+
+    Args:
+        rpc: Carries requests between the modules.
+        linked: Returns the sessions of the peers that are linked now.
+        gate: Decides which peers are believed about other sites.
+    """
+
+    def __init__(
+        self, rpc: PeerRpc, linked: Callable[[], Iterable[PeerSession]], gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        self._gate = gate
+        self._rpc = rpc
+        self._linked = linked
+        self._gateway: SiteAnswerer | None = None
+        self._liked: dict[str, str] = {}
+        """The gateway that answered for a site, by its GUID."""
+
+    @property
+    def answerer(self) -> SiteAnswerer | None:
+        """What answers as a gateway; ``None``: this agent is none."""
+        return self._gateway
+
+    def serve(self, gateway: SiteAnswerer) -> None:
+        """Answer as a gateway from now on."""
+        self._gateway = gateway
+        rpc = self._rpc
+        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
+        rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
+        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
+        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
+
+    async def answer(self, args: dict[str, Any]) -> Any:
+        """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
+
+        ``site.report`` and ``site.why`` return a list with the answers of all gateways; the others one answer.
+        """
+        what, inner = args.get("what"), args.get("args")
+        if what not in QUESTIONS or not isinstance(inner, dict):
+            raise ConfigError("what", f"{what!r} is no question about sites")
+        return await (self.all(what, inner) if what in _ALL else self.one(what, inner))
+
+    async def all(self, what: str, args: dict[str, Any]) -> list[Any]:
+        """The answers of all gateways; those that fail are left out."""
+        if self._gateway is not None:
+            return [await self._gateway.answer(what, args)]
+        sessions = self._believed()
+        # Twice the time: the gateway itself asks the other site for so long.
+        wait = 2 * bridge_limits.ASK_TIMEOUT
+        found = await asyncio.gather(*(self._ask(session, what, args, wait) for session in sessions))
+        return [value for value, error in found if error is None]
+
+    async def one(self, what: str, args: dict[str, Any]) -> Any:
+        """The answer of the first gateway that has one.
+
+        Raises:
+            UnreachableError: This module is linked to no gateway.
+            RmpaError: No gateway has an answer; the text is that of the one that knew most.
+        """
+        if self._gateway is not None:
+            return await self._gateway.answer(what, args)
+        site = str(args.get("site", ""))
+        sessions = sorted(self._believed(), key=lambda each: str(each.link.guid) != self._liked.get(site))
+        problem: RmpaError | None = None
+        for session in sessions:
+            value, error = await self._ask(session, what, args, bridge_limits.PARAM_ASK_TIMEOUT)
+            if error is None:
+                self._liked[site] = str(session.link.guid)
+                return value
+            if not _is_no_gateway(error):
+                problem = problem or error
+        self._liked.pop(site, None)
+        if isinstance(problem, PeerRefused):
+            raise PeerRefused(problem.peer, problem.reason, problem.remedy)
+        if problem is not None:
+            raise problem
+        raise UnreachableError(
+            "gateway",
+            "any linked peer",
+            "start one with `rmpa gateway`; `rmpa peer list` shows the links. In a secured mesh "
+            "`relays` of [trust] names the gateways that are believed",
+        )
+
+    def _believed(self) -> list[PeerSession]:
+        """The linked peers whose word about other sites counts: any member could answer as a gateway."""
+        return [session for session in self._linked() if self._gate.may_relay(session.link.name)]
+
+    @staticmethod
+    def _answer_peer(gateway: SiteAnswerer, what: str, asker: PeerSession, args: dict[str, Any]) -> Awaitable[object]:
+        return gateway.answer(what, args, asker.link.name)
+
+    async def _ask(
+        self, session: PeerSession, what: str, args: dict[str, Any], wait: float
+    ) -> tuple[Any, RmpaError | None]:
+        try:
+            return await self._rpc.request(session, what, args, wait), None
+        except RmpaError as error:
+            return None, error
+
+
+def _is_no_gateway(error: RmpaError) -> bool:
+    return isinstance(error, PeerRefused) and UNKNOWN_QUESTION in error.reason
 
 
 _DENY: Final = {"services": "services.deny"}

@@ -1,4 +1,4 @@
-"""The state of an agent as one value, built by ``observe.io.snapshot_builder`` and read by the command line.
+"""The state of an agent as one value, built by ``observe.snapshot_builder`` and read by the command line.
 
 It crosses the control socket as JSON (``msgspec``). Times are seconds; ``…_ago`` counts back from the snapshot.
 A field that is ``None`` is not known, or not yet. A text "ready to read" is for users.
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 import msgspec
 
 from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec needs it to decode
-from rmpa.trust.joining import TrustStatus  # noqa: TC001 - msgspec needs it to decode
+from rmpa.trust.permissions import TrustStatus  # noqa: TC001 - msgspec needs it to decode
 
 if TYPE_CHECKING:
     from rmpa.core.counters import SampleSummary

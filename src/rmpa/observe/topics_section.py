@@ -1,4 +1,7 @@
-"""Direct transport in the snapshot: which subscribers of a route are direct, and why others are relayed."""
+"""The topics in the snapshot: routes, contracts, quality, and which subscribers are direct.
+
+Direct transport in the snapshot: which subscribers of a route are direct, and why others are relayed.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.config.settings import Settings
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 
 class DirectSection:

@@ -1,4 +1,6 @@
-"""Reads the ROS_* environment variables and the remapping arguments of a node.
+"""The ROS_* environment variables, the remapping arguments, and what is told of a node.
+
+Reads the ROS_* environment variables and the remapping arguments of a node.
 
 Sources: wiki.ros.org/ROS/EnvironmentVariables, wiki.ros.org/Remapping%20Arguments. An argument overrides a variable.
 Pure: variables, arguments and the machine's addresses are passed in.

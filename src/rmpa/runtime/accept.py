@@ -1,4 +1,6 @@
-"""Accepts the connections of a listening socket, for every server of this process.
+"""What takes from the system: connections, descriptors, listening sockets and threads.
+
+Accepts the connections of a listening socket, for every server of this process.
 
 A connection for which no file descriptor is left is closed at once. Where accept(2) itself fails, the listening
 socket stays readable, and the loop would call the server again and again: an ``Acceptor`` pauses then.
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import enum
 import errno
 import logging
@@ -15,9 +18,10 @@ import os
 import resource
 import socket
 import sys
+import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import OutOfDescriptors, StartError
@@ -25,6 +29,54 @@ from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+
+# The mesh port: TCP for links and UDP for unicast beacons under one number.
+
+
+def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
+    """Bind a listening TCP socket and a UDP socket to the same port on all addresses.
+
+    Args:
+        port: The port, or 0 for one that the system chooses.
+
+    Returns:
+        The listening TCP socket and the UDP socket, both non-blocking.
+
+    Raises:
+        StartError: The port is taken, or this user may not bind it.
+    """
+    for attempt in range(limits.MESH_PORT_ATTEMPTS):
+        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            # A restarted agent gets its port back although old connections are in TIME_WAIT. Never set it on the UDP
+            # socket: two agents could then bind one port without an error, and each would miss half of its beacons.
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tcp.bind(("", port))
+            udp.bind(("", tcp.getsockname()[1]))
+            tcp.listen(limits.MESH_BACKLOG)
+        except OSError as error:
+            tcp.close()
+            udp.close()
+            if port == 0 and error.errno == errno.EADDRINUSE and attempt + 1 < limits.MESH_PORT_ATTEMPTS:
+                continue  # the number was free for TCP but not for UDP
+            raise _refused(port, error) from error
+        tcp.setblocking(False)
+        udp.setblocking(False)
+        return tcp, udp
+    raise AssertionError("unreachable")
+
+
+def _refused(port: int, error: OSError) -> StartError:
+    if error.errno == errno.EADDRINUSE:
+        problem = "is in use, perhaps by another agent"
+        remedy = "choose another with --port, or leave the choice to the system (--port 0)"
+    elif error.errno == errno.EACCES:
+        problem, remedy = "is not for this user", "choose one above 1023 with --port"
+    else:
+        problem, remedy = f"cannot be opened ({error.strerror})", ""
+    return StartError(f"mesh port {port}", problem, remedy)
 
 
 # The file descriptors of this process: which uses may take the last ones, and what is said when they run out.
@@ -192,52 +244,49 @@ DESCRIPTORS: Final = Descriptors()
 """The descriptors of this process."""
 
 
-# The mesh port: TCP for links and UDP for unicast beacons under one number.
+# Runs a user's function in a thread of its own, where it may hang forever without blocking anything else.
 
 
-def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
-    """Bind a listening TCP socket and a UDP socket to the same port on all addresses.
+_T = TypeVar("_T")
+
+
+async def in_thread(function: Callable[[], _T], name: str) -> _T:
+    """Call ``function`` in a new daemon thread, and return its result. Cancellation does not stop the thread.
+
+    ``asyncio.to_thread`` uses a pool, which a few hanging functions would exhaust. A daemon thread does not keep the
+    process from ending.
 
     Args:
-        port: The port, or 0 for one that the system chooses.
-
-    Returns:
-        The listening TCP socket and the UDP socket, both non-blocking.
-
-    Raises:
-        StartError: The port is taken, or this user may not bind it.
+        function: Its exceptions are raised here; ``SystemExit`` and the like as ``RuntimeError``.
+        name: The thread's name.
     """
-    for attempt in range(limits.MESH_PORT_ATTEMPTS):
-        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    loop = asyncio.get_running_loop()
+    result: asyncio.Future[_T] = loop.create_future()
+
+    def run() -> None:
         try:
-            # A restarted agent gets its port back although old connections are in TIME_WAIT. Never set it on the UDP
-            # socket: two agents could then bind one port without an error, and each would miss half of its beacons.
-            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            tcp.bind(("", port))
-            udp.bind(("", tcp.getsockname()[1]))
-            tcp.listen(limits.MESH_BACKLOG)
-        except OSError as error:
-            tcp.close()
-            udp.close()
-            if port == 0 and error.errno == errno.EADDRINUSE and attempt + 1 < limits.MESH_PORT_ATTEMPTS:
-                continue  # the number was free for TCP but not for UDP
-            raise _refused(port, error) from error
-        tcp.setblocking(False)
-        udp.setblocking(False)
-        return tcp, udp
-    raise AssertionError("unreachable")
+            value = function()
+        except Exception as error:  # noqa: BLE001 - handed on
+            end(None, error if not isinstance(error, StopIteration) else RuntimeError(f"StopIteration: {error}"))
+        except BaseException as error:  # noqa: BLE001 - it ends this function, not the process
+            end(None, RuntimeError(f"{type(error).__name__}: {error}"))
+        else:
+            end(value, None)
 
+    def end(value: _T | None, error: Exception | None) -> None:
+        def settle() -> None:
+            if not result.done():
+                if error is not None:
+                    result.set_exception(error)
+                else:
+                    result.set_result(value)  # type: ignore[arg-type] # a value, for there is no error
 
-def _refused(port: int, error: OSError) -> StartError:
-    if error.errno == errno.EADDRINUSE:
-        problem = "is in use, perhaps by another agent"
-        remedy = "choose another with --port, or leave the choice to the system (--port 0)"
-    elif error.errno == errno.EACCES:
-        problem, remedy = "is not for this user", "choose one above 1023 with --port"
-    else:
-        problem, remedy = f"cannot be opened ({error.strerror})", ""
-    return StartError(f"mesh port {port}", problem, remedy)
+        with contextlib.suppress(RuntimeError):  # the loop ended before this thread
+            loop.call_soon_threadsafe(settle)
+
+    context = contextvars.copy_context()
+    threading.Thread(target=context.run, args=(run,), name=name, daemon=True).start()
+    return await result
 
 
 _GONE: Final = frozenset(

@@ -1,4 +1,6 @@
-"""Periodic work that need not be exact, on one grid of wake-ups for the whole process.
+"""The event loop, in which data goes first, and the timers on it.
+
+Periodic work that need not be exact, on one grid of wake-ups for the whole process.
 
 A wake-up of an idle process costs more than most of the work that it does then: two switches of the processor, the
 interpreter's cold caches, a round of the event loop. So periodic work with a period of seconds runs at common times
@@ -504,7 +506,7 @@ def yield_to_data() -> None:
 
 
 def yielding_to_data(items: Iterable[_T], /, every: int = _ITEMS_PER_YIELD) -> Iterator[_T]:
-    """Yield the items unchanged, and handle data before one item in ``every`` (a ``core.yielding.Yielder``)."""
+    """Yield the items unchanged, and handle data before one item in ``every`` (a ``core.counters.Yielder``)."""
     for number, item in enumerate(items):
         if number % every == 0:
             yield_to_data()

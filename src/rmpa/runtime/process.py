@@ -1,4 +1,6 @@
-"""Sets Python's cyclic garbage collector for an agent: what the start made is frozen, young garbage collected often.
+"""The process: garbage collection, log, service manager and real time.
+
+Sets Python's cyclic garbage collector for an agent: what the start made is frozen, young garbage collected often.
 
 The data path makes no cycles, so in steady state nothing needs collecting. Control work makes some: each closed
 asyncio connection is a cycle. Among 64 modules, at 1 kHz and beside 200 calls a second, p99.9 of a message is that
@@ -7,9 +9,6 @@ of a collector that waits for pauses; with Python's own settings a full collecti
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import contextvars
 import gc
 import logging
 import os
@@ -20,12 +19,9 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final
 
 from rmpa.runtime import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _BEFORE = gc.get_threshold()
 
@@ -208,48 +204,3 @@ def notify_service_manager(state: str) -> bool:
         _log.warning("the service manager at NOTIFY_SOCKET=%s cannot be told %s: %s", address, state, error)
         return False
     return True
-
-
-# Runs a user's function in a thread of its own, where it may hang forever without blocking anything else.
-
-
-_T = TypeVar("_T")
-
-
-async def in_thread(function: Callable[[], _T], name: str) -> _T:
-    """Call ``function`` in a new daemon thread, and return its result. Cancellation does not stop the thread.
-
-    ``asyncio.to_thread`` uses a pool, which a few hanging functions would exhaust. A daemon thread does not keep the
-    process from ending.
-
-    Args:
-        function: Its exceptions are raised here; ``SystemExit`` and the like as ``RuntimeError``.
-        name: The thread's name.
-    """
-    loop = asyncio.get_running_loop()
-    result: asyncio.Future[_T] = loop.create_future()
-
-    def run() -> None:
-        try:
-            value = function()
-        except Exception as error:  # noqa: BLE001 - handed on
-            end(None, error if not isinstance(error, StopIteration) else RuntimeError(f"StopIteration: {error}"))
-        except BaseException as error:  # noqa: BLE001 - it ends this function, not the process
-            end(None, RuntimeError(f"{type(error).__name__}: {error}"))
-        else:
-            end(value, None)
-
-    def end(value: _T | None, error: Exception | None) -> None:
-        def settle() -> None:
-            if not result.done():
-                if error is not None:
-                    result.set_exception(error)
-                else:
-                    result.set_result(value)  # type: ignore[arg-type] # a value, for there is no error
-
-        with contextlib.suppress(RuntimeError):  # the loop ended before this thread
-            loop.call_soon_threadsafe(settle)
-
-    context = contextvars.copy_context()
-    threading.Thread(target=context.run, args=(run,), name=name, daemon=True).start()
-    return await result

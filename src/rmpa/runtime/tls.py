@@ -1,4 +1,7 @@
-"""What a partial write leaves of its buffers."""
+"""TLS for a stream: a socket with records, corking, and what a partial write leaves.
+
+What a partial write leaves of its buffers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Certificates: the CA of a mesh, requests, and certificates that prove a module's name (RFC 5280).
+"""Certificates of a mesh (RFC 5280), and the signed documents of its authority.
+
+Certificates: the CA of a mesh, requests, and certificates that prove a module's name (RFC 5280).
 
 Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
 needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
@@ -14,157 +16,216 @@ from __future__ import annotations
 
 import hashlib
 import ipaddress
-import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, TypeVar
 
+import msgspec
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rmpa.core.errors import RemoteProtocolError, StartError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import peer_name_problem
+from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
+from rmpa.trust.packets import GroupKey
+from rmpa.trust.permissions import TrustError, TrustReason, page_hosts, server_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.trust.documents import DenyList
 
-
-# The names and addresses by which a module's page is opened: which of them its certificate may have (RFC 9525).
+# Signed, numbered documents of the authority: the deny list and the list of group keys (docs/design/trust.md).
 #
-# Those that follow from the module's name are never another module's. Further ones are asked for. A browser that
-# trusts
-# the mesh's CA is to believe it about no host of the Internet, so these are private addresses, and names of the
-# local
-# network.
+# A document is the JSON object ``{"signed": TEXT, "signature": BASE64}``: TEXT is a JSON object too, and the
+# signature
+# (ECDSA P-256, SHA-256, DER) is over the kind's label, a zero byte and TEXT. So it can be checked before TEXT is
+# parsed, and no document can stand for one of the other kind. Of two documents the one with the higher number
+# holds.
 
 
-_LABEL: Final = r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?"
-_LOCAL: Final = re.compile(rf"{_LABEL}|(?:{_LABEL}\.)+(?:local|lan|internal|home\.arpa)")
-"""A name without a dot, or below a domain that is no one's in the Internet (RFC 6762, RFC 8375, ICANN's internal)."""
-_SHARED: Final = ipaddress.IPv4Network("100.64.0.0/10")
-"""Of carriers, and of VPNs such as Tailscale's (RFC 6598)."""
+_ALGORITHM: Final = ec.ECDSA(hashes.SHA256())
 
 
-def server_names(name: str) -> tuple[str, ...]:
-    """The names that every module's certificate has, besides 127.0.0.1.
+class DocumentKind(StrEnum):
+    """What a document is; the value is the label under its signature."""
 
-    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
-    has ``-`` where the module's name, which is made of it, has ``_``.
-    """
-    host = name.replace("_", "-").lower()
-    return (host, f"{host}.local", "localhost")
+    DENY = "rmpa deny 1"
+    KEYS = "rmpa keys 1"
 
 
-def page_hosts(wanted: Iterable[str]) -> tuple[str, ...]:
-    """Of names and addresses those that a certificate may have, in their normal form, at most so many."""
-    found = dict.fromkeys(host for text in wanted if (host := _page_host(text)))
-    return tuple(found)[: limits.PAGE_HOSTS_MAX]
+class DocumentError(RemoteProtocolError):
+    """A document is malformed, or not signed by the authority."""
 
 
-def host_names(host_name: str) -> tuple[str, ...]:
-    """The names of a machine in its network: its host's name, whole and short, and that of mDNS."""
-    name = host_name.lower().removesuffix(".")
-    short = name.partition(".")[0]
-    return (name, short, f"{short}.local")
+class _Signed(msgspec.Struct, frozen=True):
+    signed: str
+    signature: bytes
 
 
-def _page_host(text: str) -> str:
-    """The normal form; empty: a certificate may not have it, or has it anyway."""
-    try:
-        address = ipaddress.ip_address(text)
-    except ValueError:
-        name = text.lower().removesuffix(".")
-        return name if name != "localhost" and _LOCAL.fullmatch(name) else ""
-    special = address.is_loopback or address.is_unspecified or address.is_multicast
-    shared = isinstance(address, ipaddress.IPv4Address) and address in _SHARED
-    return str(address) if (address.is_private or shared) and not special else ""
-
-
-# The reasons for which a secured mesh refuses a connection: one word each, for wire, counters, commands and logs.
-
-
-class TrustReason(IntEnum):
-    """Why a connection is refused; the numbers continue those of ``mesh.handshake.Refusal`` on the wire."""
-
-    PLAIN = 11
-    """The dialler does not use TLS, and this mesh does."""
-    UNSECURED = 12
-    """The acceptor has not joined a secured mesh, and the dialler has."""
-    KEY = 13
-    """The group key of its packets is unknown."""
-    CLOCK = 14
-    """A certificate begins in the future."""
-    FOREIGN = 15
-    """The certificate is of another CA."""
-    EXPIRED = 16
-    """The certificate's time is over."""
-    REVOKED = 17
-    """The certificate is on the deny list."""
-    NAME = 18
-    """The certificate is of another module than the hello says."""
-    DOWNGRADE = 19
-    """The connection does not use TLS 1.3 with this protocol."""
-
-    @property
-    def label(self) -> str:
-        """The word for people and counters: ``expired``."""
-        return self.name.lower()
-
-    @property
-    def remedy(self) -> str:
-        """What to do, as a sentence part."""
-        return _REMEDIES[self]
-
-
-_REMEDIES: Final = {
-    TrustReason.PLAIN: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
-    TrustReason.UNSECURED: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
-    TrustReason.KEY: "are both of one mesh? the one that was away for long: rmpa trust renew there",
-    TrustReason.CLOCK: "set both clocks: date, timedatectl",
-    TrustReason.FOREIGN: "they have joined different meshes: rmpa trust join on one, with a token of the other's",
-    TrustReason.EXPIRED: "rmpa trust renew on the module whose certificate it is, while the authority is reachable",
-    TrustReason.REVOKED: "it can come back by rmpa trust invite at the authority, and rmpa trust join there",
-    TrustReason.NAME: "start the module with the name that it joined with, or let it join again",
-    TrustReason.DOWNGRADE: "install the same release of rmpa on both",
-}
-
-
-NOT_OF_THIS_MESH: Final = {
-    TrustReason.PLAIN: "it has joined a secured mesh and this module has not; join it by rmpa trust join TOKEN here, "
-    "with a token of rmpa trust invite at the authority of that mesh",
-    TrustReason.UNSECURED: "it has not joined this secured mesh; let it join by rmpa trust invite at the authority "
-    "and rmpa trust join TOKEN there",
-    TrustReason.FOREIGN: "it has joined another secured mesh; to have both in one, rmpa trust leave and rmpa trust "
-    "join TOKEN there, with a token of the authority here",
-    TrustReason.KEY: "its group key is unknown here; if it has joined another mesh, rmpa trust leave and rmpa trust "
-    "join TOKEN there; if it is of this one, rmpa trust renew here",
-}
-"""Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``."""
-
-
-def not_of_this_mesh(reason: TrustReason) -> str:
-    """``not of this mesh: it has not joined this secured mesh; let it join by …``."""
-    return f"not of this mesh: {NOT_OF_THIS_MESH[reason]}"
-
-
-class TrustError(RemoteProtocolError):
-    """A secured mesh refuses a connection, a certificate or a request.
+class DenyEntry(msgspec.Struct, frozen=True):
+    """One revoked module.
 
     Args:
-        reason: The word for it.
-        text: What is wrong.
+        name: The module's.
+        before: Certificates of that name that were issued up to this time are refused; seconds since 1970.
     """
 
-    def __init__(self, reason: TrustReason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+    name: str
+    before: int
+
+
+class DenyList(msgspec.Struct, frozen=True):
+    """The names that were revoked.
+
+    Args:
+        number: Grows with each change; 0: nothing was ever revoked.
+        entries: One for each name.
+    """
+
+    number: int = 0
+    entries: tuple[DenyEntry, ...] = ()
+
+    def denies(self, name: str, issued: float) -> bool:
+        """Whether a certificate is refused.
+
+        Args:
+            name: The module that it is of.
+            issued: When it was issued, seconds since 1970.
+        """
+        return any(entry.name == name and issued <= entry.before for entry in self.entries)
+
+    def with_name(self, name: str, wall: float) -> DenyList:
+        """The list after a revocation.
+
+        Args:
+            name: The module, whose present certificates are all refused.
+            wall: When the last of them was issued, or later; seconds since 1970. The time of an entry never goes
+                back.
+
+        Raises:
+            ValueError: No module can have that name, or the list is full.
+        """
+        if problem := peer_name_problem(name):
+            raise ValueError(problem)
+        before = max([int(wall), *(entry.before for entry in self.entries if entry.name == name)])
+        entries = (*(entry for entry in self.entries if entry.name != name), DenyEntry(name, before))
+        if len(entries) > limits.DENY_MAX:
+            raise ValueError(f"a deny list has at most {limits.DENY_MAX} names; make a new mesh (rmpa trust init)")
+        return DenyList(self.number + 1, entries)
+
+
+class _KeyEntry(msgspec.Struct, frozen=True):
+    number: int
+    key: bytes
+
+    def __repr__(self) -> str:
+        return f"_KeyEntry({self.number})"
+
+
+class KeyList(msgspec.Struct, frozen=True):
+    """The group keys of a mesh. It is secret: only members get it, over their links.
+
+    Args:
+        number: Grows with each change.
+        keys: By number.
+        authority: The name of the authority, so that no other member can pass for it; empty: not known.
+        proves_from: The number of the key that the last revocation made: a revoked module has those before.
+        made: When the newest key was made, by the authority's clock in seconds since 1970; 0: it was not set.
+    """
+
+    number: int
+    keys: tuple[_KeyEntry, ...]
+    authority: str = ""
+    proves_from: int = 0
+    made: int = 0
+
+    @classmethod
+    def of(
+        cls, number: int, keys: Iterable[GroupKey], authority: str = "", *, proves_from: int = 0, made: int = 0
+    ) -> KeyList:
+        """The list of these keys; arguments as for the class."""
+        entries = tuple(_KeyEntry(key.number, key.secret) for key in keys)
+        return cls(number, entries, authority, proves_from, made)
+
+    @property
+    def group_keys(self) -> tuple[GroupKey, ...]:
+        """The keys."""
+        return tuple(GroupKey(entry.number, entry.key) for entry in self.keys)
+
+    def __repr__(self) -> str:
+        """The numbers alone: secrets never come into a log."""
+        return f"KeyList(number={self.number}, keys={[entry.number for entry in self.keys]})"
+
+
+_T = TypeVar("_T", DenyList, KeyList)
+
+
+def sign(document: DenyList | KeyList, key: ec.EllipticCurvePrivateKey) -> bytes:
+    """A document with the CA's signature, as it is sent and stored."""
+    kind = DocumentKind.DENY if isinstance(document, DenyList) else DocumentKind.KEYS
+    text = msgspec.json.encode(document).decode()
+    return msgspec.json.encode(_Signed(text, key.sign(_under_signature(kind, text), _ALGORITHM)))
+
+
+def read_deny_list(data: bytes, key: ec.EllipticCurvePublicKey) -> DenyList:
+    """Read a signed deny list.
+
+    Args:
+        data: As ``sign`` made it.
+        key: The CA's key.
+
+    Raises:
+        LimitExceeded: It is too long.
+        DocumentError: It is malformed, or not signed with that key.
+    """
+    found = _read_document(data, key, DocumentKind.DENY, DenyList)
+    if len(found.entries) > limits.DENY_MAX:
+        raise DocumentError(f"{len(found.entries)} names on a deny list")
+    for entry in found.entries:
+        if problem := peer_name_problem(entry.name):
+            raise DocumentError(problem)
+    return found
+
+
+def read_key_list(data: bytes, key: ec.EllipticCurvePublicKey) -> KeyList:
+    """Read a signed list of group keys; arguments and errors as for ``read_deny_list``."""
+    found = _read_document(data, key, DocumentKind.KEYS, KeyList)
+    if not 0 < len(found.keys) <= limits.KEYS_MAX:
+        raise DocumentError(f"{len(found.keys)} group keys")
+    if found.authority and (problem := peer_name_problem(found.authority)):
+        raise DocumentError(problem)
+    try:
+        numbers = [each.number for each in found.group_keys]
+    except ValueError as error:
+        raise DocumentError(str(error)) from None
+    if len(set(numbers)) != len(numbers):
+        raise DocumentError("two group keys of one number")
+    return found
+
+
+def _read_document(data: bytes, key: ec.EllipticCurvePublicKey, kind: DocumentKind, form: type[_T]) -> _T:
+    if len(data) > limits.DOCUMENT_MAX:
+        raise LimitExceeded("a signed document", len(data), limits.DOCUMENT_MAX)
+    try:
+        envelope = msgspec.json.decode(data, type=_Signed)
+        key.verify(envelope.signature, _under_signature(kind, envelope.signed), _ALGORITHM)
+        document = msgspec.json.decode(envelope.signed, type=form)
+    except InvalidSignature:
+        raise DocumentError("the document is not signed by our authority") from None
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise DocumentError(f"the document cannot be read: {error!s:.200}") from None
+    if not 0 <= document.number <= UINT32_MAX:
+        raise DocumentError(f"the document's number is {document.number}")
+    return document
+
+
+def _under_signature(kind: DocumentKind, text: str) -> bytes:
+    return kind.value.encode() + b"\x00" + text.encode()
 
 
 URN: Final = "urn:rmpa:"
@@ -522,36 +583,3 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 def _time(wall: float) -> datetime:
     return datetime.fromtimestamp(int(wall), UTC)
-
-
-# Private keys of modules and of the CA, as PEM.
-
-
-def new_key() -> bytes:
-    """A private key (PKCS #8, PEM) for a module or a CA."""
-    return _key_pem(ec.generate_private_key(CURVE))
-
-
-def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
-    """Read a private key (PEM).
-
-    Args:
-        data: The PEM.
-        where: The file, for the error.
-
-    Raises:
-        StartError: It is none.
-    """
-    try:
-        key = serialization.load_pem_private_key(data, None)
-    except (ValueError, TypeError):
-        key = None
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise StartError(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
-    return key
-
-
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )

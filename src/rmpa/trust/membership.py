@@ -1,4 +1,7 @@
-"""What a module has as a member of a secured mesh: certificate, group keys, deny list, contexts of TLS."""
+"""What a module has as a member of a secured mesh: certificate, keys, deny list.
+
+What a module has as a member of a secured mesh: certificate, group keys, deny list, contexts of TLS.
+"""
 
 from __future__ import annotations
 
@@ -8,76 +11,55 @@ import ssl
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import TrustError, TrustReason, private_key
-from rmpa.trust.documents import DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
+from rmpa.trust.certificates import CURVE, DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
 from rmpa.trust.packets import KeyRing, PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.permissions import TrustError, TrustReason
+from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, member_context
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
-    from pathlib import Path
 
     from rmpa.core.counters import Clock
     from rmpa.trust.store import MemberFiles, TrustStore
 
 
-# The ``ssl.SSLContext`` of members, and of modules that join: TLS 1.3 alone, no resumption.
+# Private keys of modules and of the CA, as PEM.
 
 
-ALPN_LINK: Final = "rmpa/1"
-"""Protocol of a link inside TLS (RFC 7301)."""
-ALPN_JOIN: Final = "rmpa-join/1"
-"""Protocol of a join, and of a renewal with a certificate that has ended."""
-_NO_CHECK_TIME: Final = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python has no name for."""
+def new_key() -> bytes:
+    """A private key (PKCS #8, PEM) for a module or a CA."""
+    return _key_pem(ec.generate_private_key(CURVE))
 
 
-def member_context(certificate: Path, key: Path, ca: bytes, *alpn: str, server_side: bool) -> ssl.SSLContext:
-    """The context of a member.
-
-    The chain of the other side is verified; its name, times and revocation are judged behind the handshake, where
-    the reason can be told.
+def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
+    """Read a private key (PEM).
 
     Args:
-        certificate: The file of this module's certificate (PEM).
-        key: The file of its key (PEM).
-        ca: The CA's certificate (DER), the only one that is trusted.
-        alpn: The protocols.
-        server_side: Whether it is for accepted connections. A module that joins has no certificate yet.
+        data: The PEM.
+        where: The file, for the error.
 
     Raises:
-        StartError: The key is not the certificate's, or a file cannot be used.
+        StartError: It is none.
     """
-    context = _context(server_side=server_side)
-    context.verify_mode = ssl.CERT_OPTIONAL if server_side else ssl.CERT_REQUIRED
-    context.verify_flags = ssl.VerifyFlags(context.verify_flags | _NO_CHECK_TIME)
-    context.set_alpn_protocols(list(alpn))
     try:
-        context.load_cert_chain(certificate, key)
-        context.load_verify_locations(cadata=ca)
-    except (ssl.SSLError, OSError) as error:
-        remedy = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
-        raise StartError(str(certificate), f"does not fit {key.name}, or is broken: {error!s:.100}", remedy) from None
-    return context
+        key = serialization.load_pem_private_key(data, None)
+    except (ValueError, TypeError):
+        key = None
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise StartError(where, "is broken: not a private key in PEM", "join again, or take it from a copy")
+    return key
 
 
-def join_context() -> ssl.SSLContext:
-    """For a module that joins: the token's fingerprint decides on the server."""
-    context = _context(server_side=False)
-    context.verify_mode = ssl.CERT_NONE
-    context.set_alpn_protocols([ALPN_JOIN])
-    return context
-
-
-def _context(*, server_side: bool) -> ssl.SSLContext:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server_side else ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = context.maximum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # the module's name is its identity, and is compared with the hello's
-    if server_side:
-        context.num_tickets = 0  # a resumed session would outlive a revocation
-    return context
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
 
 
 _log = logging.getLogger(__name__)

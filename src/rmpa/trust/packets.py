@@ -1,4 +1,6 @@
-"""Group keys: the secrets that all members of a mesh share, and which of them signs and verifies at a time.
+"""Tags of packets by group keys, and which packets are replays.
+
+Group keys: the secrets that all members of a mesh share, and which of them signs and verifies at a time.
 
 A new key verifies at once and signs ``limits.KEY_SPREAD`` later, when it has reached every linked module. The key
 before verifies for ``limits.KEY_OVERLAP`` more; older ones are still known, so that a module that was away is

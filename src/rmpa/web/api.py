@@ -1,4 +1,6 @@
-"""The REST API: parts of the agent's snapshot as JSON; no I/O.
+"""What programs read of the agent: the REST API, and ``/metrics``, made in a process of its own if it is large.
+
+The REST API: parts of the agent's snapshot as JSON; no I/O.
 
 The types are those of ``observe.snapshot``, as ``--json`` of the commands gives them. Errors are problem details
 (RFC 9457).

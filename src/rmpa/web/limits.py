@@ -1,4 +1,6 @@
-"""Limits of the web server's clients.
+"""Limits of the web server, the monitor, rosbridge and the conversion of values.
+
+Limits of the web server's clients.
 
 Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
 """

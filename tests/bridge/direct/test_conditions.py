@@ -8,7 +8,7 @@ from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, read_reply, read_u
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 GRANT = Grant(45225, "/talker", "/talker/get_loggers")
 

@@ -11,7 +11,7 @@ from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule, Priority, Reliability
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 

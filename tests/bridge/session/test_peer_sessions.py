@@ -13,7 +13,7 @@ from rmpa.bridge.sessions import Part, PeerSession, PeerSessions, PeerState
 from rmpa.config.settings import TrustSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:

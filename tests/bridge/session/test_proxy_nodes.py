@@ -17,7 +17,7 @@ from rmpa.ros.node import listeners as shared_listener
 if TYPE_CHECKING:
     import pytest
 
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 
 def core(host: str = "127.0.0.1", address: str = "127.0.0.1") -> Core:

@@ -9,7 +9,7 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import SitePermissions, SourceKind
 from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 T = SourceKind.TOPIC
 

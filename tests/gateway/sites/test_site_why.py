@@ -27,11 +27,11 @@ from rmpa.gateway.sites.why import (
     parse_ways,
     sent_stages,
 )
-from rmpa.observe.control_client import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
+from rmpa.observe.peers_section import INFO, PARAM, REPORT, WHY
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.gateway.memory_zenoh import eventually as until
 from tests.gateway.sites.site_bed import site_bed
 

@@ -19,7 +19,7 @@ from rmpa.gateway.zenoh import access as trust
 from rmpa.gateway.zenoh.access import open_trusted_session, revoked_modules, zenohd_config
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.trust.documents import DenyList
+from rmpa.trust.certificates import DenyList
 from tests.gateway.zenoh_bed import until
 from tests.gateway.zenoh_fleet import Fleet, allow, deny
 from tests.trust.io.member_files import SecuredMesh

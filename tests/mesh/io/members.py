@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rmpa.runtime.loop import SystemClock
-from rmpa.trust.documents import DocumentKind, sign
+from rmpa.trust.certificates import DocumentKind, sign
 from rmpa.trust.membership import Membership
 from rmpa.trust.store import CERTIFICATE, KEY, MemberFiles, TrustStore
 from tests.mesh.io.meshes import Peer, introduce

@@ -24,8 +24,8 @@ from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tls import TlsHandshake
-from rmpa.trust.certificates import TrustReason
-from rmpa.trust.membership import ALPN_LINK, join_context
+from rmpa.trust.permissions import TrustReason
+from rmpa.trust.store import ALPN_LINK, join_context
 from tests.mesh.io.members import Member, meshes
 from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority

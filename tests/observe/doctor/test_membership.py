@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.observe.doctor.agents import judge_membership
 from rmpa.observe.peer_info import FAIL, OK, WARN
-from rmpa.trust.joining import TrustStatus
+from rmpa.trust.permissions import TrustStatus
 
 WALL = 1_790_000_000.0
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.observe.control_client import INFO, PARAM, REPORT, SiteRequests
+from rmpa.observe.peers_section import INFO, PARAM, REPORT, SiteRequests
 
 
 def peer(name: str) -> Any:

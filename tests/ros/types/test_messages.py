@@ -243,7 +243,7 @@ def test_the_agents_part_of_ros_starts_without_numpy() -> None:
         "import pkgutil, sys, importlib, rmpa.ros, rmpa.ros.node\n"
         "for room in (rmpa.ros, rmpa.ros.node):\n"
         "    for module in pkgutil.iter_modules(room.__path__, room.__name__ + '.'):\n"
-        "        if module.name != 'rmpa.ros.types.messages':\n"  # what the first message imports
+        "        if module.name != 'rmpa.ros.types.typestore':\n"  # what the first message imports
         "            importlib.import_module(module.name)\n"
         "from rmpa.ros.types.messages import MessageType\n"
         "MessageType('sensor_msgs/Joy').describe()\n"

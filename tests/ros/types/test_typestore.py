@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from rmpa.ros.types.messages import MessageType, Ros1Store
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.typestore import Ros1Store
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

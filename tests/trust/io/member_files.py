@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives import serialization
 
-from rmpa.trust.documents import DenyList, KeyList, sign
+from rmpa.trust.certificates import DenyList, KeyList, sign
 from rmpa.trust.membership import Membership
 from rmpa.trust.packets import GroupKey
 from rmpa.trust.store import MemberFiles, TrustStore

@@ -28,23 +28,12 @@ from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import store as files_of
-from rmpa.trust.authority import (
-    CertificateGrant,
-    Join,
-    JoinRefused,
-    MeshAuthority,
-    Renew,
-    encode_message,
-    found_mesh,
-    proof_of,
-    request_der,
-    request_pem,
-)
-from rmpa.trust.certificates import CertificateError, make_request, new_key, private_key
-from rmpa.trust.documents import DocumentKind
+from rmpa.trust.authority import MeshAuthority, found_mesh, request_der, request_pem
+from rmpa.trust.certificates import CertificateError, DocumentKind, make_request
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
-from rmpa.trust.membership import ALPN_JOIN, Membership, join_context, member_context
-from rmpa.trust.store import MemberFiles, TrustStore
+from rmpa.trust.membership import Membership, new_key, private_key
+from rmpa.trust.store import ALPN_JOIN, MemberFiles, TrustStore, join_context, member_context
+from rmpa.trust.tokens import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 

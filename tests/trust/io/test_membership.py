@@ -13,10 +13,10 @@ from rmpa.core.errors import StartError
 from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import TrustError, TrustReason
-from rmpa.trust.documents import DenyList, DocumentError, DocumentKind, KeyList, sign
+from rmpa.trust.certificates import DenyList, DocumentError, DocumentKind, KeyList, sign
 from rmpa.trust.membership import Membership
 from rmpa.trust.packets import GroupKey, KeyPurpose, Verdict
+from rmpa.trust.permissions import TrustError, TrustReason
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 

@@ -1,4 +1,7 @@
-"""The offset of a peer's clock over the last minute; each latency is corrected with an estimate of its time."""
+"""What is measured of a remote source: rate, period, jitter, latency by the peer's clock, and QoS events.
+
+The offset of a peer's clock over the last minute; each latency is corrected with an estimate of its time.
+"""
 
 from __future__ import annotations
 

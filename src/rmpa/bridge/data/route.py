@@ -1,4 +1,6 @@
-"""Chooses the lane of a route's messages, and keeps their order when it changes.
+"""What decides how a route's messages go: the lane, with a fence at each change, and the rate. Pure.
+
+Chooses the lane of a route's messages, and keeps their order when it changes.
 
 Sans-I/O. A contract's priority decides, else the size of the messages: one large message moves a topic to the bulk
 lane, a long series of small ones brings it back. Two connections have no common order. Therefore a *fence* is sent

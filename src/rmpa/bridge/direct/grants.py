@@ -16,14 +16,14 @@ from rmpa.bridge import limits
 from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, end_from, reply_of, unmet_by_trust
 from rmpa.bridge.messages import check_contract, is_crossing_name
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.core.contract import Contract  # noqa: TC001 - msgspec reads the annotations
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
-    from rmpa.core.contract import Contract
     from rmpa.core.counters import Counters
 
 

@@ -1,4 +1,6 @@
-"""The conditions of direct transport: each one that fails is a reason to relay. Pure.
+"""What direct transport needs to know of nodes: its conditions, where a node listens, and its connections.
+
+The conditions of direct transport: each one that fails is a reason to relay. Pure.
 
 docs/contracts.md lists them for users.
 """
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.contract import Contract
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.wire.slave_api import BusLink
     from rmpa.runtime.tcp_connections import TcpConnection
 
@@ -115,7 +117,7 @@ class Grant:
 
 
 def read_reply(value: object, node: str) -> Grant | Unmet:
-    """Read the response of a peer to ``direct.open`` or ``direct.service``.
+    """Read the response of a peer to ``direct.topic`` or ``direct.service``.
 
     Args:
         value: What the peer sent.
@@ -144,7 +146,7 @@ def read_unmet(why: str, text: str) -> Unmet:
 
 
 def reply_of(found: Grant | Unmet) -> dict[str, object]:
-    """The response to a peer's ``direct.open`` or ``direct.service``."""
+    """The response to a peer's ``direct.topic`` or ``direct.service``."""
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}

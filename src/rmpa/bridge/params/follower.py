@@ -21,11 +21,11 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.params.rules import Followed
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 

@@ -1,4 +1,7 @@
-"""The parameters of the local core as XML-RPC text; long values are converted without blocking the event loop."""
+"""The owner's side of parameters: answers what peers read, set, delete and follow of the local core.
+
+The parameters of the local core as XML-RPC text; long values are converted without blocking the event loop.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,18 @@ from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.trust.documents import refusal
+from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.params.rules import ParamPolicy
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
-    from rmpa.trust.documents import PermissionDecision
+    from rmpa.trust.permissions import PermissionDecision
 
 PEERS: Final = f"{OWN_NODE}/peers"
 """The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the

@@ -258,7 +258,7 @@ def learn(entry: Followed, text: str | None) -> None:
 #
 # Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has
 # neither
-# binary data nor dates. ``bridge.session.peer_rpc`` carries large ones aside of commands. ::
+# binary data nor dates. ``bridge.driver`` carries large ones aside of commands. ::
 #
 #     param.get {key}                       → {text}
 #     param.names {}                        → {text}        a list of the names of all parameters that may be read

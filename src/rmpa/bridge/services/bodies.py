@@ -1,4 +1,6 @@
-"""How requests and replies cross a link: small ones by the express lane, larger ones by the bulk lane in fragments.
+"""The bodies of calls and of large requests on a link, and the pool of connections to a local server.
+
+How requests and replies cross a link: small ones by the express lane, larger ones by the bulk lane in fragments.
 
 No part of a call may be dropped silently. ``Budget`` bounds what waits for a slow link, and a call that would exceed
 it fails with that reason.
@@ -159,7 +161,7 @@ class BodySender:
 
 
 class BodyReceiver:
-    """Reassembles the bodies that arrive on one route; a ``bridge.data.io.receiver.DataHandler``, for subclasses.
+    """Reassembles the bodies that arrive on one route; a ``bridge.data.reception.DataHandler``, for subclasses.
 
     Args:
         budget: Bounds the bytes of the peer's bodies while they are reassembled.

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.exports import ServiceExports
     from rmpa.bridge.sessions import PeerSessions
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.tls import Buffer
 

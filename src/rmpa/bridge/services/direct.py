@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.bridge.direct.grants import DirectAsk
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.exports import RemoteService, ServiceExports, ServiceRules
     from rmpa.bridge.services.imports import ServiceImports
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.core.counters import Counters
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 _log = logging.getLogger(__name__)
 _OWN_TOOLS: Final = "/rmpa_service"

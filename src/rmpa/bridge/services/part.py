@@ -44,13 +44,13 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.messages import Message
     from rmpa.bridge.policy import Relay
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.config.settings import LimitSettings, Settings
     from rmpa.core.counters import Counters
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import ServiceDescription
 

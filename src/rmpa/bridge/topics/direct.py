@@ -44,14 +44,14 @@ from rmpa.ros.wire.xmlrpc import RosReply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.core.contract import Contracts
     from rmpa.core.counters import Counters
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
 
 MEASURING: Final = "/rmpa_topic_"

@@ -12,7 +12,7 @@ A source is connected while at least one peer wants it::
 A peer that lost a route opens it again: the receiving side retries. A reliable route outlives its link: it is
 suspended, its source stays connected, and the peer's next ``OpenRoute`` continues it (``link_away``).
 
-Messages to and from peers carry wire names (``bridge.naming``). Everything else here is keyed by local names.
+Messages to and from peers carry wire names (``bridge.proxies``). Everything else here is keyed by local names.
 
 The cost of a change depends on the size of the change, not on the size of the graph. Changes are gathered for each
 peer and advertised in portions of bounded size.

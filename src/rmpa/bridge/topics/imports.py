@@ -7,7 +7,7 @@ The cost of a method depends on its arguments, not on the number of peers and so
 long, so it is split (``portions``).
 
 Sources are keyed by their wire names. ``RemoteTopic.topic`` is the name of the topic in the local graph
-(``bridge.naming``); all arguments about the local graph use that one.
+(``bridge.proxies``); all arguments about the local graph use that one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The publisher's side of direct transport for topics: grants subscribers of peers a connection to a local node.
+"""What this module's nodes publish: local sources, subscriptions to them, and direct connections to them.
+
+The publisher's side of direct transport for topics: grants subscribers of peers a connection to a local node.
 
 A rospy publisher keeps one connection for each caller id: a second subscriber of that name closes the first one's
 connection without a word (docs/design/ros-traps.md, trap 12). Therefore a name is granted once for each source, and
@@ -42,15 +44,15 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.direct.grants import DirectAsk, Want
     from rmpa.bridge.direct.nodes import LocalEndpoints
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.policy import Relay
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.exports import Exports
     from rmpa.core.contract import Contracts
     from rmpa.core.counters import Counters
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.reliable import ReliableSender
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.master.registrations import Unreachable
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode

@@ -1,6 +1,7 @@
 """The part of the bridge for topics: local sources are sent to peers, and sources of peers are published here.
 
-The two plans are pure (``topics.imports``, ``topics.exports``); this part carries them out. The path of a message::
+The two plans are pure (``bridge.topics.imports``, ``bridge.topics.exports``); this part carries them out. The
+path of a message::
 
     publisher → ExportFlow (LocalSubscriptions) → RouteSender ⇢ link
          link ⇢ DataReceiver → ImportFlow (PeerTopics) → Publication → subscribers
@@ -41,13 +42,13 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.data.route import ReceptionHistory
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.messages import Message
     from rmpa.bridge.policy import Relay
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.config.settings import LimitSettings, Settings
     from rmpa.core.counters import Counters
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
 

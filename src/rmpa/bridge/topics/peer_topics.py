@@ -1,4 +1,6 @@
-"""Reports messages that do not reach their listeners, in the log and to the agent at the other end.
+"""The topics of peers in the local graph: publications of proxies, their flows, and reports of losses.
+
+Reports messages that do not reach their listeners, in the log and to the agent at the other end.
 
 These are reliable messages that were given up, and messages that are too long to cross.
 """
@@ -32,11 +34,11 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.data.route import ReceptionHistory
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.exports import Exports
     from rmpa.core.counters import Counters, RefusalLog
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply
 

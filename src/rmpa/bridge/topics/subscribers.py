@@ -1,4 +1,6 @@
-"""Topics whose publisher checks the names of its listeners, not only whether there are any.
+"""Subscribers of peers, where their names or types matter: actionlib's clients, and types that differ.
+
+Topics whose publisher checks the names of its listeners, not only whether there are any.
 
 An actionlib client accepts a server (``wait_for_server``, ``waitForServer``) when the node that publishes the status
 also listens to the client's goals and cancellations. It compares the caller ids of the connections. Over the mesh,
@@ -16,8 +18,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import Audience, Mismatch, encode, is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, PermissionGate
-from rmpa.bridge.proxies import proxied_node, proxy_name
+from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, PermissionGate, proxied_node, proxy_name
 from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.peer_rules import Access
 from rmpa.ros.node.subscription import PublisherConnection
@@ -172,7 +173,7 @@ class MismatchReports:
 
 # Names local subscribers to the publishing peer, and connects to local publishers for a peer's subscribers.
 #
-# See ``bridge.topics.audience`` for the topics that need it.
+# See ``bridge.topics.subscribers`` for the topics that need it.
 
 
 _log = logging.getLogger(__name__)

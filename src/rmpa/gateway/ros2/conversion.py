@@ -1,4 +1,7 @@
-"""An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions."""
+"""Conversion of messages between ROS 1's bytes and CDR, for each pair of types and for actions.
+
+An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The attachment of each message, request and reply of ROS 2 over Zenoh.
+"""The formats of rmw_zenoh: tokens, QoS, and the attachment of messages, requests and replies.
+
+The attachment of each message, request and reply of ROS 2 over Zenoh.
 
 33 bytes, little-endian; rmw_zenoh_cpp writes it with zenoh's serializer::
 

@@ -1,4 +1,7 @@
-"""Which sources cross between the mesh and ROS 2, and under which names, by ``[[gateway.rule]]``."""
+"""ROS 2's graph: which sources cross, under which names, by which types, and why one does not.
+
+Which sources cross between the mesh and ROS 2, and under which names, by ``[[gateway.rule]]``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Which type of ROS 2 stands for a type of ROS 1: by name, and by ros1_bridge's mapping files.
+"""Which type of ROS 2 stands for one of ROS 1, and the messages of actions on both sides.
+
+Which type of ROS 2 stands for a type of ROS 1: by name, and by ros1_bridge's mapping files.
 
 A mapping file is a YAML list of rules (ros1_bridge's doc/index.rst): of packages (``ros1_package_name``,
 ``ros2_package_name``), of messages (also ``ros1_message_name``, ``ros2_message_name``) or services

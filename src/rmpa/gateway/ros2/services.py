@@ -1,4 +1,7 @@
-"""One service of a module, in ROS 2's graph."""
+"""Services between ROS 1 and ROS 2, in both directions.
+
+One service of a module, in ROS 2's graph.
+"""
 
 from __future__ import annotations
 

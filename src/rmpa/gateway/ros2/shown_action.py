@@ -1,4 +1,7 @@
-"""What both directions of actions share: finding the types, and the way of messages to the goals."""
+"""Actions of ROS 2 in the gateway's graph, and what both directions of actions share.
+
+What both directions of actions share: finding the types, and the way of messages to the goals.
+"""
 
 from __future__ import annotations
 

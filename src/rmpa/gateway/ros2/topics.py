@@ -1,4 +1,7 @@
-"""One topic of one publisher of the mesh, as that of a node of ROS 2."""
+"""Topics of modules in ROS 2's graph.
+
+One topic of one publisher of the mesh, as that of a node of ROS 2.
+"""
 
 from __future__ import annotations
 

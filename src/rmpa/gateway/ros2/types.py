@@ -1,4 +1,7 @@
-"""The sequence numbers of one topic's publishers: what was lost, and what came twice. A machine without I/O."""
+"""Types of ROS 2: hashes, descriptions and sizes; and the sequence numbers of a topic's publishers.
+
+The sequence numbers of one topic's publishers: what was lost, and what came twice. A machine without I/O.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What other sites have, from their liveliness tokens.
+"""What other sites have, which gateway of a site leads, and the rules of what crosses.
+
+What other sites have, from their liveliness tokens.
 
 Sans-I/O. Tokens come and go one by one, in any order. A source is there while its own token and that of its module
 are. What a gateway withdraws goes at once (after ``limits.SITE_SETTLE``); what is lost together with the leading

@@ -1,4 +1,7 @@
-"""One publisher of this site, for the other sites."""
+"""One publisher of this site for the other sites: QoS, header, numbers, limits of rate and size.
+
+One publisher of this site, for the other sites.
+"""
 
 from __future__ import annotations
 

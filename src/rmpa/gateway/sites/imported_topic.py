@@ -1,4 +1,7 @@
-"""One publisher of another site, in the gateway's graph."""
+"""One publisher of another site in the gateway's graph, and the part for topics.
+
+One publisher of another site, in the gateway's graph.
+"""
 
 from __future__ import annotations
 

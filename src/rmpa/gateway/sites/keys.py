@@ -1,4 +1,6 @@
-"""The attachment of each message between sites.
+"""Keys, tokens and attachments of messages between sites, and since when a site is away.
+
+The attachment of each message between sites.
 
 Little-endian::
 

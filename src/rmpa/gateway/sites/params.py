@@ -105,7 +105,7 @@ class SiteAsker:
     modules: tuple[str, ...] = ()
 
     def args(self, args: dict[str, Any]) -> dict[str, Any]:
-        """A request's arguments (``bridge.params.transfer``), for the module that has the parameters."""
+        """A request's arguments (``bridge.params.rules``), for the module that has the parameters."""
         return {**args, "site": self.site, "askers": list(self.modules)}
 
 
@@ -401,7 +401,7 @@ class SiteParamImports:
         self._why_not = why_not
 
     async def ask(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
-        """Answer a request of ``bridge.params.transfer`` for a module of another site.
+        """Answer a request of ``bridge.params.rules`` for a module of another site.
 
         Args:
             asker: The linked module that asks; empty for this machine's user.

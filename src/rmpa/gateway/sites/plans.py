@@ -1,4 +1,7 @@
-"""Which sources of this site other sites may have: from the mesh's sources and the rules to tokens. Sans-I/O."""
+"""What a site offers and takes: plans of exports and imports, and how the parts report them. Without I/O.
+
+Which sources of this site other sites may have: from the mesh's sources and the rules to tokens. Sans-I/O.
+"""
 
 from __future__ import annotations
 

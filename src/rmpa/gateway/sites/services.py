@@ -1,4 +1,6 @@
-"""Services between sites: the description that a queryable gives, and the texts of calls that fail. Without I/O.
+"""Services and actions between sites: descriptions, calls, and the two directions.
+
+Services between sites: the description that a queryable gives, and the texts of calls that fail. Without I/O.
 
 ``get`` on ``rmpa/1/<site>/<module>/s/<package>%<Type>/<service>`` calls: the query's payload is the request, the
 reply the response, both as TCPROS has them without length. With the parameter ``description`` it asks for the type::
@@ -131,8 +133,8 @@ def unanswered(service: str, module: str, site: str, waited: float, timeout: flo
 # The part of the neighbour "other sites" that lets actions work: clients accept a server by the names of its nodes.
 #
 # The five topics of an action cross as all topics do. But a client of actionlib waits for a node that publishes the
-# status *and* listens to goals and cancellations (``bridge.topics.audience``). The gateway listens to these for all
-# other sites, by one connection. So it opens one more for each server of another site, under the server's name
+# status *and* listens to goals and cancellations (``bridge.topics.subscribers``). The gateway listens to these for
+# all other sites, by one connection. So it opens one more for each server of another site, under the server's name
 # here.
 
 

@@ -27,8 +27,8 @@ from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.core.identity import matches
 from rmpa.gateway.zenoh.config import MeshCertificates, gateway_config, zenohd_entries
 from rmpa.gateway.zenoh.session import open_session
-from rmpa.trust.documents import action_topics
 from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
+from rmpa.trust.permissions import action_topics
 from rmpa.trust.store import CA, CERTIFICATE, DENY, KEY
 
 if TYPE_CHECKING:
@@ -435,8 +435,7 @@ def revoked_modules(settings: Settings) -> tuple[str, ...]:
     files = store.load()
     if not files.deny:
         return ()
-    from rmpa.trust.certificates import ca_public_key  # noqa: PLC0415 - they need the extra rmpa[trust]
-    from rmpa.trust.documents import read_deny_list  # noqa: PLC0415
+    from rmpa.trust.certificates import ca_public_key, read_deny_list  # noqa: PLC0415 - the extra rmpa[trust]
 
     try:
         deny = read_deny_list(files.deny, ca_public_key(files.ca))

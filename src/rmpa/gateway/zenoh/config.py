@@ -1,4 +1,7 @@
-"""What a Zenoh session is opened with: from our settings to the keys of Zenoh's configuration."""
+"""How a Zenoh session is configured, and the threads that declare, ask and answer for it.
+
+What a Zenoh session is opened with: from our settings to the keys of Zenoh's configuration.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ZenohPriority, ZenohSample
 from rmpa.gateway.zenoh.config import AnswerBudget, ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, keep_thread_state
-from rmpa.runtime.process import in_thread
+from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,4 +1,6 @@
-"""The way of what Zenoh delivers from its threads into the event loop.
+"""The way of messages between Zenoh's threads and the event loop, in both directions.
+
+The way of what Zenoh delivers from its threads into the event loop.
 
 Zenoh calls back in threads of its own. Each subscriber has a queue there, and one wake-up of the loop is enough for
 all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.

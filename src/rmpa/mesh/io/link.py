@@ -1,4 +1,6 @@
-"""The bulk lanes of all links: each is dialled when a message first wants it, and ends with its link.
+"""The link to a peer: its two lanes, what is sent on each, and the dialling of the bulk lane.
+
+The bulk lanes of all links: each is dialled when a message first wants it, and ends with its link.
 
 Only the side that dialled the link dials its bulk lane; the other side asks for it by a lane frame.
 """

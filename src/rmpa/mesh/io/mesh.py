@@ -34,7 +34,7 @@ from rmpa.mesh.peering import Peering
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
-from rmpa.trust.certificates import TrustReason
+from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     import socket

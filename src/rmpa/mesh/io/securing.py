@@ -22,8 +22,8 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Refusal, Refuse
 from rmpa.runtime.tls import SecureSocket, TlsHandshake
-from rmpa.trust.certificates import TrustError, TrustReason
-from rmpa.trust.membership import ALPN_JOIN, ALPN_LINK
+from rmpa.trust.permissions import TrustError, TrustReason
+from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
     from rmpa.core.counters import Clock, RefusalLog

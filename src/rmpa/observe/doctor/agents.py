@@ -1,4 +1,7 @@
-"""Judges the agents of this machine by their snapshots."""
+"""Judges this machine's agents, and which ports of nodes the network can reach.
+
+Judges the agents of this machine by their snapshots.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from rmpa.bridge.proxies import proxied_peer
+from rmpa.bridge.policy import proxied_peer
 from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import judge_peer_clock
-from rmpa.observe.health import fallbacks, stuck, subscriber_text
-from rmpa.observe.health import transport_remedy as remedy_for
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
+from rmpa.observe.why.diagnosis import fallbacks, stuck, subscriber_text
+from rmpa.observe.why.diagnosis import remedy as remedy_for
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.tcp_connections import listening_sockets
 
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot, UnreachableInfo
     from rmpa.runtime.tcp_connections import ListeningSocket
-    from rmpa.trust.joining import TrustStatus
+    from rmpa.trust.permissions import TrustStatus
 
 _PERMISSION: Final = "permission."
 """The counters of what ``[[permission]]`` refused begin so."""

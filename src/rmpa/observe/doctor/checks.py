@@ -1,4 +1,6 @@
-"""All checks of ``rmpa doctor``. A new check goes here.
+"""All checks of ``rmpa doctor``, with the facts of the network that they read. A new check goes here.
+
+All checks of ``rmpa doctor``. A new check goes here.
 
 A check is a function of ``DoctorInput``. It reads something of this machine, by a module of this folder, and has a
 pure ``judge_…`` function of the folder above say what that means. ``CHECKS`` lists them.

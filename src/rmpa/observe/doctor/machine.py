@@ -1,4 +1,7 @@
-"""Reads the clock, the rights and the limits of this machine."""
+"""Reads and judges the clock, the rights, the limits and the ROS environment of this machine.
+
+Reads the clock, the rights and the limits of this machine.
+"""
 
 from __future__ import annotations
 

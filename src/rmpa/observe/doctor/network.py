@@ -1,4 +1,6 @@
-"""Searches the rules of nftables and iptables for signs that they drop agents' packets.
+"""Judges interfaces, routes and the firewall's rules.
+
+Searches the rules of nftables and iptables for signs that they drop agents' packets.
 
 These are signs, not proofs: only all rules together decide about a packet. A sign is a chain for incoming packets
 whose policy is to drop, a rule that names a port of ours, or one that drops all UDP. The multicast check sends a real

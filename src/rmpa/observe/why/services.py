@@ -1,4 +1,7 @@
-"""What this agent knows of a service on its path: for its own user, and for the agent at the other end."""
+"""The stages of a service's way, and what this agent knows of a topic and a service on theirs.
+
+What this agent knows of a service on its path: for its own user, and for the agent at the other end.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 
 # Why a service of a peer cannot be called here: the stages between the client and the server, in order.

@@ -16,10 +16,10 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control_client import WHY as WHY_SITES
 from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, PeerAgent
 from rmpa.observe.peer_info import INFO as AGENT_INFO
+from rmpa.observe.peers_section import WHY as WHY_SITES
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     BothEnds,
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.observe.control_client import SiteRequests
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.peers_section import SiteRequests
     from rmpa.observe.snapshot import Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
 
 
 # Why a module is reached or not: the stages from its beacon to what crosses its link, in order.

@@ -1,4 +1,7 @@
-"""Actions that the control loop returns to its driver: apply a profile, raise or clear an alarm, report a change."""
+"""Which profile fits: the decision with its reasons, violations, and the actions that carry it out.
+
+Actions that the control loop returns to its driver: apply a profile, raise or clear an alarm, report a change.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The clients of a resource: their last messages, refusals and presence.
+"""What a resource knows and tells: its clients, its life cycle, reports, and the state that it keeps.
+
+The clients of a resource: their last messages, refusals and presence.
 
 ``resource.declare.requirements`` merges the requirements themselves. This module keeps for each client: the mark on
 its request, by which the client recognises the answer; the stamp of its request, which identifies a latched message

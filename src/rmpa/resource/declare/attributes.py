@@ -1,4 +1,6 @@
-"""Quality attributes: the unit and the scale of a quality, and which direction is better.
+"""Quality attributes with their units, and the rules of contexts.
+
+Quality attributes: the unit and the scale of a quality, and which direction is better.
 
 The literature sorts requirements into four classes (paper, section 3.1: "temporal and spatial requirements,
 information reliability and operation performance"). The class is shown in reports and does not influence decisions.
@@ -385,7 +387,7 @@ class Attribute:
     Args:
         name: ``rate``, ``latency``, ``accuracy`` …
         direction: Which values are better.
-        unit: Unit of the values (``resource.declare.units``); empty: a ratio.
+        unit: Unit of the values (``resource.declare.attributes``); empty: a ratio.
         scale: How distances are measured.
         category: The class of requirement, for reports.
         tolerance: A shortfall of this size counts as 1: in the unit (linear), as a ratio above 1 (log), in

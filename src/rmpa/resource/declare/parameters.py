@@ -1,4 +1,7 @@
-"""How quickly a resource adapts: the parameters of its control loop."""
+"""Parameters, inputs and outputs, profiles, behaviours and adaptation, as a user declares them.
+
+How quickly a resource adapts: the parameters of its control loop.
+"""
 
 from __future__ import annotations
 
@@ -492,7 +495,7 @@ class Context:
 
     Args:
         name: Unique within the resource.
-        when: A rule over topics and parameters (``resource.declare.context_rules``) that selects the context; empty:
+        when: A rule over topics and parameters (``resource.declare.attributes``) that selects the context; empty:
             it is chosen by hand only.
         requires: QoS requests on the resource itself, by attribute.
         profiles: The only profiles that may run in the context; empty: any.

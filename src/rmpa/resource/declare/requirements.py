@@ -1,4 +1,7 @@
-"""A resource's answer to the requirement of one client."""
+"""Requirements of clients: their text, their merge, and the answer to each client.
+
+A resource's answer to the requirement of one client.
+"""
 
 from __future__ import annotations
 
@@ -236,7 +239,7 @@ class QoSRequest:
     hard: bool = False
 
     def __str__(self) -> str:
-        """The text form that ``resource.declare.requirement_text`` reads: ``>= 20 Hz hard weight=2``."""
+        """The text form that ``resource.declare.requirements`` reads: ``>= 20 Hz hard weight=2``."""
         if self.exactly is not None:
             values = self.exactly if isinstance(self.exactly, tuple) else (self.exactly,)
             text = "= " + " | ".join(map(str, values))

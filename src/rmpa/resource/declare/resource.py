@@ -204,7 +204,7 @@ class Resource:
         Args:
             name: ``accuracy``, ``energy`` …
             better: ``max``, ``min``, ``target`` or ``exact``.
-            unit: Unit of the values (``resource.declare.units``); empty: a ratio.
+            unit: Unit of the values (``resource.declare.attributes``); empty: a ratio.
             scale: ``linear``, ``log``, ``ordinal`` or ``nominal``.
             category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
             tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.

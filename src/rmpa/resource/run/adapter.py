@@ -34,8 +34,8 @@ from rmpa.resource.run.runtime import CALLER, Preconditions, RuntimePart, Status
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

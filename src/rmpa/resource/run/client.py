@@ -1,4 +1,6 @@
-"""A client of a resource in this or another module: requests a quality and receives the answers.
+"""A client of a resource, and the demands that a resource makes of others.
+
+A client of a resource in this or another module: requests a quality and receives the answers.
 
 ::
 

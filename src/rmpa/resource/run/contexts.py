@@ -1,4 +1,6 @@
-"""Switches a resource between its contexts: by hand (a topic, the configuration) or by the contexts' rules.
+"""Switches a resource between its contexts, and keeps its state in a file.
+
+Switches a resource between its contexts: by hand (a topic, the configuration) or by the contexts' rules.
 
 A switch is atomic: no task runs and no message is sent until the context's function has ended, the context's outputs
 and requirements are in force, and the resulting profile has been applied.
@@ -26,8 +28,8 @@ from rmpa.resource.run.descriptor import topic_of
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine

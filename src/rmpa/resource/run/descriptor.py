@@ -1,4 +1,6 @@
-"""The descriptor of a resource: its metadata as JSON on the latched topic ``<resource>/descriptor``.
+"""The descriptor of a resource, and the schedule of its tasks.
+
+The descriptor of a resource: its metadata as JSON on the latched topic ``<resource>/descriptor``.
 
 The topic crosses the mesh like any other, so every module sees what each resource offers and needs. The names of the
 fields are part of the wire format.

@@ -1,4 +1,6 @@
-"""Converts a resource's configuration to dynamic_reconfigure's messages and back (wiki.ros.org/dynamic_reconfigure).
+"""A resource as a server of dynamic_reconfigure (wiki.ros.org/dynamic_reconfigure).
+
+Converts a resource's configuration to dynamic_reconfigure's messages and back (wiki.ros.org/dynamic_reconfigure).
 
 Pure functions between parameters and the plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription``. A
 number out of range is clipped, as by dynamic_reconfigure's own servers; any other invalid value is an error.

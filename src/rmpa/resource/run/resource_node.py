@@ -20,7 +20,7 @@ from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.process import in_thread
+from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence

@@ -20,7 +20,7 @@ from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
 from rmpa.ros.wire.tcpros import LENGTH, printable
-from rmpa.runtime.process import in_thread
+from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

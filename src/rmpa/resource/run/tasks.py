@@ -1,4 +1,7 @@
-"""A gate that separates the runs of tasks from changes of the profile, the context or several parameters."""
+"""Tasks of a resource: their runs, and the gate between runs and changes of profile or context.
+
+A gate that separates the runs of tasks from changes of the profile, the context or several parameters.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
-from rmpa.ros.core.api import Core
+from rmpa.ros.core.external import Core
 from rmpa.ros.core.liveness import Liveness, Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.rpc import XmlRpcServer

@@ -1,4 +1,7 @@
-"""Finds out which node is at an address: its port may be another node's by now (ros_comm#2018, #2241)."""
+"""Which nodes live: who is at an address, pings, and the notices of changes to nodes.
+
+Finds out which node is at an address: its port may be another node's by now (ros_comm#2018, #2241).
+"""
 
 from __future__ import annotations
 
@@ -106,7 +109,7 @@ async def _callerid(host: str, port: int, topic: str) -> str | None:
 # kernel's table shows whether it still listens, which spares the connection (rospy starts a thread for each). Other
 # nodes, and those that the table lacks, are checked by connecting. Only two refused connects prove a node dead: a
 # network that is down does not. A node to which connecting fails for another reason is unreachable
-# (``ros.master.reachability``).
+# (``ros.master.registrations``).
 
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))

@@ -26,8 +26,8 @@ from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.registrations import NodeRecord  # noqa: TC001 - msgspec reads the annotations
 from rmpa.ros.wire.xmlrpc import RosFault, brief, legal_text
+from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import yielding_to_data
-from rmpa.runtime.process import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -1,4 +1,7 @@
-"""One client of an XML-RPC server: received HTTP is parsed, one call at a time is answered, all sizes are bounded."""
+"""One client of an XML-RPC server: its bounds, which one gives way, and the listening socket.
+
+One client of an XML-RPC server: received HTTP is parsed, one call at a time is answered, all sizes are bounded.
+"""
 
 from __future__ import annotations
 

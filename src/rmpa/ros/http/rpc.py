@@ -1,4 +1,6 @@
-"""An XML-RPC server: POST to any path, each response in one piece, all sizes and times bounded.
+"""XML-RPC over HTTP: the server, the client, and the pages for browsers.
+
+An XML-RPC server: POST to any path, each response in one piece, all sizes and times bounded.
 
 ``ros.wire.http`` parses HTTP, ``ros.wire.xmlrpc`` the bodies. The server fits ROS's existing clients: XmlRpc++ wants
 ``Content-length`` and no chunks; Python keeps its connections open for as long as its threads live.

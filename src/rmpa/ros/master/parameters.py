@@ -1,4 +1,7 @@
-"""Calls to slave APIs that follow from a change in the master's tables, and reports of changes."""
+"""The parameter server, the resolution of names, and the effects of changes on nodes.
+
+Calls to slave APIs that follow from a change in the master's tables, and reports of changes.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +101,7 @@ class GraphState:
 
 # Names as rosmaster resolves them: any characters, relative to the caller.
 #
-# Stricter rules (``core.names``) hold for names that RMPA makes; a master accepts what rosmaster accepts.
+# Stricter rules (``core.identity``) hold for names that RMPA makes; a master accepts what rosmaster accepts.
 
 
 def canonical(name: str) -> str:

@@ -1,4 +1,6 @@
-"""Registered nodes to which connecting fails: an address without a route, a host name that does not resolve.
+"""The tables of a master: publishers, subscribers, services and nodes.
+
+Registered nodes to which connecting fails: an address without a route, a host name that does not resolve.
 
 Such a node may live: its network may be down for a moment. It stays registered, as at roscore, but after
 ``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: its topics and services are no longer offered to peers. Pure: the

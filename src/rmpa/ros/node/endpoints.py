@@ -1,4 +1,7 @@
-"""The services of a ``Node``: ``Service`` serves one, ``ServiceClient`` calls one."""
+"""Publishers, subscriptions, services and clients of a ``Node``.
+
+The services of a ``Node``: ``Service`` serves one, ``ServiceClient`` calls one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The addresses of this machine, from which a node chooses the one to register."""
+"""The sockets of nodes: one shared port, loopback addresses of proxies, and the TCPROS server.
+
+The addresses of this machine, from which a node chooses the one to register.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``get_loggers`` and ``set_logger_level`` of a node of this process, as every roscpp and rospy node has them.
+"""A node's Slave API and the services of its loggers.
+
+``get_loggers`` and ``set_logger_level`` of a node of this process, as every roscpp and rospy node has them.
 
 With them rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of this
 program's log while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because

@@ -1,4 +1,6 @@
-"""Actions: the seven message types of a ``.action`` file, as actionlib's ``genaction`` writes them.
+"""Definitions of messages, services and actions in the packages of this machine.
+
+Actions: the seven message types of a ``.action`` file, as actionlib's ``genaction`` writes them.
 
 Pure. A file has a goal, a result and a feedback, separated by lines ``---`` (wiki.ros.org/actionlib).
 """
@@ -320,7 +322,7 @@ def read_text(path: Path, size_max: int) -> str | None:
 # The search order is, in the workspaces:
 #
 # * genpy's modules below each folder of PYTHONPATH, which rospy's nodes import. They are read, never run;
-# * the packages below each folder of ROS_PACKAGE_PATH (``ros.types.packages``): ``msg/Name.msg``, ``srv/Name.srv``,
+# * the packages below each folder of ROS_PACKAGE_PATH (``ros.types.installed``): ``msg/Name.msg``, ``srv/Name.srv``,
 #   or ``action/Name.action`` for the messages of an action;
 # * in each prefix of CMAKE_PREFIX_PATH (a devel or install space) genpy's modules, ``share``, and the source
 # folders

@@ -1,4 +1,6 @@
-"""Services over TCPROS: connection headers, requests and replies (wiki.ros.org/ROS/TCPROS, section 1.1).
+"""TCPROS: connection headers, messages, and services (wiki.ros.org/ROS/TCPROS).
+
+Services over TCPROS: connection headers, requests and replies (wiki.ros.org/ROS/TCPROS, section 1.1).
 
 Pure: bytes in, values out. A client connects, both sides send a header, then the client sends a request with its
 length in front and the server answers with a byte for success, a length, and the response or the text of an error.

@@ -1,4 +1,6 @@
-"""Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
+"""XML-RPC as bytes: reads and writes calls and responses, within bounds.
+
+Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
 
 A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client hides
 the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer before

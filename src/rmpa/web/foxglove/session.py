@@ -1,4 +1,7 @@
-"""The connection graph that a Foxglove client is told: which nodes publish, subscribe and serve what."""
+"""The session of a Foxglove client, and the connection graph that it is told.
+
+The connection graph that a Foxglove client is told: which nodes publish, subscribe and serve what.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The graph of the local core: as the agent tells it, else read from the master again and again."""
+"""The graph of the local core and the definitions of its types, for all clients.
+
+The graph of the local core: as the agent tells it, else read from the master again and again.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The hub's node, made anew when its master was away or has shut it down, and what is registered with it."""
+"""The hub's node, its clients with their rights, and the turns of their messages.
+
+The hub's node, made anew when its master was away or has shut it down, and what is registered with it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.documents import Permissions
+    from rmpa.trust.permissions import Permissions
     from rmpa.web.hub.requests import Answer, ParamValue
 
 

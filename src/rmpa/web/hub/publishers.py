@@ -1,4 +1,7 @@
-"""``/client_count`` and ``/connected_clients``, as rosbridge_suite publishes them."""
+"""Publishers and parameters of web clients, ROS time, and rosbridge_suite's counts of clients.
+
+``/client_count`` and ``/connected_clients``, as rosbridge_suite publishes them.
+"""
 
 from __future__ import annotations
 

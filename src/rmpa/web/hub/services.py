@@ -1,4 +1,7 @@
-"""Files of ROS packages, for clients that draw a robot: ``package://NAME/PATH``."""
+"""Services that clients call and serve, and files of ROS packages.
+
+Files of ROS packages, for clients that draw a robot: ``package://NAME/PATH``.
+"""
 
 from __future__ import annotations
 

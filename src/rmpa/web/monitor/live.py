@@ -1,4 +1,7 @@
-"""Live messages as a page shows them: values cut to a size, numbers by a path, scans and images thinned."""
+"""Live messages of a page: watched, thinned, patched, and the joystick's commands.
+
+Live messages as a page shows them: values cut to a size, numbers by a path, scans and images thinned.
+"""
 
 from __future__ import annotations
 

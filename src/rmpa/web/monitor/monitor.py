@@ -1,4 +1,7 @@
-"""The server's side of the monitor: what all pages share."""
+"""What all pages of the monitor share: the state of the mesh and the log.
+
+The server's side of the monitor: what all pages share.
+"""
 
 from __future__ import annotations
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 import msgspec
 
 from rmpa.bridge.nodes import INFO
-from rmpa.bridge.policy import is_own
-from rmpa.bridge.proxies import proxied_node, proxied_peer
+from rmpa.bridge.policy import is_own, proxied_node, proxied_peer
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits

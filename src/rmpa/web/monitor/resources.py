@@ -1,4 +1,7 @@
-"""The Smart Resources of all modules, from the topics that they publish about themselves."""
+"""Smart Resources on the page, from the topics that they publish about themselves.
+
+The Smart Resources of all modules, from the topics that they publish about themselves.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxies import proxied_peer
+from rmpa.bridge.policy import proxied_peer
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR

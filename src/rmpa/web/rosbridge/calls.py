@@ -1,4 +1,7 @@
-"""Services that a client calls: those of rosapi are answered here, all others by the hub."""
+"""The session of a rosbridge client: publishes, calls and serves.
+
+Services that a client calls: those of rosapi are answered here, all others by the hub.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Messages for a client in the four encodings: JSON, JSON as a PNG, CBOR, and ROS 1 bytes in CBOR (cbor-raw)."""
+"""rosbridge's messages and their four encodings.
+
+Messages for a client in the four encodings: JSON, JSON as a PNG, CBOR, and ROS 1 bytes in CBOR (cbor-raw).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What the parts of a session share: handles, what is to be sent, and status messages."""
+"""Subscriptions of a rosbridge client: throttled, in fragments.
+
+What the parts of a session share: handles, what is to be sent, and status messages.
+"""
 
 from __future__ import annotations
 

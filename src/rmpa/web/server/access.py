@@ -1,4 +1,6 @@
-"""Which requests are served: decisions over a request's headers; no I/O.
+"""Which requests are served: host, origin, token, connections, and the counts of refusals.
+
+Which requests are served: decisions over a request's headers; no I/O.
 
 Three checks, in this order:
 

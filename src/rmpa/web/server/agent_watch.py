@@ -1,4 +1,7 @@
-"""The agent's snapshot, shared by all clients: the agent is asked at most once in ``limits.WEB_SNAPSHOT_AGE``."""
+"""What the server knows of the agent: its snapshot, changes of the graph, and its trust.
+
+The agent's snapshot, shared by all clients: the agent is asked at most once in ``limits.WEB_SNAPSHOT_AGE``.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision, SnapshotDecoder
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
-from rmpa.trust.joining import TrustStatus
+from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
 
 if TYPE_CHECKING:

@@ -1,4 +1,7 @@
-"""The hub of ``rmpa web``: its node joins the core of the agent that the server shows."""
+"""The process ``rmpa web``: its start, its certificate, and the hub on the agent's core.
+
+The hub of ``rmpa web``: its node joins the core of the agent that the server shows.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,7 @@ from rmpa.config.peer_rules import Effect
 from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.ros.node.node import Node
-from rmpa.trust.certificates import server_names
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
 from rmpa.web.gateways.gateways import Gateways
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.core.contract import Contracts
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.joining import TrustStatus
+    from rmpa.trust.permissions import TrustStatus
     from rmpa.trust.store import TrustStore
 
 _DEFAULT_PORT: Final = 8480

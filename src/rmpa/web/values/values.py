@@ -1,4 +1,7 @@
-"""The conversions of one message type, compiled when they are first used and kept for the process."""
+"""Messages as values: read from ROS 1's bytes, compiled for each type.
+
+The conversions of one message type, compiled when they are first used and kept for the process.
+"""
 
 from __future__ import annotations
 

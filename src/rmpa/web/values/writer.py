@@ -1,4 +1,6 @@
-"""Sizes of ROS types on the wire, their ``struct`` codes, and the bounds of a type.
+"""Values as ROS 1's bytes: sizes, layout and bounds of a type.
+
+Sizes of ROS types on the wire, their ``struct`` codes, and the bounds of a type.
 
 ROS 1 is little-endian and unpadded (wiki.ros.org/msg). ``byte`` is an int8 and ``char`` an uint8, as in genpy.
 """

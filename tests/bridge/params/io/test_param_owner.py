@@ -13,7 +13,7 @@ from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import ParamSettings, TrustSettings
 from rmpa.core.errors import PeerRefused
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.bridge.params.io.test_part import Side, join
 
 if TYPE_CHECKING:

@@ -12,12 +12,12 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import LinkTime
+from rmpa.bridge.driver import PeerRpc
 from rmpa.bridge.messages import decode
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
-from rmpa.bridge.rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.core.api import Core
+    from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 

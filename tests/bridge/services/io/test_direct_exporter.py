@@ -14,7 +14,7 @@ from rmpa.bridge.services.direct import DirectServiceExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.bodies import LocalService

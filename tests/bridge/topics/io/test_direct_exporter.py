@@ -21,7 +21,7 @@ from rmpa.core.contract import Contract, Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 from tests.ros.node.peers import until
 
 SOURCE = Source("/chatter", "/talker")

@@ -31,7 +31,7 @@ from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
 from rmpa.core.identity import Guid
-from rmpa.trust.documents import Permissions
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,0 +1,562 @@
+"""What every agent needs of trust, without its library: permissions, refusals, status, hosts of a page.
+
+Decides what another module may do here, by the rules of ``[[permission]]``, and names the rule that decided.
+
+A rule fits if it is about the module (by a glob over its name, or a group) and one of its globs fits the name. A deny
+that fits wins over an allow, whatever the order of the rules; if none fits, ``trust.default`` holds.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect, PermissionRule
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import matches
+from rmpa.core.limits import UINT32_MAX
+from rmpa.trust import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from rmpa.config.settings import TrustSettings
+
+_CLIENT_SENDS: Final = ("goal", "cancel")
+"""An action's topics that its client publishes (wiki.ros.org/actionlib/DetailedDescription)."""
+_SERVER_SENDS: Final = ("status", "feedback", "result")
+"""An action's topics that its server publishes."""
+_ACTION_TOPICS: Final = {
+    (ACTION_CLIENT, Access.PUBLISH): _CLIENT_SENDS,
+    (ACTION_CLIENT, Access.SUBSCRIBE): _SERVER_SENDS,
+    (ACTION_SERVER, Access.PUBLISH): _SERVER_SENDS,
+    (ACTION_SERVER, Access.SUBSCRIBE): _CLIENT_SENDS,
+}
+_DONE: Final = {
+    Access.PUBLISH: "publish",
+    Access.SUBSCRIBE: "subscribe to",
+    Access.CALL: "call",
+    Access.SERVE: "serve",
+    Access.PARAM: "read or set",
+    Access.KILL: "end",
+}
+"""Each access as a verb, for texts."""
+
+
+@dataclass(frozen=True, slots=True)
+class PermissionDecision:
+    """Whether a module may do something here, and the rule that decided.
+
+    Args:
+        allowed: Whether it may.
+        rule: The rule as text: ``[[permission]] 2 denies call of '/motors/**' to '*'``.
+        number: The number of the rule in the file, from 1; ``None``: ``trust.default`` decided.
+    """
+
+    allowed: bool
+    rule: str
+    number: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Pattern:
+    """One glob over names, of one rule, for one module."""
+
+    glob: str
+    effect: Effect
+    number: int
+    text: str
+
+
+class Permissions:
+    """The permissions of other modules in this one.
+
+    Args:
+        settings: The rules, the groups and the default.
+    """
+
+    def __init__(self, settings: TrustSettings) -> None:
+        self._known: dict[str, dict[Access, tuple[_Pattern, ...]]] = {}
+        self.reload(settings)
+
+    def reload(self, settings: TrustSettings) -> None:
+        """Judge by other rules from now on."""
+        self._settings = settings
+        self._groups = {group.name: group.modules for group in settings.groups}
+        self._known.clear()
+
+    @property
+    def direct(self) -> bool:
+        """Whether nodes may connect to those of other machines directly, in plain text (``trust.direct``)."""
+        return self._settings.direct
+
+    def judge(self, access: Access, module: str, name: str) -> PermissionDecision:
+        """Decide whether a module may do something.
+
+        Args:
+            access: What it would do.
+            module: Its name, as its certificate proves it.
+            name: The topic, service, parameter or node, by its name here.
+        """
+        for pattern in self._patterns(module)[access]:
+            if matches(pattern.glob, name):
+                return PermissionDecision(pattern.effect is Effect.ALLOW, pattern.text, pattern.number)
+        if self._settings.default == Effect.ALLOW:
+            return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
+        return PermissionDecision(False, f"no [[permission]] lets {module} {_DONE[access]} {name}")
+
+    def may_relay(self, module: str) -> PermissionDecision:
+        """Decide whether a module may pass on what others offer: the origin that it names cannot be proved."""
+        for glob in self._settings.relays:
+            if matches(glob, module):
+                return PermissionDecision(True, f"trust.relays has {glob!r}")
+        return PermissionDecision(False, f"trust.relays does not have {module}")
+
+    def groups_of(self, module: str) -> tuple[str, ...]:
+        """The groups that a module is in, in the order of the file."""
+        return tuple(name for name, globs in self._groups.items() if _first(globs, module) is not None)
+
+    def _patterns(self, module: str) -> dict[Access, tuple[_Pattern, ...]]:
+        """The globs of the rules about a module, by access, those that deny first."""
+        known = self._known.get(module)
+        if known is None:
+            if len(self._known) >= limits.MODULES_REMEMBERED:
+                self._known.clear()
+            found: dict[Access, list[_Pattern]] = {access: [] for access in Access}
+            for number, rule in enumerate(self._settings.rules, 1):
+                for access, pattern in self._rule_patterns(number, rule, module):
+                    found[access].append(pattern)
+            # sorted() is stable: among denials, and among allowances, the order of the file stays.
+            known = self._known[module] = {
+                access: tuple(sorted(patterns, key=lambda p: p.effect is Effect.ALLOW))
+                for access, patterns in found.items()
+            }
+        return known
+
+    def _rule_patterns(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, _Pattern]]:
+        """The globs of one rule, if it is about a module."""
+        whom = self._fit(rule, module)
+        if whom is None:
+            return
+        verb = "allows" if rule.effect is Effect.ALLOW else "denies"
+        for key, globs in rule.names.items():
+            for written in globs:
+                text = f"[[permission]] {number} {verb} {key} of {written!r} to {whom}"
+                filled = written.replace(PEER, module)
+                if key not in (ACTION_CLIENT, ACTION_SERVER):
+                    yield Access(key), _Pattern(filled, rule.effect, number, text)
+                    continue
+                for access, topic in action_topics(key, filled):
+                    yield access, _Pattern(topic, rule.effect, number, text)
+
+    def _fit(self, rule: PermissionRule, module: str) -> str | None:
+        """Why a rule is about a module, as text; ``None``: it is not."""
+        glob = _first(rule.modules, module)
+        if glob is not None:
+            return repr(glob)
+        for name in rule.groups:
+            if _first(self._groups.get(name, ()), module) is not None:
+                return f"group {name!r}"
+        return None
+
+
+def refusal(access: Access, module: str, name: str, where: str = "there") -> str:
+    """What a refused module is told: that it may not, and nothing of the rules."""
+    return f"the permissions {where} do not let {module} {_DONE[access]} {name}"
+
+
+def prohibition(access: Access, module: str, name: str) -> str:
+    """That a module may not do something: ``arm2 may not publish /cmd_vel``."""
+    return f"{module} may not {_DONE[access]} {name}"
+
+
+def action_topics(key: str, name: str) -> Iterator[tuple[Access, str]]:
+    """The five topics of an action, each with what the other module does with it.
+
+    Args:
+        key: ``ACTION_CLIENT`` if the other module is the client, ``ACTION_SERVER`` if it is the server.
+        name: The action's name, or a glob.
+    """
+    for access in (Access.PUBLISH, Access.SUBSCRIBE):
+        for topic in _ACTION_TOPICS[key, access]:
+            yield access, f"{name.rstrip('/')}/{topic}"
+
+
+def _first(globs: tuple[str, ...], name: str) -> str | None:
+    """The first glob that fits."""
+    return next((glob for glob in globs if matches(glob, name)), None)
+
+
+# How signed documents reach every module: which linked peer lacks which document (docs/design/trust.md).
+#
+# Each module tells a new link the numbers of its documents (``trust.have``); the side with a higher number sends
+# that
+# document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So a
+# document is everywhere after as many trips as the mesh is wide, and in a mesh that was split once it is whole
+# again.
+
+
+class Notice(StrEnum):
+    """The notifications between two agents; the value is their name on the wire."""
+
+    HAVE = "trust.have"
+    """``{"deny": 7, "keys": 3}``: the numbers that the sender has; ``"authority": true`` at the authority."""
+    DENY = "trust.deny"
+    """``{"document": TEXT}``: the signed deny list."""
+    KEYS = "trust.keys"
+    """Likewise: the signed list of group keys."""
+
+
+DOCUMENTS: Final = (Notice.DENY, Notice.KEYS)
+"""The documents in the order in which they are sent: a module that was revoked gets no new key."""
+
+
+class DocumentSpreading:
+    """Knows what each linked peer has.
+
+    Args:
+        number: The number of the document that this module has.
+    """
+
+    def __init__(self, number: Callable[[Notice], int]) -> None:
+        self._number = number
+        self._known: dict[int, dict[Notice, int]] = {}
+
+    def link_up(self, peer: int) -> None:
+        """A peer is linked; it has not said what it has."""
+        self._known[peer] = {}
+
+    def link_down(self, peer: int) -> None:
+        """A peer is not linked any more."""
+        self._known.pop(peer, None)
+
+    def have(self, peer: int, numbers: Mapping[Notice, int]) -> tuple[Notice, ...]:
+        """A peer said what it has; return the documents that it is to be sent."""
+        known = self._known.get(peer)
+        if known is None:
+            return ()
+        for kind, number in numbers.items():
+            known[kind] = max(number, known.get(kind, 0))
+        return self._take(peer, DOCUMENTS)
+
+    def received(self, peer: int, kind: Notice, number: int) -> None:
+        """A peer sent a valid document, so it has it."""
+        known = self._known.get(peer)
+        if known is not None:
+            known[kind] = max(number, known.get(kind, 0))
+
+    def changed(self) -> list[tuple[int, tuple[Notice, ...]]]:
+        """This module has newer documents: each peer that is known to lack some, and which."""
+        return [(peer, lacking) for peer in list(self._known) if (lacking := self._take(peer, DOCUMENTS))]
+
+    def _take(self, peer: int, kinds: tuple[Notice, ...]) -> tuple[Notice, ...]:
+        """The documents that a peer lacks; they count as sent."""
+        known = self._known[peer]
+        lacking = tuple(kind for kind in kinds if kind in known and known[kind] < self._number(kind))
+        for kind in lacking:
+            known[kind] = self._number(kind)
+        return lacking
+
+
+def have_args(number: Callable[[Notice], int], *, is_authority: bool) -> dict[str, Any]:
+    """The arguments of ``trust.have``."""
+    args: dict[str, Any] = {kind.removeprefix("trust."): number(kind) for kind in DOCUMENTS}
+    return args | {"authority": True} if is_authority else args
+
+
+def read_have(args: Mapping[str, Any]) -> tuple[dict[Notice, int], bool]:
+    """The numbers that a peer has, and whether it is the authority.
+
+    Raises:
+        RemoteProtocolError: They are malformed.
+    """
+    numbers = {kind: args.get(kind.removeprefix("trust.")) for kind in DOCUMENTS}
+    checked = {
+        kind: number
+        for kind, number in numbers.items()
+        if isinstance(number, int) and not isinstance(number, bool) and 0 <= number <= UINT32_MAX
+    }
+    if len(checked) != len(numbers):
+        raise RemoteProtocolError("trust.have without the numbers of two documents")
+    return checked, args.get("authority") is True
+
+
+def read_document(args: Mapping[str, Any]) -> bytes:
+    """The document in ``trust.deny`` or ``trust.keys``.
+
+    Raises:
+        RemoteProtocolError: There is none.
+    """
+    text = args.get("document")
+    if not isinstance(text, str):
+        raise RemoteProtocolError("a notification without its document")
+    return text.encode()
+
+
+# The reasons for which a secured mesh refuses a connection: one word each, for wire, counters, commands and logs.
+
+
+class TrustReason(IntEnum):
+    """Why a connection is refused; the numbers continue those of ``mesh.frames.Refusal`` on the wire."""
+
+    PLAIN = 11
+    """The dialler does not use TLS, and this mesh does."""
+    UNSECURED = 12
+    """The acceptor has not joined a secured mesh, and the dialler has."""
+    KEY = 13
+    """The group key of its packets is unknown."""
+    CLOCK = 14
+    """A certificate begins in the future."""
+    FOREIGN = 15
+    """The certificate is of another CA."""
+    EXPIRED = 16
+    """The certificate's time is over."""
+    REVOKED = 17
+    """The certificate is on the deny list."""
+    NAME = 18
+    """The certificate is of another module than the hello says."""
+    DOWNGRADE = 19
+    """The connection does not use TLS 1.3 with this protocol."""
+
+    @property
+    def label(self) -> str:
+        """The word for people and counters: ``expired``."""
+        return self.name.lower()
+
+    @property
+    def remedy(self) -> str:
+        """What to do, as a sentence part."""
+        return _REMEDIES[self]
+
+
+_REMEDIES: Final = {
+    TrustReason.PLAIN: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.UNSECURED: "it joins by rmpa trust join TOKEN, with a token of rmpa trust invite at the authority",
+    TrustReason.KEY: "are both of one mesh? the one that was away for long: rmpa trust renew there",
+    TrustReason.CLOCK: "set both clocks: date, timedatectl",
+    TrustReason.FOREIGN: "they have joined different meshes: rmpa trust join on one, with a token of the other's",
+    TrustReason.EXPIRED: "rmpa trust renew on the module whose certificate it is, while the authority is reachable",
+    TrustReason.REVOKED: "it can come back by rmpa trust invite at the authority, and rmpa trust join there",
+    TrustReason.NAME: "start the module with the name that it joined with, or let it join again",
+    TrustReason.DOWNGRADE: "install the same release of rmpa on both",
+}
+
+
+NOT_OF_THIS_MESH: Final = {
+    TrustReason.PLAIN: "it has joined a secured mesh and this module has not; join it by rmpa trust join TOKEN here, "
+    "with a token of rmpa trust invite at the authority of that mesh",
+    TrustReason.UNSECURED: "it has not joined this secured mesh; let it join by rmpa trust invite at the authority "
+    "and rmpa trust join TOKEN there",
+    TrustReason.FOREIGN: "it has joined another secured mesh; to have both in one, rmpa trust leave and rmpa trust "
+    "join TOKEN there, with a token of the authority here",
+    TrustReason.KEY: "its group key is unknown here; if it has joined another mesh, rmpa trust leave and rmpa trust "
+    "join TOKEN there; if it is of this one, rmpa trust renew here",
+}
+"""Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``."""
+
+
+def not_of_this_mesh(reason: TrustReason) -> str:
+    """``not of this mesh: it has not joined this secured mesh; let it join by …``."""
+    return f"not of this mesh: {NOT_OF_THIS_MESH[reason]}"
+
+
+class TrustError(RemoteProtocolError):
+    """A secured mesh refuses a connection, a certificate or a request.
+
+    Args:
+        reason: The word for it.
+        text: What is wrong.
+    """
+
+    def __init__(self, reason: TrustReason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+# What ``rmpa trust status`` and the other commands show. No part is a secret.
+
+
+class MemberInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """A module that the authority has given a certificate.
+
+    Attributes:
+        name: The module's.
+        issued: When its last certificate was issued, seconds since 1970.
+        expires: When that ends.
+        linked: Whether it is linked with the authority now; ``None``: its agent does not run.
+    """
+
+    name: str
+    issued: int
+    expires: int
+    linked: bool | None = None
+
+
+class TokenInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """A token of the authority.
+
+    Attributes:
+        id: 16 hexadecimal digits; not the token.
+        state: ``open``, ``used`` or ``ended``.
+        expires: Seconds since 1970.
+        name: The module that it is for; empty for any.
+        used_by: The module that joined with it.
+    """
+
+    id: str
+    state: str
+    expires: int
+    name: str = ""
+    used_by: str = ""
+
+
+class TrustStatus(msgspec.Struct, kw_only=True, frozen=True):
+    """The state of one module.
+
+    Attributes:
+        on: Whether this module is a member of a secured mesh.
+        module: Its name.
+        folder: Where its files are; empty if there is no state directory.
+        agent: ``secured``, ``plain`` (it must be started again), or ``off`` if none runs.
+        is_authority: Whether it is the authority.
+        authority: The authority's name, as far as it is known.
+        fingerprint: Of the CA, 32 hexadecimal digits.
+        issued: When its certificate was issued, seconds since 1970.
+        expires: When that ends.
+        renew_at: When it is renewed.
+        clock_set: Whether this machine's clock is set.
+        key: The number of the newest group key.
+        deny_number: The number of the deny list; 0: nothing was ever revoked.
+        revoked: The names on it.
+        members: At the authority: the modules with certificates.
+        tokens: At the authority: its tokens.
+        problems: What the user should do something about, each ready to read.
+    """
+
+    on: bool
+    module: str
+    folder: str = ""
+    agent: str = "off"
+    is_authority: bool = False
+    authority: str = ""
+    fingerprint: str = ""
+    issued: int = 0
+    expires: int = 0
+    renew_at: int = 0
+    clock_set: bool = True
+    key: int = 0
+    deny_number: int = 0
+    revoked: tuple[str, ...] = ()
+    members: tuple[MemberInfo, ...] = ()
+    tokens: tuple[TokenInfo, ...] = ()
+    problems: tuple[str, ...] = ()
+
+
+class InviteReply(msgspec.Struct, kw_only=True, frozen=True):
+    """A new invitation. It is the one reply with a secret, and only goes over the control socket.
+
+    Attributes:
+        token: Its text.
+        id: 16 hexadecimal digits.
+        expires: Seconds since 1970.
+    """
+
+    token: str
+    id: str
+    expires: int
+
+    def __repr__(self) -> str:
+        """Without the token."""
+        return f"InviteReply(id={self.id!r}, expires={self.expires})"
+
+
+class JoinStep(msgspec.Struct, kw_only=True, frozen=True):
+    """What came of a token at the authority.
+
+    Attributes:
+        step: Counts the changes.
+        state: ``waiting``, ``joined`` or ``refused``; a token that was refused may still be used.
+        module: The module that joins.
+        reason: Why it was refused, one word.
+        text: What happened.
+    """
+
+    step: int
+    state: str
+    module: str = ""
+    reason: str = ""
+    text: str = ""
+
+
+class TrustReply(msgspec.Struct, kw_only=True, frozen=True):
+    """What a command has done.
+
+    Attributes:
+        module: The module that it concerns.
+        done: Whether anything has changed.
+        text: What has happened, ready to read.
+        expires: The end of the new certificate, seconds since 1970; 0 if there is none.
+        number: The number of the new deny list or group key; 0 if there is none.
+    """
+
+    module: str
+    done: bool
+    text: str = ""
+    expires: int = 0
+    number: int = 0
+
+
+# The names and addresses by which a module's page is opened: which of them its certificate may have (RFC 9525).
+#
+# Those that follow from the module's name are never another module's. Further ones are asked for. A browser that
+# trusts
+# the mesh's CA is to believe it about no host of the Internet, so these are private addresses, and names of the
+# local
+# network.
+
+
+_LABEL: Final = r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?"
+_LOCAL: Final = re.compile(rf"{_LABEL}|(?:{_LABEL}\.)+(?:local|lan|internal|home\.arpa)")
+"""A name without a dot, or below a domain that is no one's in the Internet (RFC 6762, RFC 8375, ICANN's internal)."""
+_SHARED: Final = ipaddress.IPv4Network("100.64.0.0/10")
+"""Of carriers, and of VPNs such as Tailscale's (RFC 6598)."""
+
+
+def server_names(name: str) -> tuple[str, ...]:
+    """The names that every module's certificate has, besides 127.0.0.1.
+
+    They follow from the module's name and are not asked for, so that no module gets those of another. A host's name
+    has ``-`` where the module's name, which is made of it, has ``_``.
+    """
+    host = name.replace("_", "-").lower()
+    return (host, f"{host}.local", "localhost")
+
+
+def page_hosts(wanted: Iterable[str]) -> tuple[str, ...]:
+    """Of names and addresses those that a certificate may have, in their normal form, at most so many."""
+    found = dict.fromkeys(host for text in wanted if (host := _page_host(text)))
+    return tuple(found)[: limits.PAGE_HOSTS_MAX]
+
+
+def host_names(host_name: str) -> tuple[str, ...]:
+    """The names of a machine in its network: its host's name, whole and short, and that of mDNS."""
+    name = host_name.lower().removesuffix(".")
+    short = name.partition(".")[0]
+    return (name, short, f"{short}.local")
+
+
+def _page_host(text: str) -> str:
+    """The normal form; empty: a certificate may not have it, or has it anyway."""
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        name = text.lower().removesuffix(".")
+        return name if name != "localhost" and _LOCAL.fullmatch(name) else ""
+    special = address.is_loopback or address.is_unspecified or address.is_multicast
+    shared = isinstance(address, ipaddress.IPv4Address) and address in _SHARED
+    return str(address) if (address.is_private or shared) and not special else ""
