@@ -320,11 +320,11 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
         for name, value in SMALL_LIMITS.items():
             module = next(room for room in (core_limits, mesh_limits, bridge_limits) if hasattr(room, name))
             stack.enter_context(mock.patch.object(module, name, value))
-        for where in ("session.proxy_nodes", "io.bridge"):
+        for where in ("proxies", "bridge"):
             stack.enter_context(mock.patch(f"rmpa.bridge.{where}.SlaveNode", Node))
         stack.enter_context(mock.patch("rmpa.bridge.proxies.is_loopback", return_value=False))
         stack.enter_context(mock.patch("rmpa.bridge.topics.local.PublisherConnection", PublisherConnection))
-        for flow in ("export_flow", "import_flow"):
+        for flow in ("export", "reception"):
             wall = SimpleNamespace(time_ns=loop.time_ns)
-            stack.enter_context(mock.patch(f"rmpa.bridge.data.io.{flow}.time", wall))
+            stack.enter_context(mock.patch(f"rmpa.bridge.data.{flow}.time", wall))
         yield
