@@ -218,7 +218,7 @@ def test_the_web_server_is_as_secure_as_the_agent_whatever_their_names(machine: 
     ca = machine.state / "sec/trust/ca.crt"
     token = (machine.state / "sec/web-token").read_text().strip()
     statuses = asyncio.run(_statuses(ca, urlsplit(machine.url()).port or 0, token))
-    assert [("the client web may not" in text) for text in statuses] == [True, True], statuses
+    assert [("web may not" in text) for text in statuses] == [True, True], statuses
     # A browser that knows the CA opens the page by each name and address of this machine.
     addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
     hosts = page_hosts((*host_names(socket.gethostname()), *sorted(addresses)))

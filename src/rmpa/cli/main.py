@@ -478,4 +478,5 @@ def wants_json(arguments: Sequence[str]) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # By its name: in ``__main__`` its classes would exist twice.
+    sys.exit(importlib.import_module("rmpa.cli.main").main())
