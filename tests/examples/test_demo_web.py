@@ -75,7 +75,7 @@ async def test_its_page_shows_the_modules_and_drives_the_robot(tidy: dict[str, s
 async def watch_and_drive(page: Page, demo: Process, env: dict[str, str]) -> None:
     await page.until(lambda: page.modules() == {"pc": "here", "joystick": "up", "velocity": "up", "base": "up"})
     assert page.hello["agent"] == "pc"
-    assert set(page.hello["may"]) == {"call", "drive", "param", "read_params", "resource"}
+    assert set(page.hello["may"]) == {"control", "drive", "view"}
     await page.until(lambda: "base>pc" in page.state["flows"] and "base:/base" in page.state["resources"])
     # Without the module that computes the orders, the joystick of the page gives them.
     with Process([sys.executable, DEMO, "kill", "velocity"], env=env, name="kill velocity") as kill:
