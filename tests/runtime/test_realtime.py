@@ -22,7 +22,7 @@ NOBODY: Final = 65534
 
 CHILD: Final = """
 import json, os, resource, sys, threading
-from rmpa.runtime import realtime
+from rmpa.runtime import process as realtime
 
 def who(tid=0):
     return os.sched_getscheduler(tid) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(tid).sched_priority
