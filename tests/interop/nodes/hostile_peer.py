@@ -129,8 +129,12 @@ def garbage(link: Link) -> None:
 
 
 def unknown_routes(link: Link) -> None:
-    for route in range(10_000):
+    for route in range(1, 10_000):  # 0 carries large requests
         link.send(FrameKind.DATA, struct.pack("<I", 3) + b"abc", route)
+
+
+def no_request(link: Link) -> None:
+    link.send(FrameKind.DATA, struct.pack("<I", 3) + b"abc", 0)
 
 
 def wrong_length(link: Link) -> None:
@@ -190,6 +194,7 @@ def many_nodes(link: Link) -> None:
 ATTACKS: tuple[tuple[Callable[[Link], None], bool | None], ...] = (
     (garbage, False),
     (unknown_routes, True),
+    (no_request, False),
     (wrong_length, False),
     (control(b"[" * 100_000), False),
     (control(b"{" + RNG.randbytes(100_000)), False),
