@@ -116,8 +116,8 @@ def _print_token(invited: InviteReply, module: str | None, *, as_json: bool) -> 
     if as_json:
         print_json(invited)
     else:
-        whom = module or "one module"
-        click.echo(f"for {whom}, valid once, until {date_of(invited.expires)}; run there:", err=True)
+        invitee = module or "one module"
+        click.echo(f"for {invitee}, valid once, until {date_of(invited.expires)}; run there:", err=True)
         named = f" --name {module}" if module else ""
         click.echo(f"rmpa trust join{named} {invited.token}" if sys.stdout.isatty() else invited.token)
     sys.stdout.flush()

@@ -24,7 +24,6 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.messages import with_text
 from rmpa.bridge.params.rules import QUESTIONS as PARAM_REQUESTS
-from rmpa.bridge.policy import OWN_NODE
 from rmpa.config.values import did_you_mean
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import (
@@ -36,7 +35,7 @@ from rmpa.core.errors import (
     StartError,
     UnreachableError,
 )
-from rmpa.core.identity import is_global_name
+from rmpa.core.identity import OWN_NODE, is_global_name
 from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision, ReloadReply
 from rmpa.observe.control_client import NameLock
@@ -120,7 +119,7 @@ class ControlAccess:
 
 
 def control_access(group: str) -> ControlAccess:
-    """Who is served by an agent of this process's user.
+    """Which users an agent of this process's user serves.
 
     Args:
         group: A group's name or number, which this user must be in; empty for none.
@@ -281,7 +280,7 @@ class ControlServer:
                 await writer.wait_closed()
 
     def _wrong_user(self, sock: socket.socket) -> ControlReply | None:
-        """The reply to a client of a user who is not served; ``None``: it is served."""
+        """The refusal for a client whose user is not served; ``None``: it is served."""
         user = peer_credentials(sock)
         if self._access.allows(user):
             return None
@@ -502,7 +501,7 @@ class ControlOperations:
         if fitting:
             raise PeerRefused(self._name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
         similar = did_you_mean(peer, [session.link.name for session in sessions])
-        remedy = "`rmpa peer list` shows who is there, and why one is not linked"
+        remedy = "`rmpa peer list` shows which modules are there, and why one is not linked"
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
 
 

@@ -208,7 +208,7 @@ class SiteAnswerer(Protocol):
     def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Awaitable[Any]:
         """The reply to one of ``QUESTIONS``, which tells ``asker``, a linked module, only what it may have.
 
-        Without ``asker`` this machine's user asks, who may have everything.
+        Without ``asker`` the question is of this machine's user, to which everything is shown.
 
         Raises:
             RmpaError: It cannot be answered; the text says why.

@@ -476,5 +476,5 @@ class SiteParamImports:
                 return ParamAnswer.parse(reply.payload)
             raise PeerRefused(f"{site}/{module}", reply.payload.decode(errors="replace"))
         raise UnreachableError(
-            "gateway", f"site {site} for its module {module}", "`rmpa site info` shows who is there"
+            "gateway", f"site {site} for its module {module}", "`rmpa site info` shows which modules are there"
         )

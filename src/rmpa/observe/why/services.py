@@ -14,7 +14,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import OWN_NODE, Policy, is_own
+from rmpa.bridge.policy import Policy
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.services.exports import ServiceRules
 from rmpa.config import limits as config_limits
@@ -22,7 +22,7 @@ from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.identity import is_global_name
+from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import (
@@ -326,7 +326,7 @@ class TopicEvidence:
         return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
 
     def _permission(self, peer: str, entry: RemoteTopic) -> str:
-        """The rule about who publishes a peer's topic; empty if trust is off."""
+        """The rule about which modules may publish a peer's topic; empty if trust is off."""
         gate = self._bridge.gate
         if not gate.on:
             return ""
@@ -488,7 +488,7 @@ class ServiceEvidence:
         similar = await asyncio.to_thread(did_you_mean, service, {*state.services})
         text = f"no linked peer ({', '.join(linked) or 'there is none'}) provides {service}"
         remedy = (
-            f"did you mean {similar}?" if similar else "`rosservice list` shows what there is, `rmpa peer list` who"
+            f"did you mean {similar}?" if similar else "`rosservice list` and `rmpa peer list` show what there is"
         )
         if own:
             text = f"{own[0]} of this module provides {service}; clients here call it without us"

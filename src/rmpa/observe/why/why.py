@@ -323,7 +323,7 @@ class WhyService:
         state = self._core.state()
         similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
-        remedy = "`rmpa topic list` shows what there is, `rmpa peer list` who"
+        remedy = "`rmpa topic list` shows the topics, `rmpa peer list` the modules"
         remedy = f"did you mean {similar}?" if similar else remedy
         if not linked and (strangers := self._snapshots.build(()).strangers):
             remedy = f"{strangers[0].name} is {strangers[0].last_error}"

@@ -1,4 +1,4 @@
-"""Which nodes live: who is at an address, pings, and the notices of changes to nodes.
+"""Which nodes live: the node at an address, pings, and the notices of changes to nodes.
 
 Finds out which node is at an address: its port may be another node's by now (ros_comm#2018, #2241).
 """

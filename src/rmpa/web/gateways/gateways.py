@@ -475,7 +475,7 @@ class Gateways:
             return await self._serve(request, connection, monitor_limits.REQUEST_MAX + 1)
         await self._hub.settled(limits.SETTLE)
         rights = self._rights
-        # Only who sends data has a use for large messages: what aiohttp gathers of one is kept until its end.
+        # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         if protocol is not None:
             connection = FoxgloveConnection(
                 self._hub, rights, self._priority, address, name=self._name, session_id=self._session_id

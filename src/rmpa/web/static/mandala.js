@@ -181,7 +181,7 @@ function same(key, list) {
   return list;
 }
 
-// The slot of each module: who has one keeps it, and a new one takes the free slot that is farthest from all others.
+// The slot of each module: a module that has one keeps it, and a new one takes the free slot that is farthest from all others.
 // When all are taken the ring gets more; the order around it stays. Slot 0, at the top, is this module's.
 const SLOTS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
 const around = { slots: SLOTS[0], places: new Map() };
