@@ -15,9 +15,9 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.bridge import limits
-from rmpa.bridge.policy import proxied_node
 from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
+from rmpa.core.identity import proxied_node
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api

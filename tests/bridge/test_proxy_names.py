@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.policy import proxied_node, proxy_name, proxy_prefix
-from rmpa.core.identity import Guid, Identity
+from rmpa.core.identity import Guid, Identity, proxied_node, proxy_name, proxy_prefix
 
 BASE = Identity(Guid.of("10.0.0.1", 40001), bytes(16), "base")
 

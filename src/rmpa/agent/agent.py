@@ -18,7 +18,7 @@ from rmpa.agent.trust import AgentTrust, PlainOperations, TrustOperations, open_
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import NodePresence, NodeRequests
 from rmpa.bridge.params.follower import Params
-from rmpa.bridge.policy import OWN_NODE, Needs, Policy, is_own
+from rmpa.bridge.policy import Needs, Policy
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.services.exports import ServiceRules
 from rmpa.bridge.services.part import Services
@@ -26,6 +26,7 @@ from rmpa.config.module_name import core_file
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
+from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.discovery.network import list_interfaces
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlOperations, ControlServer, control_access

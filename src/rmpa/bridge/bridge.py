@@ -13,7 +13,7 @@ from rmpa.bridge.data.reception import DataReceiver
 from rmpa.bridge.driver import PeerRpc
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
-from rmpa.bridge.policy import OWN_NODE, Needs, PermissionGate, Policy, Relay, is_own
+from rmpa.bridge.policy import Needs, PermissionGate, Policy, Relay
 from rmpa.bridge.proxies import Names, ProxyNodes
 from rmpa.bridge.sessions import Part, PeerSessions, guarded
 from rmpa.bridge.topics.part import Topics
@@ -22,7 +22,7 @@ from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import is_global_name, matches
+from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 

@@ -18,7 +18,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, Policy, is_own, proxied_node
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, Policy
 from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.direct import MEASURING
@@ -26,7 +26,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.identity import is_global_name, matches
+from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches, proxied_node
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
 from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes

@@ -16,11 +16,11 @@ from rmpa.config.peer_rules import PEER
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.core.counters import Counters
-from rmpa.core.identity import NEVER_CROSSING, matches
+from rmpa.core.identity import NEVER_CROSSING, is_own, matches
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.bridge.messages import Source
     from rmpa.config.peer_rules import Access
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity
     from rmpa.trust.permissions import Permissions
 
-OWN_NODE: Final = "/rmpa"
-"""The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``."""
 
 BUILT_IN_DENY: Final = NEVER_CROSSING
 """Topics that never cross, each with the reason."""
@@ -44,11 +42,6 @@ class PolicyDecision:
 
     allowed: bool
     rule: str
-
-
-def is_own(node: str) -> bool:
-    """Whether a local node is the agent's own or a proxy."""
-    return node == OWN_NODE or node.startswith(OWN_NODE + "/")
 
 
 class Policy:
@@ -508,40 +501,3 @@ class RelayPaths:
     def _rank(self, known: _Origin, peer: int) -> tuple[int, int, int]:
         guid = self._linked[peer].guid
         return known.ways[peer][1], guid.value if guid is not None else 0, peer
-
-
-# The names of proxies in the local graph.
-
-
-def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
-    """The namespace of one peer's proxies: ``/rmpa/<name>``.
-
-    Args:
-        peer: The peer.
-        taken: Prefixes of other modules. Two modules of one name must not share a prefix, or their proxies would
-            replace each other in the graph.
-    """
-    prefix = f"{OWN_NODE}/{peer.name}"
-    if prefix in taken:
-        address, port = peer.guid.endpoint
-        prefix = f"{prefix}_{address.replace('.', '_')}_{port}"
-    return prefix
-
-
-def proxy_name(prefix: str, node: str) -> str:
-    """The name of a node's proxy: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
-    return prefix + node
-
-
-def proxied_node(name: str) -> tuple[str, str] | None:
-    """The peer's name and the node that a proxy stands for; ``None`` for a node of this module."""
-    if not name.startswith(OWN_NODE + "/"):
-        return None
-    peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
-    return (peer, slash + node) if node else None
-
-
-def proxied_peer(name: str) -> str | None:
-    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
-    proxy = proxied_node(name)
-    return proxy[0] if proxy is not None else None

@@ -22,13 +22,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 from weakref import WeakValueDictionary
 
-from rmpa.bridge.policy import proxy_name, proxy_prefix
 from rmpa.config import limits
 from rmpa.config.peer_rules import PEER
 from rmpa.config.rules import CLOCK
 from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError, StartError
-from rmpa.core.identity import Guid, Identity, matches
+from rmpa.core.identity import Guid, Identity, matches, proxy_name, proxy_prefix
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode

@@ -106,7 +106,7 @@ def _graph(ctx: click.Context) -> Graph:
 
 def _of_peer(name: str, node: str) -> str:
     """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
-    from rmpa.bridge.policy import proxied_peer
+    from rmpa.core.identity import proxied_peer
 
     peer = proxied_peer(node)
     return name if peer is None else f"{peer}:{name}"
@@ -143,7 +143,7 @@ def _services(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _nodes(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.bridge.policy import proxied_node
+    from rmpa.core.identity import proxied_node
 
     for node in _graph(ctx).nodes:
         proxy = proxied_node(node)

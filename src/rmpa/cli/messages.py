@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.bridge.policy import proxied_peer
 from rmpa.cli.options import FiniteRange, GraphOptions, completes, graph_options
 from rmpa.cli.output import (
     Column,
@@ -30,6 +29,7 @@ from rmpa.cli.output import (
 )
 from rmpa.cli.resource import run_stream, run_with_resources, with_node, with_resources
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
+from rmpa.core.identity import proxied_peer
 from rmpa.resource.run.descriptor import TOPIC
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType

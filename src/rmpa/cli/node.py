@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 
-from rmpa.bridge.policy import is_own, proxied_node, proxied_peer
 from rmpa.cli.options import (
     FiniteRange,
     GraphOptions,
@@ -39,6 +38,7 @@ from rmpa.cli.output import (
     warn,
 )
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.identity import is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits

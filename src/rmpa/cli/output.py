@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
-from rmpa.bridge.policy import proxied_node, proxied_peer
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.identity import is_legal_name
+from rmpa.core.identity import is_legal_name, proxied_node, proxied_peer
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.peer_info import CheckLevel
 from rmpa.observe.snapshot import Snapshot

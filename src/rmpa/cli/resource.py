@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.bridge.policy import OUTSIDE_GUID, proxied_node, proxied_peer
+from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, GraphName, print_json, print_table, printable, read_graph, read_name, warn
 from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.identity import proxied_node, proxied_peer
 from rmpa.resource.run.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.policy import proxied_peer
 from rmpa.cli.options import GraphOptions, Selection, completes, graph_options, selection_options, summary
 from rmpa.cli.output import (
     duration,
@@ -28,6 +27,7 @@ from rmpa.cli.output import (
     warn,
 )
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_peer
 from rmpa.observe.why.diagnosis import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 

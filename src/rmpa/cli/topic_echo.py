@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.bridge.policy import proxied_node, proxied_peer
 from rmpa.cli.messages import flatten, pick, shorten, to_text
 from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Graph, GraphName, print_json, read_graph, read_name, require_peer, size, warn_unpublished
@@ -23,6 +22,7 @@ from rmpa.cli.resource import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic import arriving, bandwidth_text, latency_text, origin, rate_text
 from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_node, proxied_peer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,10 +9,13 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Address
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
 from rmpa.core.limits import UINT32_MAX
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
 
 # GUIDs: they identify a peer, and decide which of two peers dials (paper, section 4.2).
 
@@ -313,3 +316,48 @@ class Identity:
     def __str__(self) -> str:
         """``base (10.0.0.1:40001#7)``."""
         return f"{self.name} ({self.guid})"
+
+
+# Names of the agent and of its proxies in the local graph.
+
+OWN_NODE: Final = "/rmpa"
+"""The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``."""
+
+
+def is_own(node: str) -> bool:
+    """Whether a local node is the agent's own or a proxy."""
+    return node == OWN_NODE or node.startswith(OWN_NODE + "/")
+
+
+def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
+    """The namespace of one peer's proxies: ``/rmpa/<name>``.
+
+    Args:
+        peer: The peer.
+        taken: Prefixes of other modules. Two modules of one name must not share a prefix, or their proxies would
+            replace each other in the graph.
+    """
+    prefix = f"{OWN_NODE}/{peer.name}"
+    if prefix in taken:
+        address, port = peer.guid.endpoint
+        prefix = f"{prefix}_{address.replace('.', '_')}_{port}"
+    return prefix
+
+
+def proxy_name(prefix: str, node: str) -> str:
+    """The name of a node's proxy: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
+    return prefix + node
+
+
+def proxied_node(name: str) -> tuple[str, str] | None:
+    """The peer's name and the node that a proxy stands for; ``None`` for a node of this module."""
+    if not name.startswith(OWN_NODE + "/"):
+        return None
+    peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
+    return (peer, slash + node) if node else None
+
+
+def proxied_peer(name: str) -> str | None:
+    """The peer whose node a proxy stands for; ``None`` for a node of this module."""
+    proxy = proxied_node(name)
+    return proxy[0] if proxy is not None else None

@@ -16,11 +16,12 @@ from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OPEN_GATE, Policy, is_outside, is_own, service_place
+from rmpa.bridge.policy import OPEN_GATE, Policy, is_outside, service_place
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.services.exports import ServiceRules
 from rmpa.bridge.topics.local import LocalSources
 from rmpa.core.counters import logged_failure
+from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.trust.permissions import refusal

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Origin, is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OUTSIDE_GUID, OWN_NODE, is_outside
+from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
 from rmpa.bridge.proxies import PeerProxies
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.core.identity import peer_name_problem
+from rmpa.core.identity import OWN_NODE, peer_name_problem
 from rmpa.gateway.foreign import ProxiedService, ProxiedTopic, TopicTap
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, MeshSources, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind

@@ -17,11 +17,12 @@ from rmpa.bridge.data.quality import PeerClockHistory, shown_seconds
 from rmpa.bridge.direct.grants import Want
 from rmpa.bridge.direct.nodes import Condition, unmet_by_contract
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import Policy, PolicyDecision, is_own
+from rmpa.bridge.policy import Policy, PolicyDecision
 from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Transport
+from rmpa.core.identity import is_own
 from rmpa.observe.peer_info import ContractTerm
 from rmpa.observe.snapshot import (
     EventInfo,

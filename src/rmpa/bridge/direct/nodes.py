@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.contract import Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.identity import OWN_NODE
 from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.wire.slave_api import TCPROS, read_bus_info

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem, replaced, too_large
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import overlap
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.identity import peer_name_problem
+from rmpa.core.identity import OWN_NODE, peer_name_problem
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces

@@ -20,10 +20,11 @@ from rmpa.bridge.direct.nodes import (
     unmet_by_trust,
 )
 from rmpa.bridge.direct.paths import Path, Paths
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, is_own
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Transport
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.wire.tcpros import printable

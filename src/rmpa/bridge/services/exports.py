@@ -26,7 +26,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import CataloguePeer, OfferCatalogue, Portion
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, PolicyDecision, is_own, may_have
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, PolicyDecision, may_have
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.services.bodies import (
     EndRoute,
@@ -41,7 +41,7 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import matches
+from rmpa.core.identity import is_own, matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

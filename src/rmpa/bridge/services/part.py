@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import AdvertiseServices, CloseService, OpenService, ServiceClosed, ServiceOpened, Source
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, Policy, is_own, service_place
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, Policy, service_place
 from rmpa.bridge.proxies import Names, ProxyCallbacks
 from rmpa.bridge.services.bodies import (
     EndedService,
@@ -36,6 +36,7 @@ from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState, Serv
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.sessions import Part, PeerState, UnchangedGraph
 from rmpa.core.counters import RefusalLog
+from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.wire.tcpros import printable

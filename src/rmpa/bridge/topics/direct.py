@@ -30,9 +30,10 @@ from rmpa.bridge.direct.nodes import (
 )
 from rmpa.bridge.direct.paths import Interruptions, Path, Paths
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, is_own
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.core.contract import Transport
+from rmpa.core.identity import is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.http.rpc import is_own_name
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind

@@ -19,14 +19,14 @@ from rmpa.bridge.direct.grants import Grants
 from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, unmet_by_contract
 from rmpa.bridge.direct.paths import Interruptions
 from rmpa.bridge.messages import Description, Source
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, Needs, PermissionGate, is_own
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import combine
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import is_type_name
+from rmpa.core.identity import OWN_NODE, is_own, is_type_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind

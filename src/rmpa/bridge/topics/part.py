@@ -19,7 +19,7 @@ from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.nodes import LocalEndpoints
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import Advertise, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy, is_own
+from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.sessions import Part, UnchangedGraph
 from rmpa.bridge.topics.direct import DirectImporter
@@ -31,6 +31,7 @@ from rmpa.bridge.topics.subscribers import MismatchReports, RemoteSubscribers
 from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind

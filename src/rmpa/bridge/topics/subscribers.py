@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import Audience, Mismatch, encode, is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, OWN_NODE, PermissionGate, proxied_node, proxy_name
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.peer_rules import Access
+from rmpa.core.identity import OWN_NODE, proxied_node, proxy_name
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from rmpa.bridge.policy import proxied_peer
 from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check

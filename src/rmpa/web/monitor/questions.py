@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 import msgspec
 
 from rmpa.bridge.nodes import INFO
-from rmpa.bridge.policy import is_own, proxied_node, proxied_peer
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.identity import is_global_name
+from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_peer
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.peers_section import PeerParams, parameters_in

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.policy import proxied_peer
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_peer
 from rmpa.core.limits import KIB
 from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
