@@ -500,6 +500,14 @@ def state_of(**parts: Any) -> bytes:
     return msgspec.msgpack.encode({"format": "rmpa core 1", **parts})
 
 
+def lists(depth: int) -> list[Any]:
+    """A list in a list, so many deep."""
+    value: list[Any] = []
+    for _ in range(depth - 1):
+        value = [value]
+    return value
+
+
 def nested(depth: int) -> dict[str, Any]:
     return {"a": nested(depth - 1)} if depth else {}
 
@@ -521,6 +529,7 @@ def nested(depth: int) -> dict[str, Any]:
         state_of(params={"a": {1: 2}}),
         state_of(params={"a": msgspec.msgpack.Ext(5, b"")}),
         state_of(params=nested(limits.CORE_STATE_DEPTH_MAX)),
+        state_of(params={"a": lists(limits.CORE_STATE_DEPTH_MAX)}),
         b"\x91" * 100_000,
     ],
     ids=lambda data: f"{data[:30]!r}"[:40],
