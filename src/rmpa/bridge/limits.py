@@ -135,7 +135,7 @@ call nothing, so its return is found by these checks."""
 WATCH_RUN: Final = 1.0
 """Losses of one kind that are at most this many seconds apart are remembered as one event."""
 QUALITY_WINDOW: Final = 512
-"""Messages of a remote source from which its figures are computed; a power of two. They take 10 KB a route, and five
+"""Messages of a remote source from which its figures are computed. They take 10 KB a route, and five
 of them lie above the 99th percentile."""
 QUALITY_RATE_SPAN: Final = 1.0
 """Seconds over which a rate is counted where ``QUALITY_WINDOW`` spans less: at 47 kHz it holds one burst of 11 ms."""

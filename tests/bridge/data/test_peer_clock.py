@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.quality import ClockEstimate, PeerClockHistory
+from rmpa.bridge.data.quality import PeerClockHistory
 from rmpa.mesh import limits as mesh_limits
 
 
@@ -14,7 +14,7 @@ def test_estimates_are_kept_in_order() -> None:
     clock = PeerClockHistory()
     for second in range(3):
         clock.add(1.0, 0.01, float(second))
-    assert list(clock) == [ClockEstimate(float(second), 1.0, 0.01) for second in range(3)]
+    assert list(clock.estimates) == [(float(second), 1.0, 0.01) for second in range(3)]
 
 
 def test_a_clock_that_was_set_makes_all_before_void() -> None:
@@ -23,7 +23,7 @@ def test_a_clock_that_was_set_makes_all_before_void() -> None:
     clock.add(1.019, 0.01, 1.0)  # within both bounds
     assert clock.trusted_from < 0
     clock.add(1.5, 0.01, 2.0)
-    assert list(clock) == [ClockEstimate(2.0, 1.5, 0.01)]
+    assert list(clock.estimates) == [(2.0, 1.5, 0.01)]
     assert clock.trusted_from == 2.0
 
 
@@ -31,14 +31,14 @@ def test_drift_is_no_setting() -> None:
     clock = PeerClockHistory()
     clock.add(0.0, 0.0, 0.0)
     clock.add(3600 * mesh_limits.CLOCK_DRIFT, 0.0, 3600.0)
-    assert len(list(clock)) == 2
+    assert len(clock.estimates) == 2
 
 
 def test_better_of_two_near_estimates_is_kept() -> None:
     clock = PeerClockHistory()
     for now, error in ((0.0, 0.01), (0.1, 0.002), (0.2, 0.01), (0.3, 0.001), (1.5, 0.01)):
         clock.add(1.0, error, now)
-    assert [estimate.now for estimate in clock] == [0.0, 0.3, 1.5]
+    assert [now for now, _, _ in clock.estimates] == [0.0, 0.3, 1.5]
 
 
 @given(st.lists(st.floats(0.001, 3.0), max_size=300))
@@ -47,7 +47,7 @@ def test_a_minute_is_remembered_however_often_it_is_told(steps: list[float]) -> 
     for step in steps:
         now += step
         clock.add(0.0, 0.001, now)
-    times = [estimate.now for estimate in clock]
+    times = [now for now, _, _ in clock.estimates]
     assert times == sorted(times)
     assert len(times) <= limits.QUALITY_CLOCKS
     if len(times) == limits.QUALITY_CLOCKS:

@@ -221,7 +221,8 @@ class PeerTopics:
         if flow is not None and outlived:
             flow.contract = contract
             flow.rebind(on_ack)
-            flow.watch.link_up(asyncio.get_running_loop().time())
+            for occurred in flow.watch.link_up(asyncio.get_running_loop().time()):
+                self._on_occurred(source, occurred)
             missed = True
         else:
             if flow is not None:
