@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rmpa.bridge.actions import Action, Disconnect, RemoveRoute, Send
+from rmpa.bridge.context import ServiceRules
 from rmpa.bridge.messages import (
     Advertise,
     Description,
@@ -22,7 +23,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.proxies import Names
 from rmpa.bridge.services.bodies import EndRoute, LocalService, ServiceAbout
-from rmpa.bridge.services.exports import ServiceExports, ServiceRules
+from rmpa.bridge.services.exports import ServiceExports
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports

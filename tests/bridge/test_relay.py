@@ -13,10 +13,11 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
+from rmpa.bridge.context import ServiceRules
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy, Relay, RelayPaths, may_have
 from rmpa.bridge.services.bodies import ExportAction, ImportAction, LocalService, Provide, Withdraw
-from rmpa.bridge.services.exports import ServiceExports, ServiceRules
+from rmpa.bridge.services.exports import ServiceExports
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports

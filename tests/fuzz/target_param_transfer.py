@@ -8,10 +8,10 @@ from typing import Any, cast
 import msgspec
 
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.driver import LargeMessages
 from rmpa.bridge.messages import Message, Request, Response
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
+from rmpa.bridge.rpc import LargeMessages
 from rmpa.core.errors import RmpaError
 from rmpa.ros.master.parameters import leaves
 from tests.bridge.services.io.test_calls import Wire

@@ -18,9 +18,7 @@ from rmpa.agent.trust import AgentTrust, PlainOperations, TrustOperations, open_
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import NodePresence, NodeRequests
 from rmpa.bridge.params.follower import Params
-from rmpa.bridge.policy import Needs, Policy
-from rmpa.bridge.proxies import Names
-from rmpa.bridge.services.exports import ServiceRules
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.services.part import Services
 from rmpa.config.module_name import core_file
 from rmpa.core.contract import Transport
@@ -196,51 +194,17 @@ class Agent:
         self._settings = settings
         clock = SystemClock()
         membership = open_membership(settings, clock)
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
             self.core,
-            policy,
+            settings,
             rng=random.random,
-            contracts=settings.make_contracts(),
-            names=names,
-            relay=settings.relay,
-            limit_settings=settings.limits,
             permissions=Permissions(settings.trust) if membership is not None else None,
         )
-        self.params = Params(
-            self.core,
-            self.bridge.node,
-            self.bridge.rpc,
-            self.bridge.sessions.linked,
-            self.bridge.counters,
-            settings.params,
-            settings.time,
-            settings.limits.params,
-            self.bridge.gate,
-        )
-        rules = ServiceRules(settings.services, policy, names)
-        self.services = Services(
-            self.core,
-            self.bridge.sessions,
-            self.bridge.rpc,
-            self.bridge.relay,
-            rules,
-            settings.limits,
-            self.bridge.counters,
-            self.bridge.gate,
-        )
-        self._nodes = NodeRequests(settings, self.core, self.bridge.rpc, self.bridge.gate)
-        presence = NodePresence(
-            self.core,
-            self.bridge.sessions,
-            self.bridge.rpc,
-            self.bridge.topics,
-            self.services,
-            settings,
-            self._nodes.visible,
-        )
-        twins = TwinWatch(self.core, self.bridge, settings.peers)
+        self.params, self.services = Params(self.bridge), Services(self.bridge)
+        self._nodes = NodeRequests(self.bridge)
+        presence = NodePresence(self.bridge, self.bridge.topics, self.services, self._nodes.visible)
+        twins = TwinWatch(self.bridge)
         for part in (self.params, self.services, presence, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
@@ -275,7 +239,7 @@ class Agent:
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
         self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
         """Answers questions about other sites; a gateway answers them itself."""
-        self.why = WhyService(settings, self.core, self.bridge, self.services, self.snapshots, self.sites)
+        self.why = WhyService(settings.name, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(
             settings.name, self.bridge, self.params, self.snapshots, self._nodes, self.sites
         )
@@ -371,7 +335,7 @@ class Agent:
         if not before.allows_direct:
             self._warn_of_stale_connections()
         logging.getLogger().setLevel(settings.log_level.upper())
-        for part in (self.bridge, self.snapshots, self.why, self._nodes):
+        for part in (self.bridge, self.snapshots):
             part.reload(settings)
         self.reloaded()
 

@@ -9,17 +9,16 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge.context import BridgeContext, Shared
 from rmpa.bridge.data.reception import DataReceiver
-from rmpa.bridge.driver import PeerRpc
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
-from rmpa.bridge.policy import Needs, PermissionGate, Policy, Relay
-from rmpa.bridge.proxies import Names, ProxyNodes
+from rmpa.bridge.policy import Needs, PermissionGate, Relay
+from rmpa.bridge.proxies import ProxyNodes
+from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, guarded
 from rmpa.bridge.topics.part import Topics
 from rmpa.config.peer_rules import Access
-from rmpa.config.settings import LimitSettings
-from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.config.settings import PeerRule, Settings
+    from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
@@ -44,16 +43,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class Bridge:
+class Bridge(Shared):
     """Wires the parts: each gets the sessions of the peers, their messages and the changes of the local graph.
 
     Args:
         core: The local core, started.
-        policy: Decides what may cross.
-        contracts: The contracts of the module's topics.
-        names: Translates names between this module and its peers.
-        relay: Whether this module offers the sources of one peer to others.
-        limit_settings: Bounds what is taken from one peer, and what is offered.
+        settings: What may cross, and how.
         rng: Uniform numbers in [0, 1) for back-off jitter.
         permissions: What each peer may do here; ``None``: the mesh is not secured.
     """
@@ -61,21 +56,18 @@ class Bridge:
     def __init__(
         self,
         core: Core,
-        policy: Policy,
+        settings: Settings,
         *,
         rng: Callable[[], float],
-        contracts: Contracts | None = None,
-        names: Names | None = None,
-        relay: bool = False,
-        limit_settings: LimitSettings | None = None,
         permissions: Permissions | None = None,
     ) -> None:
-        self._core = core
+        self.core = core
+        self.rng = rng
         self.counters = Counters()
         self.gate = PermissionGate(permissions, self.counters)
         """Decides what each peer may do."""
+        self.context = BridgeContext.of(settings, self.gate)
         self.rpc = PeerRpc(self.counters)
-        """The requests and notifications to and from the peers."""
         kills = ProxyKills(self.rpc)
         self.node = SlaveNode(
             OWN_NODE,
@@ -87,7 +79,6 @@ class Bridge:
             on_kill=kills.own,
             taps=lambda: self.topics.outbound.connections,
         )
-        """The agent's own node in the local graph."""
         self.proxy_nodes = ProxyNodes(core, self.counters)
         """Makes the nodes that stand for the nodes of peers."""
         self.receiver = DataReceiver(self.counters, self._sender)
@@ -95,24 +86,8 @@ class Bridge:
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
-        """The sessions of the peers."""
-        self.relay = Relay(enabled=relay)
-        """Which sources of one peer are offered to others."""
-        self.topics = Topics(
-            core,
-            self.node,
-            self.sessions,
-            self.rpc,
-            self.relay,
-            policy,
-            contracts=contracts if contracts is not None else Contracts(),
-            names=names if names is not None else Names(),
-            limit_settings=limit_settings if limit_settings is not None else LimitSettings(),
-            rng=rng,
-            counters=self.counters,
-            gate=self.gate,
-            find=self.proxy_nodes.publication,
-        )
+        self.relay = Relay(enabled=settings.relay)
+        self.topics = Topics(self, find=self.proxy_nodes.publication)
         self.add(self.topics)
         self._reconciler: asyncio.TimerHandle | None = None
 
@@ -129,16 +104,17 @@ class Bridge:
     def reload(self, settings: Settings) -> None:
         """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
         self.gate.reload(settings.trust)
+        self.context = BridgeContext.of(settings, self.gate)
         for part in self._parts:
             with guarded(part):
-                part.reload(settings)
+                part.reload()
 
     async def start(self) -> None:
         """Start the agent's node, the parts and the following of the local graph."""
-        self.node.master_uri = self._core.uri  # only now does the embedded core listen
+        self.node.master_uri = self.core.uri  # only now does the embedded core listen
         await self.node.start()
         await self.proxy_nodes.start()
-        self._core.on_change(self._graph_changed)
+        self.core.on_change(self._graph_changed)
         self._reconcile_later()
         for part in self._parts:
             part.start()
@@ -272,15 +248,11 @@ class TwinWatch(Part):
     """The part of the bridge that knows which peers are twins; it looks each ``limits.RECONCILE_INTERVAL``.
 
     Args:
-        core: The local graph.
-        bridge: Its sessions, topics and requests.
-        rules: The ``[[peer]]`` tables. A peer that one of them names is no twin: the user has decided about it.
+        bridge: The local graph, the sessions, topics and requests.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, rules: tuple[PeerRule, ...]) -> None:
-        self._core = core
+    def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
-        self._rules = rules
         self._clock = SystemClock()
         self._told = RefusalLog(_log, bridge.counters)
         self._state: GraphState | None = None
@@ -298,13 +270,9 @@ class TwinWatch(Part):
         names = self._twins.get(session.peer)
         return twin_text(session.link.name, names) if names else ""
 
-    def reload(self, settings: Settings) -> None:
-        """Take the rules of new settings."""
-        self._rules = settings.peers
-
     def reconcile(self) -> None:
         """Judge all peers again."""
-        state = self._core.state()
+        state = self._bridge.core.state()
         if state is not self._state:
             self._state = state
             self._offered, self._taken = telling(_own(state.publishers)), telling(_own(state.subscribers))
@@ -326,7 +294,7 @@ class TwinWatch(Part):
         if not self._offered or not self._taken or self._is_decided(name):
             self._set(session, ())
             return
-        imports, rename = self._bridge.topics.imports, self._bridge.topics.names.of(name).local_name
+        imports, rename = self._bridge.topics.imports, self._bridge.context.names.of(name).local_name
         offers = imports.offered_by(peer)
         offered_there = frozenset(
             topic
@@ -342,7 +310,9 @@ class TwinWatch(Part):
         self._set(session, twin_names(self._offered, self._taken, offered_there, taken_there))
 
     def _is_decided(self, name: str) -> bool:
-        return any(rule.name != "*" and matches(rule.name, name) for rule in self._rules)
+        """Whether the user has decided about a peer: a ``[[peer]]`` table names it."""
+        rules = self._bridge.context.settings.peers
+        return any(rule.name != "*" and matches(rule.name, name) for rule in rules)
 
     def _set(self, session: PeerSession, names: tuple[str, ...]) -> None:
         before = self._twins.pop(session.peer, ())
@@ -357,7 +327,7 @@ class TwinWatch(Part):
     def _say(self, session: PeerSession) -> None:
         """Tell a peer what nodes here take of what it may publish here, if that has changed."""
         name = session.link.name
-        wire, judge = self._bridge.topics.names.of(name).wire_name, self._bridge.gate.judge
+        wire, judge = self._bridge.context.names.of(name).wire_name, self._bridge.gate.judge
         allowed = (each for each in sorted(self._taken) if judge(Access.PUBLISH, name, each).allowed)
         names = tuple(map(wire, allowed))[: limits.TWIN_NAMES_MAX]
         if session.linked and names != self._said.get(session.peer):

@@ -18,7 +18,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, Policy
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.direct import MEASURING
@@ -39,12 +39,11 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.context import Shared
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
-    from rmpa.config.settings import Settings
-    from rmpa.ros.core.external import Core
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
@@ -61,49 +60,40 @@ class NodePresence(Part):
     """The part of the bridge that tells of nodes and shows those of peers.
 
     Args:
-        core: The local core.
-        sessions: The peers.
-        rpc: Sends and receives the notifications.
+        shared: The core, the peers and the rules. ``limits.nodes`` bounds how many nodes a peer shows, and is told.
         topics: The part with the topics' plans.
         services: The part with the services' plans.
-        settings: The agent's settings: ``limits.nodes`` bounds how many are shown of one peer, and told to it.
         visible: ``(peer) -> nodes``: which nodes a peer may know of.
     """
 
     def __init__(
         self,
-        core: Core,
-        sessions: PeerSessions,
-        rpc: PeerRpc,
+        shared: Shared,
         topics: Topics,
         services: Services,
-        settings: Settings,
         visible: Callable[[str], Collection[str]],
     ) -> None:
-        self._core = core
-        self._sessions = sessions
-        self._rpc = rpc
+        self._shared = shared
+        self._core = shared.core
+        self._sessions = shared.sessions
+        self._rpc = shared.rpc
         self._topics = topics
         self._services = services
-        self._max = settings.limits.nodes
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
         self._visible = visible
         self._told: dict[int, tuple[str, ...]] = {}
         """What each linked peer was told, by the number of its session."""
         self._shown: dict[int, set[str]] = {}
         """The nodes that each peer has told of."""
         self._soon: asyncio.TimerHandle | None = None
-        rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
+        shared.rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
 
     async def close(self) -> None:
         """Tell nothing any more."""
         if self._soon is not None:
             self._soon.cancel()
 
-    def reload(self, settings: Settings) -> None:
-        """Take other rules for peers, and another limit."""
-        self._max = settings.limits.nodes
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
+    def reload(self) -> None:
+        """Tell the peers by the new rules."""
         self._later()
 
     def graph_changed(self, change: GraphChange) -> None:
@@ -155,20 +145,21 @@ class NodePresence(Part):
         for session in self._sessions.linked():
             peer = session.link.name
             visible = self._visible(peer)
-            names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[: self._max])
+            passing = sorted(one for one in nodes if one in visible and self._passes(peer, one))
+            names = tuple(passing[: self._shared.context.settings.limits.nodes])
             if names != self._told.get(session.peer):  # over a new link also that there are none any more
                 self._told[session.peer] = names
                 self._rpc.notify(session, NODES, {"nodes": list(names)})
 
     def _passes(self, peer: str, node: str) -> bool:
         """Whether the rules for a peer let a node's name cross, as they do its topics and services."""
-        return self._policy.judge_for(peer, node, wire=node).allowed
+        return self._shared.context.policy.judge_for(peer, node, wire=node).allowed
 
     # --- of the peers -------------------------------------------------------------------------------------------
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = args.get("nodes")
-        names: list[Any] = told[: self._max] if isinstance(told, list) else [None]
+        names: list[Any] = told[: self._shared.context.settings.limits.nodes] if isinstance(told, list) else [None]
         if not all(isinstance(name, str) and is_crossing_name(name) for name in names):
             raise RemoteProtocolError(f"{NODES} has no list of nodes' names")
         wanted = {name for name in names if self._passes(session.link.name, name)}
@@ -308,24 +299,18 @@ class NodeRequests:
     """Answers the peers' requests about this module's nodes.
 
     Args:
-        settings: The agent's settings.
-        core: The local core.
-        asks: Receives the requests.
-        gate: Decides which nodes each peer may end.
+        shared: The core, the peers and the rules.
     """
 
-    def __init__(self, settings: Settings, core: Core, asks: PeerRpc, gate: PermissionGate = OPEN_GATE) -> None:
-        self._gate = gate
-        self._settings = settings
-        self._core = core
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        self._gate = shared.context.gate
+        self._core = shared.core
+        asks = shared.rpc
         asks.on_request(LIST, self._list, _VISIBLE)
         asks.on_request(INFO, self._info, _VISIBLE)
         asks.on_request(PING, self._ping, _VISIBLE)
         asks.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
-
-    def reload(self, settings: Settings) -> None:
-        """Take new settings."""
-        self._settings = settings
 
     def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         state, peer = self._core.state(), asker.link.name
@@ -406,8 +391,8 @@ class NodeRequests:
         nodes = [node for node in self._core.state().nodes if self._gate.judge(Access.KILL, peer, node).allowed]
         node, uri = self._own(args, nodes)
         who = f"{peer}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
-        here = self._settings.name
-        if not any(matches(glob, node) for glob in self._settings.nodes.kill):
+        here = self._shared.context.settings.name
+        if not any(matches(glob, node) for glob in self._shared.context.settings.nodes.kill):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
             raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
         _log.warning("= %s ends %s", who, node)
@@ -425,7 +410,7 @@ class NodeRequests:
         Raises:
             RmpaError: There is no such node.
         """
-        here = self._settings.name
+        here = self._shared.context.settings.name
         node = args.get("node")
         if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
             raise RmpaError("the question names no node")

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.reception import DataHandler, DataReceiver
     from rmpa.bridge.messages import Message, Origin
     from rmpa.bridge.proxies import ProxyNodes
-    from rmpa.config.settings import Settings
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange, GraphState
     from rmpa.ros.wire.xmlrpc import RosReply
@@ -226,8 +225,8 @@ class Part:
         """
         return False
 
-    def reload(self, settings: Settings) -> None:
-        """Take settings that were read again, as far as they can change in a running agent."""
+    def reload(self) -> None:
+        """Judge again: the settings were read again, and ``Shared.context`` is another one."""
 
     def reconcile(self) -> None:
         """Compare the actual state with the planned one, and mend it; called each ``limits.RECONCILE_INTERVAL``."""

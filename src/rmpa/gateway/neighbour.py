@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Protocol
 
+from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.messages import is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OPEN_GATE, Policy, is_outside, service_place
-from rmpa.bridge.proxies import Names
-from rmpa.bridge.services.exports import ServiceRules
+from rmpa.bridge.policy import OPEN_GATE, is_outside, service_place
 from rmpa.bridge.topics.local import LocalSources
 from rmpa.core.counters import logged_failure
 from rmpa.core.identity import is_own
@@ -254,7 +253,7 @@ class MeshSources:
         self._topics = agent.bridge.topics
         self._services = agent.services
         self._local = LocalSources(agent.core, agent.bridge.relay)
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
+        self._bridge = agent.bridge
         self.known: dict[SourceKey, MeshSource] = {}
         """The sources that were reported."""
         self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
@@ -285,11 +284,6 @@ class MeshSources:
         if self._soon is not None:
             self._soon.cancel()
             self._soon = None
-
-    def reload(self, settings: Settings) -> None:
-        """Take other rules."""
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
-        self.look_at_all()
 
     def changed(self, change: GraphChange) -> None:
         """Have a name examined that was registered or unregistered."""
@@ -358,12 +352,12 @@ class MeshSources:
 
     def _may_cross(self, topic: str, type_name: str, node: str) -> bool:
         known = is_crossing_name(topic) and is_crossing_name(node) and is_crossing_type(type_name)
-        return known and self._policy.judge(topic, type_name, node).allowed
+        return known and self._bridge.context.policy.judge(topic, type_name, node).allowed
 
     def _service(self, service: str) -> Iterable[MeshSource]:
         for node in self._core.state().services.get(service, {}):
             if not is_own(node):
-                if is_crossing_name(service) and self._services.rules.judge(service, node).allowed:
+                if is_crossing_name(service) and self._bridge.context.services.judge(service, node).allowed:
                     yield MeshSource(
                         SourceKind.SERVICE, self._name, self._relay.instance, node, service, _ANY, service, node
                     )
@@ -371,7 +365,7 @@ class MeshSources:
             origin, shown = (self._relay.origin(place := service_place(service, node)), self._relay.source(place))
             if origin is None or shown is None or is_outside(origin):
                 continue
-            if is_crossing_name(service) and self._services.rules.judge(service, origin.node).allowed:
+            if is_crossing_name(service) and self._bridge.context.services.judge(service, origin.node).allowed:
                 remote = self._services.imports.get(shown[0], service)
                 wire = remote.wire if remote is not None else service
                 yield MeshSource(
@@ -390,8 +384,8 @@ class OwnPolicy:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._topics = Policy(settings.policy, settings.peers, settings.time)
-        self._services = ServiceRules(settings.services, self._topics, Names(settings.naming))
+        context = BridgeContext.of(settings)
+        self._topics, self._services = context.policy, context.services
 
     def judge(self, kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
         """Decide whether a source may cross; ``type_name`` counts for topics alone."""

@@ -258,7 +258,7 @@ class AgentGraph(Part):
             proxies=site.proxies,
             serve=serve,
             describe=describe,
-            timeout=self._agent.services.rules.timeout(source.name),
+            timeout=self._bridge.context.services.timeout(source.name),
             taken=lambda: self._module_with(source.name),
             on_closed=lambda: self._hidden(site, key, shown),
         )
@@ -294,10 +294,10 @@ class AgentGraph(Part):
         self._pools.clear()
         await self._node.close()
 
-    def reload(self, settings: Settings) -> None:
+    def reload(self) -> None:
         """Take other rules."""
-        self._sources.reload(settings)
-        self.reloaded(settings)
+        self._sources.look_at_all()
+        self.reloaded(self._bridge.context.settings)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Follow publishers and services that come, go or move."""

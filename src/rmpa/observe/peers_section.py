@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.driver import UNKNOWN_QUESTION
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.discovery import limits as discovery_limits
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity

@@ -53,10 +53,12 @@ class ServicesSection:
     """Reads what the bridge knows of services; changes nothing.
 
     Args:
-        services: The bridge's part.
+        bridge: The agent's.
+        services: Its part for services.
     """
 
-    def __init__(self, services: Services) -> None:
+    def __init__(self, bridge: Bridge, services: Services) -> None:
+        self._bridge = bridge
         self._services = services
 
     def used(self, most: int) -> tuple[Collection[str] | None, int]:
@@ -104,7 +106,7 @@ class ServicesSection:
     def _export(self, service: str, server: LocalService) -> ServiceInfo:
         exports = self._services.exports
         about = exports.about(service)
-        decision = self._services.rules.judge(service, server.node)
+        decision = self._bridge.context.services.judge(service, server.node)
         callers = tuple(sorted(self._services.imports.peer_name(peer) for peer in exports.callers(service)))
         return ServiceInfo(
             name=service,
@@ -114,7 +116,7 @@ class ServicesSection:
             type=about.type if about else "",
             md5=about.md5 if about else "",
             callers=callers,
-            wanted=self._services.rules.transport(service).value,
+            wanted=self._bridge.context.services.transport(service).value,
             direct_callers=tuple(
                 sorted(
                     self._services.imports.peer_name(peer)
@@ -135,7 +137,7 @@ class ServicesSection:
 
     def _import(self, peer: int, remote: RemoteService) -> ServiceInfo:
         shown = self._services.shown(peer, remote.name) if remote.shown else None
-        decision = self._services.rules.judge(remote.name, remote.node)
+        decision = self._bridge.context.services.judge(remote.name, remote.node)
         figures = _figures(shown.stats if shown else None)
         figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem
         return ServiceInfo(
@@ -156,7 +158,7 @@ class ServicesSection:
 
     def _transport(self, peer: int, remote: RemoteService) -> dict[str, Any]:
         """The fields of a peer's service that say by which transport it is called."""
-        wanted = self._services.rules.transport(remote.name).value
+        wanted = self._bridge.context.services.transport(remote.name).value
         if not remote.shown:
             return {"wanted": wanted}
         direct = self._services.direct_imports.answer(peer, remote.name)
@@ -287,8 +289,8 @@ class SnapshotBuilder:
         self._peers = PeersSection(sources.bridge, sources.services, sources.twins)
         self.direct = DirectSection(sources.bridge)
         """What is known of direct transport."""
-        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks, self.direct)
-        self._services = ServicesSection(sources.services)
+        self._topics = TopicsSection(sources.core, sources.bridge, sources.clocks, self.direct)
+        self._services = ServicesSection(sources.bridge, sources.services)
 
     @property
     def endpoint(self) -> EndpointView | None:
@@ -298,7 +300,6 @@ class SnapshotBuilder:
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
         self._settings = settings
-        self._topics.reload(settings)
 
     def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
         """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""

@@ -17,7 +17,7 @@ from rmpa.bridge.data.quality import PeerClockHistory, shown_seconds
 from rmpa.bridge.direct.grants import Want
 from rmpa.bridge.direct.nodes import Condition, unmet_by_contract
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.bridge.policy import PolicyDecision
 from rmpa.bridge.topics.routes import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.routes import RemoteTopic
-    from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
 
 
@@ -228,34 +227,24 @@ class TopicsSection:
     It yields to data between two topics. What it iterates over is a copy, because data may change the routes.
 
     Args:
-        settings: The agent's.
         core: Its ROS core.
         bridge: Its bridge.
         clocks: Those of its peers.
         direct: Reads what is known of direct transport.
     """
 
-    def __init__(
-        self, settings: Settings, core: Core, bridge: Bridge, clocks: PeerClocks, direct: DirectSection
-    ) -> None:
+    def __init__(self, core: Core, bridge: Bridge, clocks: PeerClocks, direct: DirectSection) -> None:
         self._core = core
         self._clocks = clocks
         self._bridge = bridge
         self._direct = direct
         self._clock = SystemClock()
-        self.reload(settings)
-
-    def reload(self, settings: Settings) -> None:
-        """Use other settings from now on."""
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
-        self._contracts = settings.make_contracts()
-        self._follow = settings.time.follow
 
     def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
         """The terms of a topic's contract by the settings, by key."""
         return {
             key: ContractTerm(value=cast("str | float | None", value), rule=rule)
-            for key, (value, rule) in self._contracts.explain(topic, type_name).items()
+            for key, (value, rule) in self._bridge.context.contracts.explain(topic, type_name).items()
         }
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
@@ -325,9 +314,10 @@ class TopicsSection:
 
     def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
         """Whether a topic of this module may cross."""
-        decision = self._policy.judge(name, type_name, node)
-        if name == CLOCK and self._follow and not decision.allowed:
-            text = f'time.follow = "{self._follow}": that module\'s comes here; one of this module stays home'
+        decision = self._bridge.context.policy.judge(name, type_name, node)
+        follow = self._bridge.context.settings.time.follow
+        if name == CLOCK and follow and not decision.allowed:
+            text = f'time.follow = "{follow}": that module\'s comes here; one of this module stays home'
             return PolicyDecision(True, text)
         return decision
 
@@ -366,12 +356,12 @@ class TopicsSection:
             dropped=publication.dropped if publication is not None else 0,
             lost=past.lost if past is not None else 0,
             latched=latched,
-            contract=_contract(entry.contract or self._contracts.of(source.topic, entry.type)),
+            contract=_contract(entry.contract or self._bridge.context.contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
             limit="nodes" if entry.crowded else "",
             **_events(flow.watch if flow is not None else past, now),
         )
-        own = self._contracts.of(entry.topic, entry.type)
+        own = self._bridge.context.contracts.of(entry.topic, entry.type)
         info = self._direct.inbound(info, at.peer, source, own, now)
         if flow is None:
             return info
@@ -434,7 +424,7 @@ class TopicsSection:
             latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",
             lane=sender.lane if sender is not None else "",
-            contract=_contract(contract or self._contracts.of(source.topic, local.type)),
+            contract=_contract(contract or self._bridge.context.contracts.of(source.topic, local.type)),
         )
         if flow is None:
             return info

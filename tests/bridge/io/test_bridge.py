@@ -10,10 +10,9 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.messages import Advertise, AdvertiseServices, TopicOffer, encode, op_of
-from rmpa.bridge.policy import Policy
 from rmpa.bridge.sessions import Part
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import PolicySettings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ class Core:
 
 @pytest.fixture
 async def bridge(monkeypatch: pytest.MonkeyPatch) -> Bridge:
-    made = Bridge(cast("RosCore", Core()), Policy(PolicySettings()), rng=lambda: 0.5)
+    made = Bridge(cast("RosCore", Core()), Settings(), rng=lambda: 0.5)
     session = SimpleNamespace(peer=1)
     monkeypatch.setattr(made.sessions, "of", lambda link: session if link is LINK else None)
     return made

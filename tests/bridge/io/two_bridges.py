@@ -11,10 +11,8 @@ from unittest import mock
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.bridge import Bridge
-from rmpa.bridge.policy import Policy
-from rmpa.config.settings import PolicySettings
+from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
-from rmpa.core.contract import Contracts
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.links import LinkEnd
@@ -75,8 +73,8 @@ class Side:
         instance = bytes([self._number, self._runs]) * 8
         self.identity = Identity(Guid.of(f"10.0.0.{self._number}", 1000), instance, self.name)
         self.core = Core(self)
-        core, contracts = cast("RosCore", self.core), Contracts(self._rules)
-        self.bridge = Bridge(core, Policy(PolicySettings()), rng=self._rng.random, contracts=contracts)
+        settings = Settings(contracts=self._rules)
+        self.bridge = Bridge(cast("RosCore", self.core), settings, rng=self._rng.random)
 
     @property
     def attached(self) -> Iterator[PeerSession]:

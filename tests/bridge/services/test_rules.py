@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.bridge.context import ServiceRules
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.proxies import Names
-from rmpa.bridge.services.exports import ServiceRules
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceRule, ServiceSettings
 from rmpa.core.contract import Transport
 

@@ -4,7 +4,7 @@ import runpy
 import sys
 from typing import Any
 
-from rmpa.bridge.driver import PeerRpc
+from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.topics.direct import DirectImporter
 
 DirectImporter.kind = "earlier"  # what nobody asks for is not answered

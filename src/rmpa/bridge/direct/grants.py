@@ -22,7 +22,7 @@ from rmpa.core.errors import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.core.counters import Counters
 

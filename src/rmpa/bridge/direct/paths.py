@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct.grants import DirectAsk, Want, read_want, write
 from rmpa.bridge.direct.nodes import NO_LINK, Condition, Grant, Unmet, read_reply
-from rmpa.bridge.driver import UNKNOWN_QUESTION
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.core.contract import Contract
     from rmpa.core.counters import Counters

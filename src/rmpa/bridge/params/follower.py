@@ -11,9 +11,8 @@ from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
 from rmpa.bridge.params.rules import Following, ParamPolicy, follow_rules, learn
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
-from rmpa.config import limits as config_limits
 from rmpa.config.rules import SIM_TIME
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
@@ -21,12 +20,11 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.context import Shared
     from rmpa.bridge.params.rules import Followed
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
-    from rmpa.ros.core.external import Core
-    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.config.settings import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -299,32 +297,17 @@ class Params(Part):
     """The part of the bridge for parameters.
 
     Args:
-        core: The local core.
-        node: The agent's own node, which the core notifies of changes.
-        rpc: Carries the requests between the modules.
-        linked: Returns the sessions of the peers that are linked now.
-        counters: Counts ``param.put_back``, ``param.refused``, ``param.failed`` and ``param.two_owners``.
-        params: What peers may do, and what is followed.
-        time: Whether time is shared, and which peer's is followed.
-        followed_max: How many parameters one peer may follow here.
-        gate: Decides what each peer may do.
+        shared: The core, the peers and the rules.
     """
 
-    def __init__(
-        self,
-        core: Core,
-        node: SlaveNode,
-        rpc: PeerRpc,
-        linked: Callable[[], Iterable[PeerSession]],
-        counters: Counters,
-        params: ParamSettings,
-        time: TimeSettings,
-        followed_max: int = config_limits.FOLLOWED_MAX,
-        gate: PermissionGate = OPEN_GATE,
-    ) -> None:
-        self._core = ParamCore(core, node)
-        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, followed_max, gate)
-        self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        settings, rpc = shared.context.settings, shared.rpc
+        params, time, most, gate = settings.params, settings.time, settings.limits.params, shared.context.gate
+        self._core = ParamCore(shared.core, shared.node)
+        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, most, gate)
+        rules = follow_rules(params, time)
+        self._follower = ParamFollower(self._core, rpc, shared.sessions.linked, rules, shared.counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
 
@@ -338,8 +321,9 @@ class Params(Part):
         found = (e for e in self._follower.following if e.problem and e.peer is not None)
         return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
 
-    def reload(self, settings: Settings) -> None:
+    def reload(self) -> None:
         """Apply other settings; parameters that they do not affect are not touched."""
+        settings = self._shared.context.settings
         params, time = settings.params, settings.time
         self._server.policy = ParamPolicy(params, time)
         self._server.followed_max = settings.limits.params

@@ -29,8 +29,8 @@ from rmpa.trust.permissions import refusal
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.params.rules import ParamPolicy
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode

@@ -32,10 +32,11 @@ from rmpa.ros.wire.tcpros import printable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rmpa.bridge.context import ServiceRules
     from rmpa.bridge.direct.grants import DirectAsk
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.bodies import LocalService
-    from rmpa.bridge.services.exports import RemoteService, ServiceExports, ServiceRules
+    from rmpa.bridge.services.exports import RemoteService, ServiceExports
     from rmpa.bridge.services.imports import ServiceImports
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.core.counters import Counters

@@ -26,8 +26,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import CataloguePeer, OfferCatalogue, Portion
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, PolicyDecision, may_have
-from rmpa.bridge.proxies import Names
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, may_have
 from rmpa.bridge.services.bodies import (
     EndRoute,
     ExportAction,
@@ -37,19 +36,15 @@ from rmpa.bridge.services.bodies import (
     ServeRoute,
     ServiceAbout,
 )
-from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import is_own, matches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from rmpa.bridge.context import ServiceRules
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.policy import Policy
-    from rmpa.config.settings import ServiceRule, ServiceSettings
-    from rmpa.core.contract import Transport
 
 
 # One service of one peer, and the states in which it can be called or not. Pure.
@@ -107,106 +102,6 @@ class RemoteService:
     about: ServiceAbout | None = None
     problem: str = ""
     origin: Origin | None = None
-
-
-# Which services may cross, their names at a peer and here, the time-out of a call and its path. Without I/O.
-
-
-OWN_SERVICES: Final = "/rmpa/**"
-LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
-"""Every node has these two services; if they crossed, they would double the graph for no use."""
-
-
-class ServiceRules:
-    """Judges and names services.
-
-    Args:
-        settings: ``[services]`` and ``[[service]]``.
-        policy: For what ``[[peer]]`` allows; the rules of topics do not apply to services.
-        names: For what ``[[peer]]`` renames.
-    """
-
-    def __init__(self, settings: ServiceSettings, policy: Policy, names: Names | None = None) -> None:
-        self._settings = settings
-        self._policy = policy
-        self._names = names if names is not None else Names()
-
-    def judge(self, service: str, node: str) -> PolicyDecision:
-        """Decide whether a service may cross at all.
-
-        The built-in rules go first, then ``services.deny``, then ``services.allow``; what no glob fits may not cross.
-
-        Args:
-            service: Its name in the local graph.
-            node: The node that provides it.
-        """
-        settings = self._settings
-        if is_own(node):
-            return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
-        if matches(OWN_SERVICES, service):
-            return PolicyDecision(False, "built in: the agent's own services stay home")
-        if not settings.loggers and any(matches(pattern, service) for pattern in LOGGERS):
-            return PolicyDecision(
-                False, "built in: a node's log is set at home; services.loggers = true lets it cross"
-            )
-        for pattern in settings.deny:
-            if matches(pattern, service):
-                return PolicyDecision(False, f"services.deny has {pattern!r}")
-        for pattern in settings.allow:
-            if matches(pattern, service):
-                return PolicyDecision(True, f"services.allow has {pattern!r}")
-        return PolicyDecision(False, f"no glob of services.allow fits {service}")
-
-    def judge_for(self, peer: str, service: str, wire: str) -> PolicyDecision:
-        """Decide whether a service that ``judge`` allows may cross between this module and one peer.
-
-        Args:
-            peer: The peer's name.
-            service: The service's name in the local graph.
-            wire: Its name on the wire.
-        """
-        return self._policy.judge_for(peer, service, wire=wire)
-
-    def local_name(self, peer: str, wire: str) -> str:
-        """The name in the local graph of a service that a peer offers as ``wire``."""
-        return self._names.local_name(peer, wire)
-
-    def wire_name(self, peer: str, service: str) -> str:
-        """The name on the wire, to this peer, of a service of this module."""
-        return self._names.wire_name(peer, service)
-
-    def own_name(self, peer: str, wire: str) -> str:
-        """The name in the local graph of a service of this module that this peer knows as ``wire``."""
-        return next(iter(self._names.of(peer).locals_of(wire)), wire)
-
-    def timeout(self, service: str) -> float:
-        """The time-out of a call of a service, in seconds.
-
-        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
-        ``[services]``.
-        """
-        said = (rule.timeout for rule in self._fitting(service) if rule.timeout is not None)
-        return next(said, self._settings.timeout)
-
-    def has_timeout(self, service: str) -> bool:
-        """Whether a service has another time-out than the built-in one.
-
-        Only agents keep time-outs: a call from node to node has none.
-        """
-        return self.timeout(service) != config_limits.SERVICE_TIMEOUT
-
-    def transport(self, service: str) -> Transport:
-        """The path of a service's calls that this module wants.
-
-        It is that of the first ``[[service]]`` that fits the service's name and says one, else that of
-        ``[services]``.
-        """
-        said = (rule.transport for rule in self._fitting(service) if rule.transport is not None)
-        return next(said, self._settings.transport)
-
-    def _fitting(self, service: str) -> Iterator[ServiceRule]:
-        """The rules ``[[service]]`` that fit a service, in order."""
-        return (rule for rule in self._settings.rules if any(matches(pattern, service) for pattern in rule.names))
 
 
 @dataclass(slots=True)

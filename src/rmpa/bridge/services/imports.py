@@ -54,8 +54,8 @@ from rmpa.core.identity import Guid
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
+    from rmpa.bridge.context import ServiceRules
     from rmpa.bridge.offers import Change
-    from rmpa.bridge.services.exports import ServiceRules
 
 
 @dataclass(slots=True, kw_only=True)

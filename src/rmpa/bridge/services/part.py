@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import AdvertiseServices, CloseService, OpenService, ServiceClosed, ServiceOpened, Source
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate, Policy, service_place
-from rmpa.bridge.proxies import Names, ProxyCallbacks
+from rmpa.bridge.policy import Needs, service_place
+from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.services.bodies import (
     EndedService,
     ExportAction,
@@ -32,7 +32,7 @@ from rmpa.bridge.services.bodies import (
 )
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving, description_of
 from rmpa.bridge.services.direct import DirectServiceExporter, DirectServiceImporter
-from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState, ServiceRules
+from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.sessions import Part, PeerState, UnchangedGraph
 from rmpa.core.counters import RefusalLog
@@ -45,13 +45,9 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.context import Shared
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.policy import Relay
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
-    from rmpa.config.settings import LimitSettings, Settings
-    from rmpa.core.counters import Counters
-    from rmpa.ros.core.external import Core
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -95,39 +91,21 @@ class Services(Part):
     """Both directions of services, for all peers.
 
     Args:
-        core: The local core.
-        sessions: The peers' sessions.
-        rpc: Carries notifications to and from the peers.
-        relay: Offers the services of one peer to others.
-        rules: What may cross, under which names, and for how long.
-        limit_settings: How much is taken of one peer, and how much is offered.
-        counters: Counts what happens, by name.
-        gate: Decides what each peer may do.
+        shared: The core, the peers and the rules.
     """
 
     advertisement = "services"
 
-    def __init__(
-        self,
-        core: Core,
-        sessions: PeerSessions,
-        rpc: PeerRpc,
-        relay: Relay,
-        rules: ServiceRules,
-        limit_settings: LimitSettings,
-        counters: Counters,
-        gate: PermissionGate = OPEN_GATE,
-    ) -> None:
-        self._limit_settings = limit_settings
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        core, sessions, rpc, counters = shared.core, shared.sessions, shared.rpc, shared.counters
+        rules, limit_settings, gate = shared.context.services, shared.context.settings.limits, shared.context.gate
         self._core = core
         self._sessions = sessions
         self._rpc = rpc
-        self._relay = relay
-        self.rules = rules
-        """What may cross; read by snapshots too."""
-        self.exports = ServiceExports(rules, self._limit_settings, gate)
+        self.exports = ServiceExports(rules, limit_settings, gate)
         """The outbound plan; read by snapshots too."""
-        self.imports = ServiceImports(rules, self._limit_settings, gate)
+        self.imports = ServiceImports(rules, limit_settings, gate)
         """The inbound plan; read by snapshots too."""
         self.make_room: Callable[[str], None] = lambda _: None
         """Called with a service whose name a node has already: a gateway's node of another site leaves it."""
@@ -188,20 +166,11 @@ class Services(Part):
         """Set whether this module reaches another one outside the mesh; see ``ServiceImports.reached_here``."""
         self._act(self.imports.reached_here(instance, reached=reached))
 
-    def reload(self, settings: Settings) -> None:
-        """Apply other settings."""
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
-        self._limit_settings = settings.limits
-        self.apply_rules(ServiceRules(settings.services, policy, names))
-
-    def apply_rules(self, rules: ServiceRules) -> None:
-        """Replace the rules; services that they do not affect stay shown and open."""
-        self.rules = rules
+    def reload(self) -> None:
+        """Judge by the new rules; services that they do not affect stay shown and open."""
+        rules, limit_settings = self._shared.context.services, self._shared.context.settings.limits
         self._driver.rejudge(
-            chain(
-                self.exports.apply_rules(rules, self._limit_settings),
-                self.imports.apply_rules(rules, self._limit_settings),
-            )
+            chain(self.exports.apply_rules(rules, limit_settings), self.imports.apply_rules(rules, limit_settings))
         )
         self.direct_exports.reload(rules)
         self.direct_imports.reload(rules)
@@ -232,7 +201,7 @@ class Services(Part):
         peer, link = session.peer, session.link
         self._budgets[peer] = Budgets()
         instance = link.identity.instance.hex()
-        self.imports.ways.instance = self._relay.instance
+        self.imports.ways.instance = self._shared.relay.instance
         self._act(self.imports.link_up(peer, link.name, link.guid.value, instance))
         self._act(self.exports.link_up(peer, link.name, instance))
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
@@ -362,7 +331,7 @@ class Services(Part):
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """The server of a service that is relayed for another module; ``None`` if there is none."""
         for node, uri in providers.items():
-            if (origin := self._relay.origin(service_place(service, node))) is not None:
+            if (origin := self._shared.relay.origin(service_place(service, node))) is not None:
                 return LocalService(node, uri, origin)
         return None
 
@@ -402,7 +371,7 @@ class Services(Part):
         origin = remote.origin if remote is not None else None
         name = self._sessions.proxy_name(session, action.node, origin)
         source, place = Source(f"service {action.service}", action.node), service_place(action.service, name)
-        self._relay.pass_on(session.peer, session.link.identity, source, place, origin)
+        self._shared.relay.pass_on(session.peer, session.link.identity, source, place, origin)
         shown = self._shown[action.peer, action.service] = ShownService(
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
         )
@@ -420,7 +389,7 @@ class Services(Part):
             proxy.name,
             lambda call: self._call(shown, call),
             lambda: self._describe(shown),
-            timeout=self.rules.timeout(shown.service),
+            timeout=self._shared.context.services.timeout(shown.service),
             on_mismatch=lambda fields, text: self._mismatched(shown, fields, text),
         )
         proxy.add_service(shown.endpoint)
@@ -444,7 +413,7 @@ class Services(Part):
         return any(node != proxy.name for node in self._core.state().services.get(shown.service, {}))
 
     def _withdraw(self, action: Withdraw) -> None:
-        self._relay.gone(action.peer, Source(f"service {action.service}", action.node))
+        self._shared.relay.gone(action.peer, Source(f"service {action.service}", action.node))
         shown = self._shown.pop((action.peer, action.service), None)
         if shown is None:
             return

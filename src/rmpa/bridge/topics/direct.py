@@ -45,7 +45,7 @@ from rmpa.ros.wire.xmlrpc import RosReply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import PeerTopics

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.direct.grants import DirectAsk, Want
     from rmpa.bridge.direct.nodes import LocalEndpoints
-    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.policy import Relay
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.exports import Exports
     from rmpa.core.contract import Contracts

@@ -19,8 +19,7 @@ from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.nodes import LocalEndpoints
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import Advertise, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy
-from rmpa.bridge.proxies import Names
+from rmpa.bridge.policy import LinkedPeer
 from rmpa.bridge.sessions import Part, UnchangedGraph
 from rmpa.bridge.topics.direct import DirectImporter
 from rmpa.bridge.topics.exports import Exports
@@ -28,7 +27,7 @@ from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import DirectExporter, LocalSources, LocalSubscriptions
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
 from rmpa.bridge.topics.subscribers import MismatchReports, RemoteSubscribers
-from rmpa.core.contract import Contracts, Priority
+from rmpa.core.contract import Priority
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
@@ -40,18 +39,13 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from rmpa.bridge.context import Shared
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.data.route import ReceptionHistory
-    from rmpa.bridge.driver import PeerRpc
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.policy import Relay
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
-    from rmpa.config.settings import LimitSettings, Settings
-    from rmpa.core.counters import Counters
-    from rmpa.ros.core.external import Core
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
 
@@ -60,52 +54,25 @@ class Topics(Part):
     """The topics of all peers, in both directions.
 
     Args:
-        core: The local core.
-        node: The agent's own node, which subscribes to what peers want.
-        sessions: The peers.
-        rpc: Sends and receives notifications.
-        relay: Offers the sources of one peer to others.
-        policy: Decides which sources may cross.
-        contracts: The contracts of this module's topics.
-        names: Translates names between this module and its peers.
-        limit_settings: Bounds what is taken from one peer, and what is offered.
-        rng: Uniform numbers in [0, 1) for back-off jitter.
-        counters: Counts what happens, by name.
-        gate: Decides what each peer may do.
+        shared: The core, the peers and the rules.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process; see ``LocalSubscriptions``.
     """
 
     advertisement = "advertise"
 
-    def __init__(
-        self,
-        core: Core,
-        node: SlaveNode,
-        sessions: PeerSessions,
-        rpc: PeerRpc,
-        relay: Relay,
-        policy: Policy,
-        *,
-        contracts: Contracts,
-        names: Names,
-        limit_settings: LimitSettings,
-        rng: Callable[[], float],
-        counters: Counters,
-        gate: PermissionGate = OPEN_GATE,
-        find: Callable[[str, str, str], Publication | None] = lambda *_: None,
-    ) -> None:
+    def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
+        self._shared = shared
+        core, sessions, rpc, counters = shared.core, shared.sessions, shared.rpc, shared.counters
+        context = shared.context
+        policy, contracts, names, gate = context.policy, context.contracts, context.names, context.gate
         self._core = core
-        self._sessions = sessions
-        self._relay = relay
         self._counters = counters
-        self.names = names
-        """Translates names between this module and its peers; replaced by ``reload``."""
         self._peers: dict[int, PeerTopics] = {}
-        self.imports = Imports(policy, rng, contracts, self._position, names, limit_settings, gate)
+        self.imports = Imports(policy, shared.rng, contracts, self._position, names, context.settings.limits, gate)
         """The inbound plan."""
         self.outbound = LocalSubscriptions(
             core,
-            node,
+            shared.node,
             on_described=lambda source, description: self._act(self.exports.described(source, description)),
             on_lost=lambda source, reason, lasts: self._act(self.exports.lost(source, reason, lasts)),
             on_given_up=self._given_up,
@@ -117,7 +84,7 @@ class Topics(Part):
             find=find,
         )
         """The subscriptions to local publishers, and the routes to the peers."""
-        self.exports = Exports(policy, contracts, names, limit_settings, self.outbound.numbering, gate)
+        self.exports = Exports(policy, contracts, names, context.settings.limits, self.outbound.numbering, gate)
         """The outbound plan."""
         refusals = RefusalLog(_log, counters)
         self._driver: GraphDriver[act.Action, Advertise] = GraphDriver(
@@ -157,7 +124,7 @@ class Topics(Part):
             gate=gate,
         )
         """Direct connections of local nodes to peers' publishers."""
-        self._local = LocalSources(core, relay, lambda source: self.exports.description(source) is not None)
+        self._local = LocalSources(core, shared.relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None
         self._closed = False
 
@@ -195,13 +162,12 @@ class Topics(Part):
         """Set whether this module reaches another one outside the mesh; see ``Imports.reached_here``."""
         self._act(self.imports.reached_here(instance, reached=reached))
 
-    def reload(self, settings: Settings) -> None:
+    def reload(self) -> None:
         """Takes new settings; sources and routes that they do not change go on untouched."""
-        policy, contracts = Policy(settings.policy, settings.peers, settings.time), settings.make_contracts()
-        self.names = Names(settings.naming)
-        limit_settings, now = settings.limits, asyncio.get_running_loop().time()
-        self._act(self.exports.apply_rules(policy, contracts, self.names, limit_settings))
-        self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, limit_settings))
+        context, now = self._shared.context, asyncio.get_running_loop().time()
+        policy, contracts, names, limits = context.policy, context.contracts, context.names, context.settings.limits
+        self._act(self.exports.apply_rules(policy, contracts, names, limits))
+        self._driver.rejudge(self.imports.apply_rules(policy, contracts, names, now, limits))
         self.direct_exports.reload(contracts)
         self.direct_imports.reload(contracts)
         self._look_at_all()
@@ -214,7 +180,7 @@ class Topics(Part):
             self.outbound.back(peer)
         else:
             self._begin(session)
-        self.imports.ways.instance = self._relay.instance
+        self.imports.ways.instance = self._shared.relay.instance
         linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
         self._act(self.imports.link_up(peer, identity.name, linked))
         self._act(self.exports.link_up(peer, identity.name, linked.instance))
@@ -289,7 +255,7 @@ class Topics(Part):
         # The actions are not carried out: closing the proxies does the same at once.
         self._driver.free(self.imports.link_down(peer))
         self._driver.gone(session)
-        self._relay.peer_gone(peer)
+        self._shared.relay.peer_gone(peer)
         self._act(self.imports.unlinked(peer))
         topics.close()
 
@@ -430,12 +396,12 @@ class Topics(Part):
             case act.RemoveRoute():
                 self._subscribers.route_over(action.peer, action.source)
                 self.outbound.remove_route(action)
-                session = self._sessions.get(action.peer)
+                session = self._shared.sessions.get(action.peer)
                 if session is not None and session.linked:
                     session.link.close_route(action.route)
 
     def _add_route(self, action: act.AddRoute) -> None:
-        session = self._sessions.get(action.peer)
+        session = self._shared.sessions.get(action.peer)
         if session is None:
             return
         try:
@@ -450,19 +416,19 @@ class Topics(Part):
                 self._act(self.exports.given_up(action.source, action.peer))
 
     def _do_inbound(self, action: act.Incoming) -> None:
-        session, topics = self._sessions.get(action.peer), self._peers.get(action.peer)
+        session, topics = self._shared.sessions.get(action.peer), self._peers.get(action.peer)
         if session is None or topics is None:
             return
         match action:
             case act.Publish():
                 source = action.source
-                name = self._sessions.proxy_name(session, source.node, action.origin)
+                name = self._shared.sessions.proxy_name(session, source.node, action.origin)
                 place = (action.topic or source.topic, name)
-                self._relay.pass_on(session.peer, session.link.identity, source, place, action.origin)
+                self._shared.relay.pass_on(session.peer, session.link.identity, source, place, action.origin)
                 topics.publish(action)
                 self.direct_imports.shown(action.peer, source)
             case act.Retract():
-                self._relay.gone(action.peer, action.source)
+                self._shared.relay.gone(action.peer, action.source)
                 self.direct_imports.hidden(action.peer, action.source)
                 topics.retract(action)
             case act.Describe():

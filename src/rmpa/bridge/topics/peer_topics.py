@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent
     from rmpa.bridge.data.route import ReceptionHistory
-    from rmpa.bridge.driver import PeerRpc
+    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession, PeerSessions
     from rmpa.bridge.topics.exports import Exports
     from rmpa.core.counters import Counters, RefusalLog

@@ -14,9 +14,6 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import Policy
-from rmpa.bridge.proxies import Names
-from rmpa.bridge.services.exports import ServiceRules
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
@@ -48,7 +45,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.routes import RemoteTopic
-    from rmpa.config.settings import Settings
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.external import Core
@@ -264,21 +260,15 @@ class TopicEvidence:
     """Reads what the rooms know of one topic; changes nothing.
 
     Args:
-        settings: The agent's.
-        core: Its ROS core.
+        core: The agent's ROS core.
         bridge: Its bridge.
         snapshots: Its snapshots.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
+    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
         self._core = core
         self._bridge = bridge
         self._snapshots = snapshots
-        self.reload(settings)
-
-    def reload(self, settings: Settings) -> None:
-        """Use other settings from now on."""
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
 
     def own(self, topic: str) -> dict[str, str]:
         """The module's own publishers of a topic, and their addresses."""
@@ -289,7 +279,7 @@ class TopicEvidence:
 
         A user may write either: a name that no topic of the peer can have here is taken for the peer's own.
         """
-        names = self._bridge.topics.names.of(peer)
+        names = self._bridge.context.names.of(peer)
         wires = names.wires_of(topic)
         return (topic, wires[0]) if wires else (names.local_name(topic), topic)
 
@@ -358,7 +348,7 @@ class TopicEvidence:
         wire = name_in(args, "topic")
         instance = args.get("instance") or ""
         asker = session.link.name
-        names = self._bridge.topics.names.of(asker)
+        names = self._bridge.context.names.of(asker)
         state = self._core.state()
         sources: list[PublisherReport] = []
         subscribers: list[str] = []
@@ -382,7 +372,7 @@ class TopicEvidence:
 
     async def _similar(self, asker: str, wire: str) -> str:
         """The topic of this module whose name on the wire is most like this one; empty if none is."""
-        names, state = self._bridge.topics.names.of(asker), self._core.state()
+        names, state = self._bridge.context.names.of(asker), self._core.state()
         known = {
             names.wire_name(topic)
             for topic, nodes in yielding_to_data(list(state.publishers.items()))
@@ -407,9 +397,9 @@ class TopicEvidence:
         local = exports.offered.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         node = source.node if local is None or local.origin is None else local.origin.node
-        decision = self._policy.judge(source.topic, kind, node)
+        decision = self._bridge.context.policy.judge(source.topic, kind, node)
         if decision.allowed:
-            special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
+            special = self._bridge.context.policy.judge_for(session.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
         flow = self._bridge.topics.outbound.flows.get(source)
         numbering = self._bridge.topics.outbound.numbering(source, session.peer)
@@ -453,22 +443,15 @@ class ServiceEvidence:
     """Reads what the rooms know of one service, and probes servers; changes nothing.
 
     Args:
-        settings: The agent's.
-        core: Its ROS core.
+        core: The agent's ROS core.
         bridge: Its bridge.
         services: The bridge's part for services.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, services: Services) -> None:
+    def __init__(self, core: Core, bridge: Bridge, services: Services) -> None:
         self._core = core
         self._bridge = bridge
         self._services = services
-        self.reload(settings)
-
-    def reload(self, settings: Settings) -> None:
-        """Use other settings from now on."""
-        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
-        self._rules = ServiceRules(settings.services, policy, names)
 
     def known(self, service: str) -> bool:
         """Whether a peer offers a service; ``service`` is its name here."""
@@ -526,7 +509,7 @@ class ServiceEvidence:
     def _transport(self, peer: int, service: str) -> ServiceTransport:
         direct = self._services.direct_imports
         wanted, answer, unmet = (
-            self._rules.transport(service),
+            self._bridge.context.services.transport(service),
             direct.answer(peer, service),
             direct.unmet(peer, service),
         )
@@ -546,7 +529,7 @@ class ServiceEvidence:
         wire = name_in(args, "service")
         peer = session.link.name
         seen, gate = self._services.exports.seen, self._bridge.gate
-        services = self._bridge.topics.names.of(peer).locals_of(wire)
+        services = self._bridge.context.names.of(peer).locals_of(wire)
         services = tuple(service for service in services if gate.judge(Access.CALL, peer, service).allowed)
         if not services:
             return ServiceAtServer(permitted=False)
@@ -558,9 +541,10 @@ class ServiceEvidence:
                         refusal = f"it cannot be reached at {found.api} ({found.problem})"
                         return ServiceAtServer(node=node, service=service, refusal=refusal)
                 continue
-            decision = self._rules.judge(service, server.node if server.origin is None else server.origin.node)
+            rules, origin = self._bridge.context.services, server.origin
+            decision = rules.judge(service, server.node if origin is None else origin.node)
             if decision.allowed:
-                special = self._rules.judge_for(peer, service, wire)
+                special = rules.judge_for(peer, service, wire)
                 decision = special if special.rule else decision
             _, refusal = await _probe(server.uri, service)
             return ServiceAtServer(
@@ -572,7 +556,7 @@ class ServiceEvidence:
                 permitted=True if gate.on else None,
             )
         known = {
-            self._rules.wire_name(peer, service)
+            self._bridge.context.services.wire_name(peer, service)
             for service in yielding_to_data(list(seen))
             if gate.judge(Access.CALL, peer, service).allowed
         }

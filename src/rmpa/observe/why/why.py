@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.config.settings import Settings
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
     from rmpa.observe.peers_section import SiteRequests
     from rmpa.observe.snapshot import Snapshot
@@ -156,7 +155,7 @@ class WhyService:
     """The op ``why`` of the control socket, and the peers' requests about it. Changes nothing.
 
     Args:
-        settings: The agent's.
+        name: The module's.
         core: Its ROS core.
         bridge: Its bridge.
         services: The bridge's part for services.
@@ -166,7 +165,7 @@ class WhyService:
 
     def __init__(
         self,
-        settings: Settings,
+        name: str,
         core: Core,
         bridge: Bridge,
         services: Services,
@@ -174,21 +173,16 @@ class WhyService:
         sites: SiteRequests,
     ) -> None:
         self._core = core
-        self._name = settings.name
+        self._name = name
         self._sites = sites
         self._bridge = bridge
         self._snapshots = snapshots
-        self._topics = TopicEvidence(settings, core, bridge, snapshots)
-        self._services = ServiceEvidence(settings, core, bridge, services)
+        self._topics = TopicEvidence(core, bridge, snapshots)
+        self._services = ServiceEvidence(core, bridge, services)
         rpc = bridge.rpc
         rpc.on_request(TOPIC, self._topics.answer, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
         rpc.on_request(SERVICE, self._services.answer, Needs((Access.CALL,), "the service, and those like it"))
         rpc.on_request(HERE, self._answer_here, Needs((Access.PUBLISH,), "the topic, which the peer publishes"))
-
-    def reload(self, settings: Settings) -> None:
-        """Use other settings from now on."""
-        self._topics.reload(settings)
-        self._services.reload(settings)
 
     async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         """The control socket's op ``why``.
@@ -370,7 +364,7 @@ class WhyService:
         if session is None or session.link.name != to:
             stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
             return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
-        question = {"topic": self._bridge.topics.names.wire_name(to, topic)}
+        question = {"topic": self._bridge.context.names.wire_name(to, topic)}
         try:
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], observe_limits.WHY_TIMEOUT)
             if not found:
@@ -382,7 +376,7 @@ class WhyService:
             return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        topic = self._bridge.topics.names.local_name(session.link.name, name_in(args, "topic"))
+        topic = self._bridge.context.names.local_name(session.link.name, name_in(args, "topic"))
         found = await self._arrives(str(session.link.guid), topic)
         return tuple(without_rules(one) for one in found[: observe_limits.WHY_SOURCES_MAX])
 

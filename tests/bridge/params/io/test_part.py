@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
+from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.driver import PeerRpc
 from rmpa.bridge.messages import decode
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
@@ -28,9 +29,8 @@ from tests.bridge.services.io.test_calls import Wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rmpa.bridge.context import Shared
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.core.external import Core
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 OURS = "http://127.0.0.1:1/"
@@ -84,17 +84,20 @@ class Side:
         self.counters = Counters()
         self.asks = PeerRpc(self.counters)
         self.links: dict[int, PeerSession] = {}
-        self.params = Params(
-            cast("Core", self.core),
-            cast("SlaveNode", SimpleNamespace(uri=OURS)),
-            self.asks,
-            self.links.values,
-            self.counters,
-            params or ParamSettings(),
-            time or TimeSettings(),
-            gate=gate,
+        self.shared = SimpleNamespace(
+            core=self.core,
+            node=SimpleNamespace(uri=OURS),
+            sessions=SimpleNamespace(linked=self.links.values),
+            rpc=self.asks,
+            counters=self.counters,
+            context=BridgeContext.of(Settings(params=params or ParamSettings(), time=time or TimeSettings()), gate),
         )
+        self.params = Params(cast("Shared", self.shared))
         self.core.told = self.params.param_update
+
+    def reload(self, settings: Settings) -> None:
+        self.shared.context = BridgeContext.of(settings, self.shared.context.gate)
+        self.params.reload()
 
     def link(self, other: Side, number: int) -> PeerSession:
         def send(payload: bytes) -> None:
@@ -428,12 +431,12 @@ async def test_refusals_are_said_and_asked_again(sides: Any, caplog: pytest.LogC
     assert problems["/base/robot_description"] in caplog.text
     assert pad.core.get("/use_sim_time") is None
     # The owner's rules change: it is followed without a word of ours.
-    base.params.reload(Settings(params=ParamSettings(), time=TimeSettings(share=True)))
+    base.reload(Settings(params=ParamSettings(), time=TimeSettings(share=True)))
     await pad.look()
     await until(lambda: pad.core.get("/use_sim_time") is True)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
     # And back: what is here stays, and is not followed any more.
-    base.params.reload(Settings(params=ParamSettings(), time=TimeSettings()))
+    base.reload(Settings(params=ParamSettings(), time=TimeSettings()))
     await until(lambda: pad.states()["/use_sim_time"] == "refused")
     base.core.set("/use_sim_time", False)
     await base.look()
@@ -500,7 +503,7 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
-    pad.params.reload(Settings(params=follows(ARM)))
+    pad.reload(Settings(params=follows(ARM)))
     await until(lambda: pad.core.get("/arm") == 1)
     base.core.set("/robot_description", "two")
     pad.core.set("/base/robot_description", "mine")
@@ -519,7 +522,7 @@ async def test_time_that_is_no_longer_followed_is_as_it_was(sides: Any, before: 
         pad.core.set("/use_sim_time", before)
     join(simulator, pad)
     await until(lambda: pad.core.get("/use_sim_time") is True)
-    pad.params.reload(Settings())
+    pad.reload(Settings())
     await pad.look()
     assert pad.core.get("/use_sim_time") is before
 
