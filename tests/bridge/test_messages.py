@@ -34,7 +34,6 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import (
     Contract,
@@ -401,10 +400,9 @@ def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatc
         decode(b'{"op":"close","route":1}')
 
 
-def test_too_many_topics_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ADVERTISED_MAX", 2)
-    offers = tuple(TopicOffer(f"/t{i}", "/n", "a/B") for i in range(3))
-    with pytest.raises(LimitExceeded, match="in topics"):
+def test_too_many_topics_are_refused() -> None:
+    offers = tuple(TopicOffer(f"/t{i}", "/n", "a/B") for i in range(limits.ADVERTISED_MAX + 1))
+    with pytest.raises(RemoteProtocolError, match="added"):
         decode(encode(Advertise(added=offers)))
 
 
@@ -417,20 +415,20 @@ _types = st.from_regex(r"[a-z][a-z_]{0,8}/[A-Z][A-Za-z]{0,8}", fullmatch=True)
 _md5s = st.from_regex(r"[0-9a-f]{32}", fullmatch=True)
 _routes = st.integers(1, (1 << 31) - 1)
 _numbers = st.integers(0, (1 << 32) - 1)
-_times = st.none() | st.floats(config_limits.CONTRACT_TIME_MIN, config_limits.CONTRACT_TIME_MAX)
+_times = st.none() | st.floats(core_limits.CONTRACT_TIME_MIN, core_limits.CONTRACT_TIME_MAX)
 _contracts = st.builds(
     Contract,
     st.sampled_from(Reliability),
     st.sampled_from(Durability),
     st.sampled_from(History),
-    st.integers(1, config_limits.CONTRACT_DEPTH_MAX),
+    st.integers(1, core_limits.CONTRACT_DEPTH_MAX),
     _times,
     _times,
     st.sampled_from(Liveliness),
     _times,
     st.sampled_from(Priority),
-    st.none() | st.floats(config_limits.CONTRACT_RATE_MIN, config_limits.CONTRACT_RATE_MAX),
-    st.floats(config_limits.OUTAGE_MIN, config_limits.OUTAGE_MAX),
+    st.none() | st.floats(core_limits.CONTRACT_RATE_MIN, core_limits.CONTRACT_RATE_MAX),
+    st.floats(core_limits.OUTAGE_MIN, core_limits.OUTAGE_MAX),
     st.sampled_from(Transport),
 )
 _service_routes = st.integers(1 << 31, (1 << 32) - 1)
@@ -478,18 +476,18 @@ def test_no_bytes_do_worse_than_a_protocol_error(wire: bytes) -> None:
 @pytest.mark.parametrize(
     ("wire", "words"),
     [
-        (b'{"op":"service_open","route":7,"service":"/add"}', "route 7 of a service"),
-        (b'{"op":"service_open","route":4294967296,"service":"/add"}', "is not from 2147483648 to"),
-        (b'{"op":"service_open","route":2147483649,"service":"add"}', "'add' is not a global ROS name"),
-        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":0}', "that may take 0"),
-        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":1e9}', "that may take 1"),
-        (b'{"op":"service_opened","route":2147483649,"requests":5,"type":"a/B","md5":"*"}', "route 5 of a service"),
+        (b'{"op":"service_open","route":7,"service":"/add"}', "`$.route`"),
+        (b'{"op":"service_open","route":4294967296,"service":"/add"}', "`$.route`"),
+        (b'{"op":"service_open","route":2147483649,"service":"add"}', "`$.service`"),
+        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":0}', "`$.timeout`"),
+        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":1e9}', "`$.timeout`"),
+        (b'{"op":"service_opened","route":2147483649,"requests":5,"type":"a/B","md5":"*"}', "`$.requests`"),
         (
             b'{"op":"service_opened","route":2147483649,"requests":2147483650,"type":"a/B","md5":"*"}',
-            "md5 sum '*'",
+            "`$.md5`",
         ),
-        (b'{"op":"services","added":[{"service":"/add","node":"x y"}]}', "'x y' is not a global ROS name"),
-        (b'{"op":"services","removed":["add"]}', "'add' is not a global ROS name"),
+        (b'{"op":"services","added":[{"service":"/add","node":"x y"}]}', "`$.added[0].node`"),
+        (b'{"op":"services","removed":["add"]}', "`$.removed[0]`"),
     ],
 )
 def test_what_a_peer_may_not_say_of_services(wire: bytes, words: str) -> None:

@@ -83,7 +83,7 @@ class Module:
     def direct(self, peer: int, node: str) -> Origin:
         """Whose a source is that comes by the link of its own module."""
         there = next(module for module, number in self.links.items() if number == peer)
-        return Origin(f"m{there}", f"10.0.0.{there}:4000#0", instance(there), node)
+        return Origin(f"m{there}", f"10.0.0.{there}:4000#0", instance(there), node, ())
 
     def look(self) -> list[Any]:
         """The local graph as the agent's driver reads it."""

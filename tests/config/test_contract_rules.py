@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config import limits
 from rmpa.config.read import LISTS, Loaded, line_of, load_settings
 from rmpa.config.schema import read_duration, read_rate
 from rmpa.config.settings import Settings
 from rmpa.config.values import BadValue
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import (
     KEYS,
     Contract,
@@ -318,8 +318,8 @@ TEXTS = st.text(alphabet="0123456789.-+e_ msuµinhz")
 @given(st.one_of(TEXTS, st.floats(), st.integers(), st.booleans(), st.none(), st.lists(st.integers())))
 def test_whatever_is_written_is_read_within_bounds_or_refused(raw: object) -> None:
     for read, low, high in (
-        (read_duration, limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX),
-        (read_rate, limits.CONTRACT_RATE_MIN, limits.CONTRACT_RATE_MAX),
+        (read_duration, core_limits.CONTRACT_TIME_MIN, core_limits.CONTRACT_TIME_MAX),
+        (read_rate, core_limits.CONTRACT_RATE_MIN, core_limits.CONTRACT_RATE_MAX),
     ):
         try:
             value = read(raw)
@@ -328,7 +328,7 @@ def test_whatever_is_written_is_read_within_bounds_or_refused(raw: object) -> No
         assert value is None or low <= value <= high
 
 
-@given(st.floats(limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX))
+@given(st.floats(core_limits.CONTRACT_TIME_MIN, core_limits.CONTRACT_TIME_MAX))
 def test_seconds_stay_as_they_are(seconds: float) -> None:
     assert read_duration(seconds) == seconds
 

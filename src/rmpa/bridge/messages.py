@@ -6,19 +6,34 @@ readable in a packet capture. ``docs/design/protocol.md`` lists the messages wit
 
 from __future__ import annotations
 
-import math
 import re
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
+from msgspec import Meta
 
 from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import Guid, is_global_name, is_type_name, peer_name_problem
+from rmpa.core.identity import GLOBAL_NAME, TYPE_NAME, Guid, is_global_name, is_type_name, peer_name_problem
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
+
+Name = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{GLOBAL_NAME}\Z")]
+"""A global ROS name. The types below are checked where a message of a peer is decoded, and nowhere else."""
+TypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{TYPE_NAME}\Z")]
+TypeNameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({TYPE_NAME})?\Z")]
+Md5 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
+InstanceId = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
+Text = Annotated[str, Meta(max_length=limits.CONTROL_TEXT_MAX)]
+Route = Annotated[int, Meta(gt=0, lt=limits.SERVICE_ROUTES)]
+ServiceRoute = Annotated[int, Meta(ge=limits.SERVICE_ROUTES, le=UINT32_MAX)]
+Sequence = Annotated[int, Meta(ge=0, le=UINT32_MAX)]
+QuestionNumber = Annotated[int, Meta(gt=0, le=UINT32_MAX)]
+Question = Annotated[str, Meta(max_length=limits.ASK_NAME_MAX)]
+CallTimeout = Annotated[float, Meta(ge=core_limits.CONTRACT_TIME_MIN, le=config_limits.SERVICE_TIMEOUT_MAX)]
 
 
 class Source(msgspec.Struct, frozen=True, order=True):
@@ -29,8 +44,8 @@ class Source(msgspec.Struct, frozen=True, order=True):
         node: Global name of the publishing node, in the publishing module.
     """
 
-    topic: str
-    node: str
+    topic: Name
+    node: Name
 
     def __str__(self) -> str:
         """``/cmd from /joy_node``."""
@@ -50,9 +65,19 @@ class Origin(msgspec.Struct, frozen=True):
 
     name: str
     guid: str
-    instance: str
-    node: str
-    path: tuple[str, ...] = ()
+    instance: InstanceId
+    node: Name
+    path: Annotated[tuple[InstanceId, ...], Meta(min_length=1, max_length=limits.RELAY_HOPS_MAX)]
+
+    def __post_init__(self) -> None:
+        """Check the origin that a peer names.
+
+        Raises:
+            ValueError: The name or the GUID is none.
+        """
+        if problem := peer_name_problem(self.name):
+            raise ValueError(problem)
+        Guid.parse(self.guid)
 
 
 class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -65,9 +90,9 @@ class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
         origin: Its module and node, if it is not the sender's own.
     """
 
-    topic: str
-    node: str
-    type: str
+    topic: Name
+    node: Name
+    type: TypeName
     origin: Origin | None = None
 
     @property
@@ -114,7 +139,7 @@ class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
         more: Whether the full advertisement continues in further messages.
     """
 
-    added: tuple[TopicOffer, ...] = ()
+    added: Annotated[tuple[TopicOffer, ...], Meta(max_length=limits.ADVERTISED_MAX)] = ()
     removed: tuple[Source, ...] = ()
     full: bool = False
     more: bool = False
@@ -132,12 +157,12 @@ class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
         after: The last message of that numbering that it has.
     """
 
-    route: int
-    topic: str
-    node: str
+    route: Route
+    topic: Name
+    node: Name
     contract: Contract = Contract()
-    epoch: int = 0
-    after: int = 0
+    epoch: Sequence = 0
+    after: Sequence = 0
 
     @property
     def source(self) -> Source:
@@ -158,19 +183,19 @@ class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
         unknown: Whether an earlier run of the subscribing agent may have missed messages; left out: no.
     """
 
-    route: int
+    route: Route
     description: Description
     contract: Contract = Contract()
-    epoch: int = 0
-    first: int = 1
-    following: int | msgspec.UnsetType = msgspec.UNSET
+    epoch: Sequence = 0
+    first: Sequence = 1
+    following: Sequence | msgspec.UnsetType = msgspec.UNSET
     unknown: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
     """The subscribing agent closes a route."""
 
-    route: int
+    route: Route
 
 
 class RouteClosed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
@@ -182,8 +207,8 @@ class RouteClosed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
         last: If the publisher of a reliable route has gone: the sequence of its last message.
     """
 
-    route: int
-    reason: str
+    route: Route
+    reason: Text
     last: int | msgspec.UnsetType = msgspec.UNSET
 
 
@@ -193,10 +218,10 @@ class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
     An empty ``text`` ends an earlier mismatch: the subscriber has gone or registers again.
     """
 
-    topic: str
-    node: str
-    subscriber: str
-    text: str
+    topic: Name
+    node: Name
+    subscriber: Text
+    text: Text
 
     @property
     def source(self) -> Source:
@@ -212,8 +237,8 @@ class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):
         nodes: The listeners' global names, in the sender's graph.
     """
 
-    route: int
-    nodes: tuple[str, ...] = ()
+    route: Route
+    nodes: Annotated[tuple[Name, ...], Meta(max_length=limits.AUDIENCE_MAX)] = ()
 
 
 class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -225,16 +250,16 @@ class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
         origin: Its module and node, if it is not the sender's own.
     """
 
-    service: str
-    node: str
+    service: Name
+    node: Name
     origin: Origin | None = None
 
 
 class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="services"):
     """The services that the sender offers, as ``Advertise`` for topics; ``removed`` has names of services."""
 
-    added: tuple[ServiceOffer, ...] = ()
-    removed: tuple[str, ...] = ()
+    added: Annotated[tuple[ServiceOffer, ...], Meta(max_length=limits.ADVERTISED_MAX)] = ()
+    removed: tuple[Name, ...] = ()
     full: bool = False
     more: bool = False
 
@@ -249,9 +274,9 @@ class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open
         timeout: Seconds that the calling agent waits for the reply to a call.
     """
 
-    route: int
-    service: str
-    timeout: float = config_limits.SERVICE_TIMEOUT
+    route: ServiceRoute
+    service: Name
+    timeout: CallTimeout = config_limits.SERVICE_TIMEOUT
 
 
 class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_opened"):
@@ -266,29 +291,29 @@ class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_op
         response_type: The type of its responses, likewise.
     """
 
-    route: int
-    requests: int
-    type: str
-    md5: str
-    request_type: str = ""
-    response_type: str = ""
+    route: ServiceRoute
+    requests: ServiceRoute
+    type: TypeName
+    md5: Md5
+    request_type: TypeNameOrNone = ""
+    response_type: TypeNameOrNone = ""
 
 
 class CloseService(msgspec.Struct, frozen=True, tag_field="op", tag="service_close"):
     """The calling agent closes a service; ``route`` is its own one."""
 
-    route: int
+    route: ServiceRoute
 
 
 class ServiceClosed(msgspec.Struct, frozen=True, tag_field="op", tag="service_closed"):
     """The service cannot be called (any more); pending calls get no reply. ``reason`` is text for the user."""
 
-    route: int
-    reason: str
+    route: ServiceRoute
+    reason: Text
 
 
 class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
-    """A request of one agent to another; ``bridge.driver`` finds its handler.
+    """A request of one agent to another; ``bridge.rpc`` finds its handler.
 
     Args:
         number: Identifies the request at the requesting agent.
@@ -296,8 +321,8 @@ class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
         args: The handler's arguments, by name.
     """
 
-    number: int
-    what: str
+    number: QuestionNumber
+    what: Question
     args: dict[str, Any] = {}
 
 
@@ -312,31 +337,27 @@ class Response(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
         remedy: What the user can do; may be empty.
     """
 
-    number: int
+    number: QuestionNumber
     ok: bool
     value: Any = None
-    error: str = ""
-    remedy: str = ""
+    error: Text = ""
+    remedy: Text = ""
 
 
 class Notification(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
     """A message to another agent without a response; ``what`` selects the listener."""
 
-    what: str
+    what: Question
     args: dict[str, Any] = {}
 
 
-RouteMessage = OpenRoute | RouteOpened | CloseRoute | RouteClosed | Audience
-TopicMessage = Advertise | Mismatch | RouteMessage
+TopicMessage = Advertise | OpenRoute | RouteOpened | CloseRoute | RouteClosed | Mismatch | Audience
 ServiceMessage = AdvertiseServices | OpenService | ServiceOpened | CloseService | ServiceClosed
-AgentMessage = Request | Response | Notification
-Message = TopicMessage | ServiceMessage | AgentMessage
+Message = TopicMessage | ServiceMessage | Request | Response | Notification
 
 _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(Message)
 _MD5: Final = re.compile(r"[0-9a-f]{32}")
-_INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
-
 
 _OP: Final = b'{"op":"'
 _OP_MAX: Final = 32
@@ -390,8 +411,8 @@ def decode(payload: bytes | bytearray | memoryview) -> Message:
     """Read and validate one message.
 
     Raises:
-        LimitExceeded: It is longer than ``mesh.limits.CONTROL_PAYLOAD_MAX``, or a list or text in it is too long.
-        RemoteProtocolError: It is not a message of this version, or has an invalid name, type or value.
+        LimitExceeded: It is longer than ``mesh.limits.CONTROL_PAYLOAD_MAX``.
+        RemoteProtocolError: It is not a message of this version, or a name, type, number or length in it is invalid.
     """
     if len(payload) > mesh_limits.CONTROL_PAYLOAD_MAX:
         raise LimitExceeded("control message", len(payload), mesh_limits.CONTROL_PAYLOAD_MAX)
@@ -399,156 +420,6 @@ def decode(payload: bytes | bytearray | memoryview) -> Message:
         message: Message = _DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RemoteProtocolError(f"control message: {error}") from error
-    _validate(message)
+    if isinstance(message, RouteOpened) and message.description.problem:
+        raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
     return message
-
-
-def _validate(message: Message) -> None:
-    match message:
-        case Advertise():
-            _validate_advertise(message)
-        case Mismatch():
-            _check_names(message.topic, message.node)
-            _check_text(message.subscriber)
-            _check_text(message.text)
-        case Request() | Response() | Notification():
-            _validate_agent(message)
-        case AdvertiseServices() | OpenService() | ServiceOpened() | CloseService() | ServiceClosed():
-            _validate_service(message)
-        case _:
-            _validate_route(message)
-
-
-def _validate_advertise(message: Advertise) -> None:
-    if len(message.added) > limits.ADVERTISED_MAX:
-        raise LimitExceeded("advertisement (in topics)", len(message.added), limits.ADVERTISED_MAX)
-    for offer in message.added:
-        _check_names(offer.topic, offer.node)
-        if not is_crossing_type(offer.type):
-            raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
-        if offer.origin is not None:
-            _check_origin(offer.origin)
-    for source in message.removed:
-        _check_names(source.topic, source.node)
-
-
-def _check_origin(origin: Origin) -> None:
-    if problem := peer_name_problem(origin.name):
-        raise RemoteProtocolError(f"a relayed source: {problem}")
-    try:
-        Guid.parse(origin.guid)
-    except ValueError as error:
-        raise RemoteProtocolError(f"a relayed source: {error}") from error
-    _check_names(origin.node)
-    if not 0 < len(origin.path) <= limits.RELAY_HOPS_MAX:
-        raise LimitExceeded("way of a relayed source (in relays)", len(origin.path), limits.RELAY_HOPS_MAX)
-    for instance in (origin.instance, *origin.path):
-        if not _INSTANCE.fullmatch(instance):
-            raise RemoteProtocolError(f"{instance[:64]!r} in the way of a relayed source is no instance id")
-
-
-def _validate_route(message: RouteMessage) -> None:
-    if not 0 < message.route < limits.SERVICE_ROUTES:
-        raise RemoteProtocolError(f"route {message.route} is not a 31-bit number above 0")
-    match message:
-        case OpenRoute():
-            _check_names(message.topic, message.node)
-            _check_terms(message)
-        case RouteClosed():
-            _check_text(message.reason)
-        case RouteOpened():
-            if message.description.problem:
-                raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
-            _check_terms(message)
-        case Audience():
-            if len(message.nodes) > limits.AUDIENCE_MAX:
-                raise LimitExceeded("audience (in nodes)", len(message.nodes), limits.AUDIENCE_MAX)
-            _check_names(*message.nodes)
-
-
-def _validate_service(message: ServiceMessage) -> None:
-    if isinstance(message, AdvertiseServices):
-        if len(message.added) > limits.ADVERTISED_MAX:
-            raise LimitExceeded("advertisement (in services)", len(message.added), limits.ADVERTISED_MAX)
-        for offer in message.added:
-            _check_names(offer.service, offer.node)
-            if offer.origin is not None:
-                _check_origin(offer.origin)
-        _check_names(*message.removed)
-        return
-    _check_service_route(message.route)
-    if isinstance(message, OpenService):
-        _check_names(message.service)
-        if not config_limits.CONTRACT_TIME_MIN <= message.timeout <= config_limits.SERVICE_TIMEOUT_MAX:
-            raise RemoteProtocolError(f"calls of {message.service} that may take {message.timeout} s")
-    elif isinstance(message, ServiceClosed):
-        _check_text(message.reason)
-    elif isinstance(message, ServiceOpened):
-        _check_service_route(message.requests)
-        if not is_crossing_type(message.type) or not _MD5.fullmatch(message.md5):
-            raise RemoteProtocolError(f"a service of type {message.type[:200]!r} and md5 sum {message.md5[:64]!r}")
-        for name in (message.request_type, message.response_type):
-            if name and not is_crossing_type(name):
-                raise RemoteProtocolError(f"{name[:200]!r} is not a type of requests or responses")
-
-
-def _check_service_route(route: int) -> None:
-    if not limits.SERVICE_ROUTES <= route <= UINT32_MAX:
-        raise RemoteProtocolError(f"route {route} of a service is not from {limits.SERVICE_ROUTES} to {UINT32_MAX}")
-
-
-def _validate_agent(message: AgentMessage) -> None:
-    if isinstance(message, Response):
-        _check_text(message.error)
-        _check_text(message.remedy)
-    elif len(message.what) > limits.ASK_NAME_MAX:
-        raise LimitExceeded("name of a question", len(message.what), limits.ASK_NAME_MAX)
-    if isinstance(message, Request | Response) and not 0 < message.number <= UINT32_MAX:
-        raise RemoteProtocolError(f"question {message.number} is not a 32-bit number above 0")
-
-
-def _check_terms(message: OpenRoute | RouteOpened) -> None:
-    """Checks a peer's contract, and that its numbers have 32 bits."""
-    check_contract(message.contract, f"route {message.route}")
-    numbers = [message.epoch, message.after if isinstance(message, OpenRoute) else message.first]
-    if isinstance(message, RouteOpened) and not isinstance(message.following, msgspec.UnsetType):
-        numbers.append(message.following)
-    if any(not 0 <= number <= UINT32_MAX for number in numbers):
-        raise RemoteProtocolError(f"route {message.route}: a contract with the numbers {numbers} cannot be")
-
-
-def check_contract(contract: Contract, what: str) -> None:
-    """Check that a peer's contract has only values that ``rmpa.toml`` allows.
-
-    Args:
-        contract: The contract.
-        what: What it is for, as text for the error.
-
-    Raises:
-        RemoteProtocolError: A value is out of its range.
-    """
-    times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
-    lowest, highest = config_limits.CONTRACT_TIME_MIN, config_limits.CONTRACT_TIME_MAX
-    lowest_rate = config_limits.CONTRACT_RATE_MIN
-    if not 1 <= contract.depth <= config_limits.CONTRACT_DEPTH_MAX:
-        problem = f"a depth of {contract.depth}"
-    elif any(t is not None and not (math.isfinite(t) and lowest <= t <= highest) for t in times):
-        problem = f"times of {times} seconds"
-    elif contract.max_rate is not None and not lowest_rate <= contract.max_rate <= config_limits.CONTRACT_RATE_MAX:
-        problem = f"a rate of {contract.max_rate}"
-    elif not config_limits.OUTAGE_MIN <= contract.outage <= config_limits.OUTAGE_MAX:
-        problem = f"an outage of {contract.outage} seconds"
-    else:
-        return
-    raise RemoteProtocolError(f"{what}: a contract with {problem} cannot be")
-
-
-def _check_names(*names: str) -> None:
-    for name in names:
-        if not is_crossing_name(name):
-            raise RemoteProtocolError(f"{name[:200]!r} is not a global ROS name")
-
-
-def _check_text(text: str) -> None:
-    if len(text) > limits.CONTROL_TEXT_MAX:
-        raise LimitExceeded("text in a control message", len(text), limits.CONTROL_TEXT_MAX)

@@ -326,7 +326,7 @@ class Relay:
             origin: Its module and node; ``None``: the peer's own.
         """
         if self.enabled:
-            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node)
+            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node, ())
             self.shown(peer, source, place, origin or own)
 
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:

@@ -16,16 +16,6 @@ NAMES_REMEMBERED: Final = 256
 """Peers whose result of the naming rules is cached: as many as a large network has."""
 REMAPS_MAX: Final = 256
 """Renaming rules in one direction of a ``[[peer]]``; each is compared with each other one."""
-CONTRACT_DEPTH_MAX: Final = 100_000
-"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LANE_QUEUE_BYTES`` bounds their bytes."""
-CONTRACT_TIME_MIN: Final = 0.001
-"""Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches."""
-CONTRACT_TIME_MAX: Final = 86_400.0
-"""Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
-CONTRACT_RATE_MIN: Final = 0.001
-"""Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
-CONTRACT_RATE_MAX: Final = 1_000_000.0
-"""Highest ``max_rate`` in messages a second: more than any topic reaches."""
 FOLLOWED_MAX: Final = 256
 """Default of ``limits.params``: parameters that one module follows, and that one peer may follow here; a namespace
 counts as one."""
@@ -51,12 +41,6 @@ MULTICAST_GROUP: Final = "239.255.82.77"
 """Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
 MULTICAST_PORT: Final = 11411
 """The discovery port of domain 0; domain n uses this port plus n."""
-
-# --- mesh -------------------------------------------------------------------------------------------------------
-OUTAGE_MIN: Final = 1.0
-"""Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner."""
-OUTAGE_MAX: Final = 86_400.0
-"""Longest ``outage`` of a contract, a day; as the other times of a contract."""
 
 # --- ROS --------------------------------------------------------------------------------------------------------
 SERVICE_TIMEOUT: Final = 60.0

@@ -36,6 +36,7 @@ from rmpa.config.values import (
     whole_number,
     word_of,
 )
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import (
     Contract,
     ContractRule,
@@ -72,7 +73,7 @@ KEYS: Final = (
     RuleKey("history", member_of(History, "a history"), "What a full queue keeps."),
     RuleKey(
         "depth",
-        whole_number(1, limits.CONTRACT_DEPTH_MAX, "a depth"),
+        whole_number(1, core_limits.CONTRACT_DEPTH_MAX, "a depth"),
         "Messages that wait for one slow receiver; beyond it the oldest is dropped.",
     ),
     RuleKey("deadline", duration_of("a deadline"), "The longest time from one message to the next."),

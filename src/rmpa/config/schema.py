@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.config import limits
 from rmpa.config.values import BadValue, JsonSchema, ValueType, shown
+from rmpa.core import limits as core_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -268,8 +269,8 @@ def read_duration(raw: object, what: str = "a duration") -> float | None:
     seconds = _seconds(raw, what)
     if seconds == math.inf:
         return None
-    if not limits.CONTRACT_TIME_MIN <= seconds <= limits.CONTRACT_TIME_MAX:
-        bounds = f"{limits.CONTRACT_TIME_MIN:g} and {limits.CONTRACT_TIME_MAX:.0f} s"
+    if not core_limits.CONTRACT_TIME_MIN <= seconds <= core_limits.CONTRACT_TIME_MAX:
+        bounds = f"{core_limits.CONTRACT_TIME_MIN:g} and {core_limits.CONTRACT_TIME_MAX:.0f} s"
         raise BadValue(f"{shown(raw)} is out of range", f'{what} is between {bounds}; "{_INFINITE}" is none at all')
     return seconds
 
@@ -277,7 +278,7 @@ def read_duration(raw: object, what: str = "a duration") -> float | None:
 def read_outage(raw: object) -> float:
     """How long messages are kept for a peer whose link is gone, in seconds; unlike other durations it has an end."""
     seconds = _seconds(raw, "an outage")
-    shortest, longest = limits.OUTAGE_MIN, limits.OUTAGE_MAX
+    shortest, longest = core_limits.OUTAGE_MIN, core_limits.OUTAGE_MAX
     if not shortest <= seconds <= longest:
         bounds = f"an outage is between {shortest:g} and {longest:.0f} s: messages are not kept for ever"
         raise BadValue(f"{shown(raw)} is out of range", bounds)
@@ -315,8 +316,8 @@ def read_rate(raw: object) -> float | None:
         rate = _number(raw, "a rate", example)
     if rate == math.inf:
         return None
-    if not limits.CONTRACT_RATE_MIN <= rate <= limits.CONTRACT_RATE_MAX:
-        bounds = f"{limits.CONTRACT_RATE_MIN:g} and {limits.CONTRACT_RATE_MAX:.0f} Hz"
+    if not core_limits.CONTRACT_RATE_MIN <= rate <= core_limits.CONTRACT_RATE_MAX:
+        bounds = f"{core_limits.CONTRACT_RATE_MIN:g} and {core_limits.CONTRACT_RATE_MAX:.0f} Hz"
         raise BadValue(f"{shown(raw)} is out of range", f'a rate is between {bounds}; "{_UNLIMITED}" is none at all')
     return rate
 

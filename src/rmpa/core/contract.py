@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+
+from msgspec import Meta
 
 from rmpa.core import limits
 from rmpa.core.identity import matches
@@ -17,6 +19,11 @@ if TYPE_CHECKING:
 
 _Word = TypeVar("_Word", bound=StrEnum)
 _Number = TypeVar("_Number", int, float)
+Depth = Annotated[int, Meta(ge=1, le=limits.CONTRACT_DEPTH_MAX)]
+"""These types have the bounds that hold in settings and in the messages of peers."""
+Seconds = Annotated[float, Meta(ge=limits.CONTRACT_TIME_MIN, le=limits.CONTRACT_TIME_MAX)]
+Rate = Annotated[float, Meta(ge=limits.CONTRACT_RATE_MIN, le=limits.CONTRACT_RATE_MAX)]
+Outage = Annotated[float, Meta(ge=limits.OUTAGE_MIN, le=limits.OUTAGE_MAX)]
 
 
 class Reliability(StrEnum):
@@ -92,14 +99,14 @@ class Contract:
     reliability: Reliability = Reliability.BEST_EFFORT
     durability: Durability = Durability.VOLATILE
     history: History = History.KEEP_LAST
-    depth: int = limits.ROUTE_QUEUE_MESSAGES
-    deadline: float | None = None
-    lifespan: float | None = None
+    depth: Depth = limits.ROUTE_QUEUE_MESSAGES
+    deadline: Seconds | None = None
+    lifespan: Seconds | None = None
     liveliness: Liveliness = Liveliness.AUTOMATIC
-    liveliness_lease: float | None = None
+    liveliness_lease: Seconds | None = None
     priority: Priority = Priority.NORMAL
-    max_rate: float | None = None
-    outage: float = limits.RESUME_WINDOW
+    max_rate: Rate | None = None
+    outage: Outage = limits.RESUME_WINDOW
     transport: Transport = Transport.RELAY
 
     @property

@@ -136,7 +136,12 @@ NEVER_CROSSING: Final = {
     "/rmpa/**": "the agent's own topics stay home",
 }
 """Topics that stay in their module under every policy, and why."""
-_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+GLOBAL_NAME: Final = r"/([A-Za-z0-9_]+(/[A-Za-z0-9_]+)*)?"
+"""The regular expression of a resolved name, ``/like/this``."""
+TYPE_NAME: Final = r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*"
+"""The regular expression of a message or service type, ``package/Name``."""
+_GLOBAL: Final = re.compile(GLOBAL_NAME)
+_TYPE: Final = re.compile(TYPE_NAME)
 
 
 def is_legal_name(name: str) -> bool:
@@ -146,7 +151,7 @@ def is_legal_name(name: str) -> bool:
 
 def is_global_name(name: str) -> bool:
     """Whether this is a resolved name, ``/like/this``."""
-    return name.startswith("/") and is_legal_name(name) and (name == "/" or not name.endswith("/"))
+    return _GLOBAL.fullmatch(name) is not None
 
 
 def is_type_name(name: str) -> bool:

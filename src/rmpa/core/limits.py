@@ -33,6 +33,20 @@ DOMAIN_MAX: Final = 232
 # --- settings ---------------------------------------------------------------------------------------------------
 CONTRACTS_REMEMBERED: Final = 4096
 """(topic, type) pairs whose contract is cached; the oldest is dropped first."""
+CONTRACT_DEPTH_MAX: Final = 100_000
+"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LANE_QUEUE_BYTES`` bounds their bytes."""
+CONTRACT_TIME_MIN: Final = 0.001
+"""Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches."""
+CONTRACT_TIME_MAX: Final = 86_400.0
+"""Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
+CONTRACT_RATE_MIN: Final = 0.001
+"""Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
+CONTRACT_RATE_MAX: Final = 1_000_000.0
+"""Highest ``max_rate`` in messages a second: more than any topic reaches."""
+OUTAGE_MIN: Final = 1.0
+"""Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner."""
+OUTAGE_MAX: Final = 86_400.0
+"""Longest ``outage`` of a contract, a day; as the other times of a contract."""
 
 # --- discovery --------------------------------------------------------------------------------------------------
 PEER_LEASE: Final = 16.0

@@ -53,7 +53,7 @@ def foreign_node(source: ForeignSource) -> str:
 
 def foreign_origin(source: ForeignSource) -> Origin:
     """The origin of a neighbour's source; its path is empty."""
-    return Origin(source.site, OUTSIDE_GUID, site_instance(source.site), foreign_node(source))
+    return Origin(source.site, OUTSIDE_GUID, site_instance(source.site), foreign_node(source), ())
 
 
 # The gateway's own graph, for its neighbours. All is called in the event loop, callbacks too.

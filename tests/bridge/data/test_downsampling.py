@@ -9,9 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge.data.route import Downsampler
-from rmpa.config import limits
+from rmpa.core import limits as core_limits
 
-RATES = st.sampled_from([limits.CONTRACT_RATE_MIN, 0.5, 1.0, 10.0, 30.0, 1000.0, limits.CONTRACT_RATE_MAX])
+RATES = st.sampled_from([core_limits.CONTRACT_RATE_MIN, 0.5, 1.0, 10.0, 30.0, 1000.0, core_limits.CONTRACT_RATE_MAX])
 SLACK = 0.6
 """Intervals by which the messages of a window may be nearer together: one that was half an interval late and is
 followed on the beat, and the tenth by which one may be early."""

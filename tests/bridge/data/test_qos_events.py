@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.quality import QosEvent, QosEventKind, QosWatch
-from rmpa.config import limits as config_limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Liveliness
 
 TICKS = st.lists(st.integers(0, 40), max_size=40).map(lambda gaps: [sum(gaps[: n + 1]) / 8 for n in range(len(gaps))])
@@ -105,7 +105,7 @@ def test_late_timers_report_only_real_misses(arrivals: list[float], deadline: fl
 
 
 @given(
-    st.floats(config_limits.CONTRACT_TIME_MIN, 100.0),
+    st.floats(core_limits.CONTRACT_TIME_MIN, 100.0),
     st.floats(0.0, 1e9),
     st.lists(st.floats(0.0, 50.0), max_size=20),
 )

@@ -14,7 +14,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, end_from, reply_of, unmet_by_trust
-from rmpa.bridge.messages import check_contract, is_crossing_name
+from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.core.contract import Contract  # noqa: TC001 - msgspec reads the annotations
 from rmpa.core.errors import RemoteProtocolError
@@ -92,8 +92,6 @@ def read_ask(args: dict[str, Any]) -> DirectAsk:
     for name in found.want if found.user else found.want[:2]:
         if not is_crossing_name(name):
             raise RemoteProtocolError(f"direct transport: {name[:200]!r} is not a global ROS name")
-    if found.contract is not None:
-        check_contract(found.contract, found.name)
     return found
 
 

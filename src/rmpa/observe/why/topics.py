@@ -18,6 +18,7 @@ from rmpa.bridge.policy import OUTSIDE_GUID
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
+from rmpa.core import limits as core_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import (
@@ -439,7 +440,7 @@ def _arrived(
     moved = now.messages - before.messages
     sent = report_now.messages - report.messages if report is not None and report_now is not None else None
     rarely = (
-        float(now.contract.get("max_rate") or config_limits.CONTRACT_RATE_MAX) * observe_limits.WHY_WINDOW < _SEVERAL
+        float(now.contract.get("max_rate") or core_limits.CONTRACT_RATE_MAX) * observe_limits.WHY_WINDOW < _SEVERAL
     )
     if not now.messages or (sent is not None and sent >= _SEVERAL and not moved and not rarely):
         text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {module}"
