@@ -156,7 +156,6 @@ class Link(asyncio.Protocol):
             time.monotonic(),
             wall_ns=time.time_ns,
             on_event=self._event,
-            on_data=lambda *_: None,
         )
         self._flush()
 

@@ -8,6 +8,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Refuse, pack_data_header, pong
 from rmpa.mesh.keepalive import ConnectionEvent, HelloReceived
+from tests.mesh.worlds import AnyRoute
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -81,9 +82,8 @@ def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, lis
         else:
             parts[-1][2:] = [flags & (LAST | ABORT), bytes(parts[-1][3]) + bytes(part)]  # type: ignore[call-overload]
 
-    link = ConnectionProtocol(
-        role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
-    )
+    link = ConnectionProtocol(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event)
+    link.routes = AnyRoute(on_data, on_part)
 
     def closed() -> bool:
         return link.state is ConnectionState.CLOSED

@@ -13,6 +13,7 @@ from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Hello
 from rmpa.mesh.keepalive import HelloReceived
 from rmpa.ros import limits
+from tests.mesh.worlds import AnyRoute
 from tests.simulation.network import World
 from tests.simulation.process import Process
 
@@ -102,18 +103,8 @@ def _fuzz(data: bytes) -> None:
         if isinstance(event, HelloReceived):
             link.accept(0.0)
 
-    def on_data(_route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        # As the bridge: a whole one that is none ends the link.
-        if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
-            raise RemoteProtocolError("a data frame that holds no message")
-        flow.message(sequence, stamp_ns, payload)
-
-    def on_part(_route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        flow.part(sequence, stamp_ns, flags, part)
-
-    link = ConnectionProtocol(
-        ConnectionRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
-    )
+    link = ConnectionProtocol(ConnectionRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event)
+    link.routes = AnyRoute(lambda _, *message: flow.message(*message), lambda _, *part: flow.part(*part))
     link.receive(memoryview(_HELLO), 0.0)
     wire = data[1:]
     try:

@@ -8,6 +8,7 @@ import signal
 import struct
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
@@ -220,7 +221,7 @@ async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> 
     closing.push_async_callback(proxies.close)
     inbound = PeerTopics(
         core,
-        PeerSession(1, cast("PeerLink", None), proxies),
+        PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies),
         on_demand=lambda _s, _w: None,
         on_mismatch=lambda _s, _c, _t: None,
         on_occurred=lambda _s, _o: None,

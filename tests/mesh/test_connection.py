@@ -11,7 +11,7 @@ from rmpa.mesh.connection import ConnectionRole, ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Refusal, Refuse, pack_data_header, pong
 from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived, Refused
 from rmpa.runtime import limits as runtime_limits
-from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
+from tests.mesh.worlds import HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time, side
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24, 1 << 20])
@@ -55,11 +55,20 @@ def test_data_arrives_as_a_view_without_a_copy() -> None:
     time = Time()
     _, acceptor = pair(time)
     seen: list[memoryview] = []
-    acceptor.link.on_data = lambda _r, _s, _t, view: seen.append(view)
+    acceptor.link.routes = AnyRoute(lambda _r, _s, _t, view: seen.append(view))
     whole = bytearray(pack_data_header(3, 1, 1, 1) + b"abc")
     acceptor.link.receive(memoryview(whole), time.now)
     whole[24] = ord("X")
     assert bytes(seen[0]) == b"Xbc"
+
+
+def test_data_of_a_closed_route_is_dropped_and_counted() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    acceptor.link.routes = {}
+    wire = pack_data_header(3, 1, 1, 1) + b"abc" + pack_data_header(200_000, 1, 2, 1) + bytes(100_000)
+    assert acceptor.link.receive(memoryview(wire), time.now) == (len(wire), 0)
+    assert acceptor.link._counters["route.unknown"] == 2
 
 
 def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
@@ -235,7 +244,7 @@ def test_after_a_pause_beyond_the_lease_nothing_is_acted_on_until_the_peer_answe
     dialler, acceptor = pair(time)
     told: list[bool] = []
     for one in (dialler, acceptor):
-        one.link.on_data = lambda *_, link=one.link: told.append(link.abandoned)
+        one.link.routes = AnyRoute(lambda *_, link=one.link: told.append(link.abandoned))
     data = pack_data_header(3, 1, 1, 1) + b"abc"
     pass_time(dialler.link, time, 0.3)
     time.now += 0.9 * limits.EXPRESS_LEASE - 0.3
@@ -334,7 +343,7 @@ def test_close_within_the_data_callback_stops_reading() -> None:
         got.append(sequence)
         acceptor.link.lost("closed by its user")
 
-    acceptor.link.on_data = on_data
+    acceptor.link.routes = AnyRoute(on_data)
     both = pack_data_header(0, 1, 1, 0) + pack_data_header(0, 1, 2, 0)
     assert acceptor.link.receive(memoryview(both), time.now) == (len(both), 0)
     assert got == [1]

@@ -11,7 +11,7 @@ from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionRole, ConnectionState
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Lane, pack_data_header
 from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived, MarkReceived
-from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, pass_time, side
+from tests.mesh.worlds import HIGH, LOW, AnyRoute, Time, deliver, exchange, pair, pass_time, side
 
 
 def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> list[bytes]:
@@ -132,7 +132,7 @@ def test_closing_from_within_a_part_stops_the_reading() -> None:
         got.append(len(part))
         acceptor.link.lost("closed by its user")
 
-    acceptor.link.on_part = on_part
+    acceptor.link.routes = AnyRoute(lambda *_: acceptor.data.append((0, 0, 0, b"")), on_part)
     wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000) + pack_data_header(1, 1, 2, 0) + b"x"
     acceptor.link.receive(memoryview(wire[:150_000]), time.now)
     acceptor.link.receive(memoryview(wire[150_000:]), time.now)
@@ -170,7 +170,7 @@ def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) ->
     dialler, acceptor = pair(time)
     said: list[object] = []
     for link in (dialler.link, acceptor.link):
-        link.on_data = lambda _r, sequence, _t, _v: said.append(sequence)
+        link.routes = AnyRoute(lambda _r, sequence, _t, _v: said.append(sequence))
         link.on_event = said.append
     mark = Frame(kind, route=7, sequence=0xFFFFFFFF).serialize()
     wire = pack_data_header(1, 7, 1, 0) + b"x" + mark + pack_data_header(1, 7, 2, 0) + b"x"

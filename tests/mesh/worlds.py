@@ -7,16 +7,46 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState, DataHandler
 from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.mesh.keepalive import ConnectionEvent, RestPace
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
 
 WALL = 1_700_000_000_000_000_000
+
+
+class _Route(DataHandler):
+    """One route of ``AnyRoute``."""
+
+    def __init__(self, route: int, owner: AnyRoute) -> None:
+        self.route, self.owner = route, owner
+
+    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
+        self.owner.data(self.route, sequence, stamp_ns, framed)
+
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        self.owner.part(self.route, sequence, stamp_ns, flags, part)
+
+
+class AnyRoute(dict[int, DataHandler]):
+    """All routes are open, and their data goes to two functions, with the route in front."""
+
+    def __init__(
+        self,
+        data: Callable[[int, int, int, memoryview], object],
+        part: Callable[[int, int, int, int, memoryview], object] = lambda *_: None,
+    ) -> None:
+        super().__init__()
+        self.data, self.part = data, part
+
+    def get(self, route: int, _default: object = None) -> DataHandler:
+        return _Route(route, self)
 
 
 @dataclass
@@ -88,12 +118,14 @@ def side(
         time.now,
         wall_ns=time.wall_ns,
         on_event=events.append,
-        on_data=lambda route, seq, stamp, view: data.append((route, seq, stamp, bytes(view))),
-        on_part=lambda route, seq, stamp, flags, view: parts.append((route, seq, stamp, flags, bytes(view))),
         expected=expected,
         lane=lane,
         lease=lease,
         rest=rest,
+    )
+    link.routes = AnyRoute(
+        lambda route, seq, stamp, view: data.append((route, seq, stamp, bytes(view))),
+        lambda route, seq, stamp, flags, view: parts.append((route, seq, stamp, flags, bytes(view))),
     )
     return Side(link, events, data, parts)
 

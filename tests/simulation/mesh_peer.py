@@ -78,9 +78,7 @@ class MeshPeer(RosterPeer):
             on_link_up=ours(self.link_up),
             on_link_down=ours(self.link_down),
             on_control=ours(self.control),
-            handlers=LinkHandlers(
-                ours(self.data), ours(self.part), ours(self.mark), ours(self.clock_known), ours(self.lane_lost)
-            ),
+            handlers=LinkHandlers(ours(self.mark), ours(self.clock_known), ours(self.lane_lost)),
             clock=SimClock(self.world),
             rng=rng.random,
             dialler=SimDialler(self),
@@ -146,12 +144,6 @@ class MeshPeer(RosterPeer):
 
     def control(self, link: PeerLink, payload: bytes) -> None:
         """A control frame; nothing here."""
-
-    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        """A message; nothing here."""
-
-    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of one; nothing here."""
 
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement or the answer to a fence; nothing here."""

@@ -201,6 +201,7 @@ class TrafficPeer(MeshPeer):
         super().link_down(link, down)
         self.times.pop(link, None)
         for key in [key for key in self.flows if key[0] is link]:
+            link.routes.pop(key[1])
             self.flows.pop(key).torn()
             inbox = self.inboxes[link.identity.instance]
             if inbox.contract.reliability is not Reliability.RELIABLE and inbox.flow is not None:
@@ -238,18 +239,6 @@ class TrafficPeer(MeshPeer):
             self._opened(link, said["epoch"], said["after"])
         else:
             self._begin(link, said)
-
-    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        """A message."""
-        flow = self.flows.get((link, route))
-        if flow is not None:
-            flow.message(sequence, stamp_ns, payload)
-
-    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """A part of one."""
-        flow = self.flows.get((link, route))
-        if flow is not None:
-            flow.part(sequence, stamp_ns, flags, part)
 
     def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement, or a fence's answer."""
@@ -294,4 +283,4 @@ class TrafficPeer(MeshPeer):
         else:
             inbox.flow = ImportFlow(cast("Any", inbox), inbox.contract, self.times[link], on_ack=acknowledge)
         inbox.breaks += not inbox.flow.begin_epoch(said["epoch"], said["first"])
-        self.flows[link, 1] = inbox.flow
+        self.flows[link, 1] = link.routes[1] = inbox.flow

@@ -67,7 +67,6 @@ class NetworkEndpoint:
         self._clock = clock = SystemClock()
         self._settings = settings
         self._bridge = bridge
-        sessions, receiver = bridge.sessions, bridge.receiver
         self._on_displaced = on_displaced
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
@@ -90,7 +89,7 @@ class NetworkEndpoint:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            handlers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
+            handlers=LinkHandlers(bridge.mark, bridge.sessions.clock, bridge.sessions.lane_lost),
             lanes=settings.lanes,
             clock=clock,
             security=trust.membership if trust is not None else None,

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext, Shared
-from rmpa.bridge.data.reception import DataReceiver
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import Needs, PermissionGate, Relay
@@ -22,6 +21,7 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
+from rmpa.mesh.frames import FrameKind
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from collections.abc import Set as AbstractSet
 
-    from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
@@ -81,11 +80,9 @@ class Bridge(Shared):
         )
         self.proxy_nodes = ProxyNodes(core, self.counters)
         """Makes the nodes that stand for the nodes of peers."""
-        self.receiver = DataReceiver(self.counters, self._sender)
-        """Takes the data frames of the links."""
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
-        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy, self.gate)
+        self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
         self.relay = Relay(enabled=settings.relay)
         self.topics = Topics(self, find=self.proxy_nodes.publication)
         self.add(self.topics)
@@ -150,8 +147,16 @@ class Bridge(Shared):
         if not any(part.message(session, message) for part in self._parts):
             raise RemoteProtocolError(f"a message of kind {type(message).__name__} that no part here takes")
 
-    def _sender(self, peer: int, route: int) -> RouteSender | None:
-        return self.topics.outbound.sender(peer, route)
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
+        """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
+        session = self.sessions.of(link)
+        sender = self.topics.outbound.sender(session.peer, route) if session is not None else None
+        if sender is None:
+            return
+        if kind is FrameKind.ACK:
+            sender.acknowledged(sequence)
+        elif kind is FrameKind.FENCED:
+            sender.fenced(sequence)
 
     # --- the local graph's side --------------------------------------------------------------------------------
 

@@ -103,7 +103,7 @@ class PeerRpc(Part):
 
     def link_up(self, session: PeerSession) -> None:
         """Take the large messages of a linked peer."""
-        self._large[session.peer] = session.handlers[_ROUTE] = LargeMessages(session, self._take_large, self._send)
+        self._large[session.peer] = session.link.routes[_ROUTE] = LargeMessages(session, self._take_large, self._send)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Fail the requests to a peer that lost the bulk lane: it is unknown which were on it, or their responses."""

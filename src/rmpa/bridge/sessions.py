@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
-    from rmpa.bridge.data.reception import DataHandler, DataReceiver
     from rmpa.bridge.messages import Message, Origin
     from rmpa.bridge.proxies import ProxyNodes
     from rmpa.mesh.io.link import PeerLink
@@ -58,7 +57,6 @@ class PeerSession:
         peer: Its number in this agent; never used again for another run.
         link: Its link, or the last one while it has none.
         proxies: The nodes that stand for its nodes in the local graph.
-        handlers: The handler of each open route's data, by the route's id; the parts fill it.
         time: The time base of its link: the offset between its clock and the local one.
         state: Whether it has a link.
         away_since: When its last link ended, monotonic seconds.
@@ -68,7 +66,6 @@ class PeerSession:
     peer: int
     link: PeerLink
     proxies: PeerProxies
-    handlers: dict[int, DataHandler] = field(default_factory=dict)
     time: LinkTime = field(default_factory=LinkTime)
     state: PeerState = PeerState.LINKED
     away_since: float = 0.0
@@ -184,7 +181,7 @@ class Part:
     def depends(self, session: PeerSession) -> bool:  # noqa: ARG002 - for those that override it
         """Whether something here needs to know within a second that this linked peer is gone.
 
-        Open routes are known by the session's handlers; this is for what has no handler.
+        Open routes are known by the link's handlers; this is for what has no handler.
         """
         return False
 
@@ -243,7 +240,6 @@ class PeerSessions:
     Args:
         parts: The parts, notified in this order; more may be added until the first link is up.
         nodes: Makes the proxies.
-        receiver: Passes the data of links to the handlers of routes.
         on_kill: ``(session, node, caller id, reason) -> reply``: called when a node's proxy is asked to end.
         gate: Whether the mesh is secured.
     """
@@ -252,14 +248,12 @@ class PeerSessions:
         self,
         parts: Sequence[Part],
         nodes: ProxyNodes,
-        receiver: DataReceiver,
         on_kill: Callable[[PeerSession, str, str, str], Awaitable[RosReply]],
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._gate = gate
         self._parts = parts
         self._nodes = nodes
-        self._receiver = receiver
         self._on_kill = on_kill
         self._numbers = itertools.count(1)
         self._by_number: dict[int, PeerSession] = {}
@@ -306,7 +300,6 @@ class PeerSessions:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
-        self._receiver.link_up(link, session.peer, session.handlers)
         for part in self._parts:
             with guarded(part):
                 part.link_up(session)
@@ -336,13 +329,12 @@ class PeerSessions:
         session = self._by_link.pop(link, None)
         if session is None:
             return
-        self._receiver.link_down(link)
         session.away_since = asyncio.get_running_loop().time()
         session.state = PeerState.SILENT
         for part in self._parts:
             with guarded(part):
                 part.link_down(session)
-        session.handlers.clear()
+        session.link.routes.clear()
         if link.silent:
             session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
@@ -394,7 +386,6 @@ class PeerSessions:
         self._timer.arm()
         self._by_number.pop(session.peer, None)
         if self._by_link.pop(session.link, None) is not None:
-            self._receiver.link_down(session.link)
             for part in self._parts:
                 with guarded(part):
                     part.link_down(session)
@@ -432,7 +423,7 @@ class PeerSessions:
 
     def _depends(self, session: PeerSession) -> bool:
         """Whether anything of this module needs to know within a second that a peer is gone."""
-        return any(session.handlers) or any(part.depends(session) for part in self._parts)
+        return any(session.link.routes) or any(part.depends(session) for part in self._parts)
 
     def reconcile(self) -> None:
         """Try failed proxies again, let unused links rest, and forget unused namespaces of relayed modules."""

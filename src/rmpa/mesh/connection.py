@@ -23,6 +23,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
+from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
@@ -119,8 +120,30 @@ _ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]]
 
 
 OnEvent = Callable[[ConnectionEvent], None]
-OnData = Callable[[int, int, int, memoryview], None]
-OnPart = Callable[[int, int, int, int, memoryview], None]
+
+
+class DataHandler:
+    """Takes the data that arrives on one route; for subclasses."""
+
+    __slots__ = ()
+
+    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
+        """Take a whole message, its 4-byte length in front; ``framed`` is valid during the call only.
+
+        Raises:
+            RemoteProtocolError: It is no message; the connection is closed.
+        """
+        raise NotImplementedError
+
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """Take a part of a large message (``core.outbox`` FIRST, LAST, ABORT); valid during the call only.
+
+        The parts of one message are in order, with parts of other routes in between.
+
+        Raises:
+            RemoteProtocolError: The parts are no message; the connection is closed.
+        """
+        raise NotImplementedError
 
 
 class ConnectionProtocol:
@@ -132,11 +155,7 @@ class ConnectionProtocol:
         now: Monotonic seconds at which the connection was established.
         wall_ns: Returns the wall clock in nanoseconds; only called where a stamp is needed.
         on_event: Called from within the methods below; it may call any of them except ``receive``.
-        on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each message in one frame; the payload is a
-            view of the bytes given to ``receive`` and only valid during the call. The attribute may be assigned
-            later, because the peer, and so the receiver of its data, is only known after the handshake.
-        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a longer message; the parts
-            of one message are in order, with parts of other routes in between. Otherwise as ``on_data``.
+        counters: Counts data frames of routes that are not open, as ``route.unknown``.
         expected: Dialler: the GUID that was dialled; ``None`` if only the address is known.
         lane: Dialler: what the connection is for.
         lease: Seconds after which the silence of this side means that it is dead.
@@ -153,8 +172,7 @@ class ConnectionProtocol:
         *,
         wall_ns: Callable[[], int],
         on_event: OnEvent,
-        on_data: OnData,
-        on_part: OnPart | None = None,
+        counters: Counters | None = None,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
         lease: float = limits.EXPRESS_LEASE,
@@ -168,8 +186,9 @@ class ConnectionProtocol:
         """The remote side's hello or welcome; ``None`` before it is received."""
         self.on_event = on_event
         self.prove = prove
-        self.on_data = on_data
-        self.on_part = on_part if on_part is not None else _no_parts
+        self.routes: Mapping[int, DataHandler] = {}
+        """The handler of each open route. Assigned once the peer, and so the receiver of its data, is known."""
+        self._counters = counters if counters is not None else Counters()
         self._ours = ours
         self._wall_ns = wall_ns
         self._missing = 0
@@ -250,15 +269,15 @@ class ConnectionProtocol:
                     # Handed on as it arrives, so that a large frame is neither awaited nor moved within the buffer.
                     self._missing = end - size
                     self._begun = (route, sequence, stamp_ns, flags & LAST)
-                    self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
+                    self._part(route, sequence, stamp_ns, flags & FIRST, view[start:])
                     return size, 0
                 offset = end
                 if kind != _DATA:
                     self._handle(FrameKind(kind), view[start:end], route, sequence, stamp_ns, now)
-                elif flags == _WHOLE:
-                    self.on_data(route, sequence, stamp_ns, view[start:end])
+                elif flags == _WHOLE and (handler := self.routes.get(route)) is not None:
+                    handler.message(sequence, stamp_ns, view[start:end])
                 else:
-                    self.on_part(route, sequence, stamp_ns, flags, view[start:end])
+                    self._part(route, sequence, stamp_ns, flags, view[start:end])
         except RemoteProtocolError as error:
             if self.role is ConnectionRole.ACCEPTOR and self.remote is None and view[0] == _TLS_HANDSHAKE:
                 text = f"{self._ours.name} is not secured, but the dialler is; {TrustReason.UNSECURED.remedy}"
@@ -418,8 +437,14 @@ class ConnectionProtocol:
         self._missing -= count
         if self._state is ConnectionState.UP:
             route, sequence, stamp_ns, last = self._begun
-            self.on_part(route, sequence, stamp_ns, 0 if self._missing else last, view[:count])
+            self._part(route, sequence, stamp_ns, 0 if self._missing else last, view[:count])
         return count
+
+    def _part(self, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        if (handler := self.routes.get(route)) is not None:
+            handler.part(sequence, stamp_ns, flags, part)
+        else:
+            self._counters.add("route.unknown")
 
     def _handle(
         self, kind: FrameKind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float
@@ -536,7 +561,3 @@ class ConnectionProtocol:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("> %s: %s", self._name, frame)
         self._output += frame.serialize()
-
-
-def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
-    """Ignores parts of messages, for an owner of the machine that does not handle them."""

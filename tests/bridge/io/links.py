@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.core.outbox import Framer, QueuedMessage
+    from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.io.link import PeerLink
     from tests.bridge.io.two_bridges import Side
 
@@ -116,6 +117,7 @@ class LinkEnd:
         for lane in (self.express, self.bulk):
             lane.outbox._fragment = core_limits.FRAGMENT_BYTES
         self.wires: dict[str, Wire] = {}
+        self.routes: dict[int, DataHandler] = {}
 
     def __repr__(self) -> str:
         return f"{self.side.name}→{self.name}"
@@ -165,12 +167,13 @@ class LinkEnd:
         elif frame.kind is FrameKind.FENCE:
             self.mark(FrameKind.FENCED, frame.route, frame.sequence)
         elif frame.kind is not FrameKind.DATA:
-            bridge.receiver.mark(link, frame.kind, frame.route, frame.sequence)
+            bridge.mark(link, frame.kind, frame.route, frame.sequence)
+        elif (handler := self.routes.get(frame.route)) is None:
+            bridge.counters.add("route.unknown")
         elif frame.flags == FIRST | LAST:
-            bridge.receiver.data(link, frame.route, frame.sequence, frame.stamp_ns, memoryview(frame.payload))
+            handler.message(frame.sequence, frame.stamp_ns, memoryview(frame.payload))
         else:
-            part = memoryview(frame.payload)
-            bridge.receiver.part(link, frame.route, frame.sequence, frame.stamp_ns, frame.flags, part)
+            handler.part(frame.sequence, frame.stamp_ns, frame.flags, memoryview(frame.payload))
 
     def end(self, *, silent: bool) -> None:
         """This end notices that the link is gone."""

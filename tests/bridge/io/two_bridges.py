@@ -303,7 +303,7 @@ class World:
                 assert not topics.flows
                 assert not topics._latest
                 assert not topics._watches
-                assert not any(attached.handlers), "but route 0, which every link has"
+                assert not any(attached.link.routes), "but route 0, which every link has"
         for end in self._ends:
             for lane in (end.express, end.bulk):
                 assert lane.outbox.pending_bytes == 0

@@ -59,6 +59,7 @@ class Link:
     def __init__(self, run_number: int, *, silent: bool, host: str = "10.0.0.1") -> None:
         self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)
         self.guid = self.identity.guid
+        self.routes: dict[int, object] = {}
         self.silent = silent
         self.crashed = False
 
@@ -68,11 +69,9 @@ class Scene:
 
     def __init__(self, *outages: float, before: Sequence[Part] = ()) -> None:
         self.part = Keeper(*outages)
-        nodes, receiver = SimpleNamespace(), SimpleNamespace(link_up=lambda *_: None, link_down=lambda _: None)
+        nodes = cast("Any", SimpleNamespace())
         self.gate = PermissionGate()
-        self.sessions = PeerSessions(
-            [*before, self.part], cast("Any", nodes), cast("Any", receiver), self._killed, self.gate
-        )
+        self.sessions = PeerSessions([*before, self.part], nodes, self._killed, self.gate)
 
     async def _killed(self, *_: object) -> RosReply:
         raise NotImplementedError

@@ -12,6 +12,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Lane
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from tests.mesh.worlds import AnyRoute
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -71,22 +72,25 @@ class Peer:
         self.mesh = Mesh(
             self.identity,
             sock,
-            on_link_up=self.ups.append,
+            on_link_up=self.on_link_up,
             on_link_down=lambda link, down: self.downs.append((link, down.reason)),
             on_control=lambda _link, payload: self.controls.append(payload),
-            handlers=LinkHandlers(self.on_data, self.on_part, self.on_mark, self.clocks.append, self.on_lane_lost),
+            handlers=LinkHandlers(self.on_mark, self.clocks.append, self.on_lane_lost),
             lanes=lanes,
             security=security,
             on_join=on_join,
         )
 
-    def on_data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        assert link.used, "what comes by the bulk lane is its link's too"
+    def on_link_up(self, link: PeerLink) -> None:
+        self.ups.append(link)
+        link.routes = AnyRoute(self.on_data, self.on_part)
+        link.use(self.mesh.handlers)
+
+    def on_data(self, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         self.data.append((route, sequence, stamp_ns, bytes(payload)))
 
-    def on_part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def on_part(self, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """Put fragments together; a message is there when its last one is."""
-        assert link.used
         if flags & FIRST:
             assert route not in self._begun
             self._begun[route] = (sequence, stamp_ns, bytearray())

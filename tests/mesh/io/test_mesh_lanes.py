@@ -16,6 +16,7 @@ from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse, pack_data_header, unpack_header
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
+from tests.mesh.worlds import AnyRoute
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -124,8 +125,8 @@ async def test_handlers_receive_from_both_lanes() -> None:
     async with linked_pair() as (one, other):
         got: list[int] = []
         link = other.link(one)
-        taken = replace(other.mesh.handlers, data=lambda k, r, s, t, p: got.append(s))
-        link.use(taken)
+        link.routes = AnyRoute(lambda _r, sequence, _t, _p: got.append(sequence))
+        link.use(other.mesh.handlers)
         one.link(other).bulk.send(7, 1, 0, b"x")
         one.link(other).express.send(7, 2, 0, b"x")
         await until(lambda: sorted(got) == [1, 2], "both")

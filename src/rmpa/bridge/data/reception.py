@@ -10,7 +10,7 @@ import asyncio
 import math
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.quality import QosWatch, Quality
 from rmpa.bridge.data.route import ReceptionHistory
@@ -20,7 +20,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.frames import FrameKind
+from rmpa.mesh.connection import DataHandler
 from rmpa.mesh.reliable import ReliableReceiver
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import LENGTH
@@ -28,11 +28,9 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.data.export import RouteSender
     from rmpa.bridge.data.quality import QosEvent
-    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.publication import Publication
 
 
@@ -63,99 +61,12 @@ class LinkTime:
         self.error_ns = None if error is None else round(error * 1e9)
 
 
-# Passes the data frames of the links to the handlers of their routes: the path of every message.
-
-
 _PREFIX_SIZE: Final = LENGTH.size
-
-
-class DataHandler(Protocol):
-    """Takes the data that arrives on one route."""
-
-    def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
-        """Take a whole message, its 4-byte length in front; ``framed`` is valid during the call only."""
-        ...
-
-    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """Take a part of a large message (``core.outbox`` FIRST, LAST, ABORT); valid during the call only."""
-        ...
-
-
-class DataReceiver:
-    """Finds the handler of a frame by its link and its route; drops frames of routes that were closed meanwhile.
-
-    Args:
-        counters: Counts dropped frames as ``route.unknown``.
-        sender: ``(peer, route)``: returns the sender of a route, for acknowledgements and fences.
-    """
-
-    def __init__(self, counters: Counters, sender: Callable[[int, int], RouteSender | None]) -> None:
-        self._counters = counters
-        self._sender = sender
-        self._handlers: dict[PeerLink, Mapping[int, DataHandler]] = {}
-        self._peers: dict[PeerLink, int] = {}
-
-    def link_up(self, link: PeerLink, peer: int, handlers: Mapping[int, DataHandler]) -> None:
-        """Accept data from a link.
-
-        Args:
-            link: The link.
-            peer: The number of its peer's session.
-            handlers: The handler of each open route, by its id; changes as routes are opened and closed.
-        """
-        self._handlers[link] = handlers
-        self._peers[link] = peer
-
-    def link_down(self, link: PeerLink) -> None:
-        """Drop further data of a link that is gone."""
-        self._handlers.pop(link, None)
-        self._peers.pop(link, None)
-
-    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        """Pass on a data frame with a whole message.
-
-        Raises:
-            RemoteProtocolError: The frame does not hold exactly one message; the caller closes the link.
-        """
-        handlers = self._handlers.get(link)
-        handler = handlers.get(route) if handlers is not None else None
-        if handler is None:
-            self._counters.add("route.unknown")
-            return
-        size = len(payload)
-        if size < _PREFIX_SIZE or LENGTH.unpack_from(payload)[0] != size - _PREFIX_SIZE:
-            raise RemoteProtocolError(f"a data frame of {size} bytes on route {route} does not hold one message")
-        handler.message(sequence, stamp_ns, payload)
-
-    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
-        """Pass on a part of a large message."""
-        handlers = self._handlers.get(link)
-        if handlers is None:
-            return
-        handler = handlers.get(route)
-        if handler is None:
-            self._counters.add("route.unknown")
-        else:
-            handler.part(sequence, stamp_ns, flags, part)
-
-    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
-        """Pass an acknowledgement, or the answer to a fence, to the route's sender."""
-        peer = self._peers.get(link)
-        sender = self._sender(peer, route) if peer is not None else None
-        if sender is None:
-            return
-        if kind is FrameKind.ACK:
-            sender.acknowledged(sequence)
-        elif kind is FrameKind.FENCED:
-            sender.fenced(sequence)
-
-
-_PREFIX_SIZE_OF_PART: Final = 4
 _NONE: Final = -1
 """No expected sequence: no message came yet, or one is coming in parts, so each sequence is checked closely."""
 
 
-class ImportFlow:
+class ImportFlow(DataHandler):
     """From one peer's route to the local subscribers of its proxy.
 
     Args:
@@ -283,7 +194,13 @@ class ImportFlow:
             sequence: The number of the message.
             stamp_ns: When it came from its publisher, by the peer's wall clock, ns.
             framed: The message, its 4-byte length in front; valid during the call only.
+
+        Raises:
+            RemoteProtocolError: ``framed`` is not exactly one message.
         """
+        size = len(framed)
+        if size < _PREFIX_SIZE or LENGTH.unpack_from(framed)[0] != size - _PREFIX_SIZE:
+            raise RemoteProtocolError(f"a data frame of {size} bytes does not hold one message")
         now_ns = time.time_ns()
         if self._plain:
             if sequence != self._expected and not self._follows(sequence):
@@ -296,12 +213,12 @@ class ImportFlow:
                 return
             if self._held is not None:
                 self._drop_held()
-        elif not self._accept(sequence, stamp_ns, len(framed), now_ns) or (
+        elif not self._accept(sequence, stamp_ns, size, now_ns) or (
             self._replay is not None and self._is_replay(framed)
         ):
             return
         self._output.publish_framed(framed)
-        self._note(stamp_ns, now_ns, len(framed))
+        self._note(stamp_ns, now_ns, size)
 
     def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """Take a part of a large message.
@@ -471,9 +388,9 @@ class ImportFlow:
 
     def _begin(self, sequence: int, stamp_ns: int, part: memoryview) -> None:
         """Takes the first part of a message, which begins with the message's length."""
-        if len(part) < _PREFIX_SIZE_OF_PART:
+        if len(part) < _PREFIX_SIZE:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
-        size = _PREFIX_SIZE_OF_PART + int.from_bytes(part[:_PREFIX_SIZE_OF_PART], "little")
+        size = _PREFIX_SIZE + int.from_bytes(part[:_PREFIX_SIZE], "little")
         if size > ros_limits.MESSAGE_MAX:
             raise LimitExceeded("message", size, ros_limits.MESSAGE_MAX)
         if self._receiver is not None:

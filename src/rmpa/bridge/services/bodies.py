@@ -25,6 +25,7 @@ from rmpa.core.identity import OWN_NODE
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.connection import DataHandler
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.runtime.loop import yield_to_data
@@ -160,8 +161,8 @@ class BodySender:
         self._task = None
 
 
-class BodyReceiver:
-    """Reassembles the bodies that arrive on one route; a ``bridge.data.reception.DataHandler``, for subclasses.
+class BodyReceiver(DataHandler):
+    """Reassembles the bodies that arrive on one route; for subclasses.
 
     Args:
         budget: Bounds the bytes of the peer's bodies while they are reassembled.
@@ -186,7 +187,13 @@ class BodyReceiver:
         raise NotImplementedError
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
-        """Handle a body that arrived in one frame."""
+        """Handle a body that arrived in one frame.
+
+        Raises:
+            RemoteProtocolError: The frame does not hold exactly one body.
+        """
+        if int.from_bytes(framed[:_LENGTH], "little") != len(framed) - _LENGTH:
+            raise RemoteProtocolError(f"a data frame of {len(framed)} bytes does not hold one message")
         self._stamp_ns = stamp_ns
         self.body(sequence, bytes(framed[_LENGTH:]))
 

@@ -395,7 +395,7 @@ class Serving:
                     server.close()
                 session = self._sessions.get(action.peer)
                 if session is not None:
-                    session.handlers.pop(action.requests, None)
+                    session.link.routes.pop(action.requests, None)
             case ServerGone():
                 pool = self._pools.pop(action.service, None)
                 if pool is not None:
@@ -462,7 +462,7 @@ class Serving:
             session.time,
         )
         self._servers[action.peer, action.requests] = server
-        session.handlers[action.requests] = server
+        session.link.routes[action.requests] = server
 
     async def _look_after(self) -> None:
         """Find killed servers: a node with an offered service whose port has no listener is suspected."""

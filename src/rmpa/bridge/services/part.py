@@ -471,7 +471,7 @@ class Services(Part):
         what = f"service [{shown.service}] of {shown.peer_name}"
         description, budgets = description_of(action.about), self._budgets[action.peer]
         caller = shown.caller = Caller(session.link, action.requests, what, budgets, shown.stats, description)
-        session.handlers[action.route] = caller
+        session.link.routes[action.route] = caller
         self._callers[action.peer, action.route] = shown
         asking, shown.asking = shown.asking, []
         for future in asking:
@@ -484,7 +484,7 @@ class Services(Part):
     def _ended(self, action: EndedService) -> None:
         session = self._sessions.get(action.peer)
         if session is not None:
-            session.handlers.pop(action.route, None)
+            session.link.routes.pop(action.route, None)
         shown = self._callers.pop((action.peer, action.route), None)
         if shown is not None and shown.caller is not None:
             caller, shown.caller = shown.caller, None

@@ -4,7 +4,7 @@ The two plans are pure (``bridge.topics.imports``, ``bridge.topics.exports``); t
 path of a message::
 
     publisher → ExportFlow (LocalSubscriptions) → RouteSender ⇢ link
-         link ⇢ DataReceiver → ImportFlow (PeerTopics) → Publication → subscribers
+         link ⇢ ImportFlow (PeerTopics) → Publication → subscribers
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class PeerTopics:
 
     Args:
         core: The local core, in which the proxies are registered as publishers.
-        session: The peer: its proxies, the handlers of its routes and the time of its link.
+        session: The peer: its proxies, its link with the handlers of its routes, and its time.
         counters: Counts messages that reach no subscriber.
         on_demand: Called with a source and whether a local node listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text of the refusal.
@@ -178,7 +178,7 @@ class PeerTopics:
         if publication is None:
             return
         flow, goes_on = self._flow(action, publication, on_ack)
-        self.flows[action.route] = self.session.handlers[action.route] = flow
+        self.flows[action.route] = self.session.link.routes[action.route] = flow
         about = action.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
         if publication.describe(TopicDescription(about.type, about.md5, text, about.latching)):
@@ -318,7 +318,7 @@ class PeerTopics:
     def detach(self, action: Detach) -> None:
         """End a route's data; with ``keep`` its flow waits for the peer's next link."""
         flow = self.flows.pop(action.route, None)
-        self.session.handlers.pop(action.route, None)
+        self.session.link.routes.pop(action.route, None)
         if action.keep:
             if flow is not None:
                 self._watches[action.source].arm()
@@ -343,7 +343,7 @@ class PeerTopics:
             self._end(source, flow)
         self._latest.clear()
         for route in self.flows:
-            self.session.handlers.pop(route, None)
+            self.session.link.routes.pop(route, None)
         self.flows.clear()
 
     # --- at the proxies ----------------------------------------------------------------------------------------

@@ -31,11 +31,11 @@ from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-    from rmpa.core.counters import Clock
+    from rmpa.core.counters import Clock, Counters
     from rmpa.core.identity import Guid, Identity
-    from rmpa.mesh.connection import OnData, OnPart
+    from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.keepalive import RemoteClock, RestPace
@@ -54,6 +54,8 @@ _ENDED_THERE: Final = frozenset({errno.ECONNRESET, errno.EPIPE})
 
 class ConnectionOwner(Protocol):
     """The events that a connection reports to the mesh; all methods are called from the event loop."""
+
+    counters: Counters
 
     def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello of a dialler: ``None`` accepts the connection."""
@@ -172,7 +174,7 @@ class Connection:
             clock.now(),
             wall_ns=clock.wall_ns,
             on_event=self._event,
-            on_data=_ignore_data,
+            counters=owner.counters,
             expected=expected,
             lane=lane,
             lease=limits.BULK_LEASE if lane is Lane.BULK else limits.EXPRESS_LEASE,
@@ -237,13 +239,9 @@ class Connection:
         """Monotonic seconds at which bytes were last received."""
         return max(self._machine.heard_at, self.stream.last_in)
 
-    def deliver_to(self, data: OnData | None, part: OnPart | None, mark: OnMark | None) -> None:
-        """Call these for data, parts and marks from now on; ``None`` drops them.
-
-        Their arguments are those of ``ConnectionProtocol``.
-        """
-        self._machine.on_data = _ignore_data if data is None else data
-        self._machine.on_part = _ignore_part if part is None else part
+    def deliver_to(self, routes: Mapping[int, DataHandler], mark: OnMark | None) -> None:
+        """Pass data to the handlers of these routes, and marks to ``mark``, from now on; ``None`` drops them."""
+        self._machine.routes = routes
         self._on_mark = _ignore_mark if mark is None else mark
 
     def send_mark(self, kind: FrameKind, route: int, sequence: int) -> None:
@@ -411,7 +409,7 @@ class Connection:
 
     def _report_end(self, reason: str) -> None:
         self.stream.close()
-        self.deliver_to(None, None, None)
+        self.deliver_to({}, None)
         # The machine would keep this object, with its perhaps large buffers, in a reference cycle until a collection.
         self._machine.on_event = _ignore_event
         self._machine.prove = None
@@ -429,14 +427,6 @@ class Connection:
         if was_up and not self.silent and now - self.heard_at > self.quiet_after:
             self._owner.connection_quiet(self)
         self._send_output()
-
-
-def _ignore_data(_route: int, _sequence: int, _stamp_ns: int, _payload: memoryview) -> None:
-    """Drops data of a connection that no link uses."""
-
-
-def _ignore_part(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
-    """Drops parts of messages of a connection that no link uses."""
 
 
 def _ignore_mark(_kind: FrameKind, _route: int, _sequence: int) -> None:

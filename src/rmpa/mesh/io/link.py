@@ -11,7 +11,6 @@ import asyncio
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from rmpa.core.counters import Clock, Counters
+    from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.io.connection import Connection
     from rmpa.runtime.stream import Stream
     from rmpa.runtime.tls import Buffer
@@ -175,26 +175,19 @@ def _nothing() -> None:
 # The link to one peer: two lanes, each with a connection, and the handlers of the received messages.
 
 
-OnLinkData = Callable[["PeerLink", int, int, int, memoryview], None]
-OnLinkPart = Callable[["PeerLink", int, int, int, int, memoryview], None]
 OnLinkMark = Callable[["PeerLink", FrameKind, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class LinkHandlers:
-    """The handlers of the frames of a link that is used with its peer.
+    """The handlers of the marks and events of a link that is used with its peer.
 
     Args:
-        data: ``(link, route, sequence, stamp_ns, payload)``: a whole message; the payload is only valid during the
-            call.
-        part: ``(link, route, sequence, stamp_ns, flags, part)``: a part of a message; only valid during the call.
         mark: ``(link, kind, route, sequence)``: an acknowledgement, or the answer to a fence.
         clock: ``(link)``: the estimate of the peer's clock is new or more exact.
         lane_lost: ``(link)``: the bulk lane lost its connection, with the messages in flight; the link is still up.
     """
 
-    data: OnLinkData
-    part: OnLinkPart
     mark: OnLinkMark
     clock: Callable[[PeerLink], None]
     lane_lost: Callable[[PeerLink], None]
@@ -227,6 +220,8 @@ class PeerLink:
         """The connection of the bulk lane, while there is one."""
         self.express: Final = LaneSender("express")
         self.bulk: Final = LaneSender("bulk", lambda: on_bulk_wanted(self))
+        self.routes: dict[int, DataHandler] = {}
+        """The handlers of the data that arrives, by route; both lanes look here while the link is used."""
         self.bulk_wanted = False
         """Whether a message of either side has wanted the bulk lane."""
         self.silent = False
@@ -369,7 +364,7 @@ class PeerLink:
     # --- for the mesh -----------------------------------------------------------------------------------------
 
     def use(self, handlers: LinkHandlers | None) -> None:
-        """Pass the frames of both lanes to these handlers; ``None``: the link is not used, and data is dropped."""
+        """Pass what arrives on both lanes to ``routes`` and these handlers; ``None``: the link is not used."""
         self._handlers = handlers
         for connection in (self.connection, self.bulk_connection):
             if connection is not None:
@@ -397,7 +392,7 @@ class PeerLink:
         self.bulk_connection = None
         self._bulk_bytes_in += bulk.stream.bytes_in
         self._bulk_bytes_out += bulk.stream.bytes_out
-        bulk.deliver_to(None, None, None)
+        bulk.deliver_to({}, None)
         self.bulk.disconnect()
         if self._handlers is not None:
             self._handlers.lane_lost(self)
@@ -408,7 +403,7 @@ class PeerLink:
         self.bulk.end()
         if self.bulk_connection is not None:
             bulk, self.bulk_connection = self.bulk_connection, None
-            bulk.deliver_to(None, None, None)
+            bulk.deliver_to({}, None)
             bulk.close(reason)
 
     def discard(self) -> int:
@@ -422,9 +417,9 @@ class PeerLink:
     def _receive_from(self, connection: Connection) -> None:
         handlers = self._handlers
         if handlers is None:
-            connection.deliver_to(None, None, None)
+            connection.deliver_to({}, None)
         else:
-            connection.deliver_to(partial(handlers.data, self), partial(handlers.part, self), self._marked)
+            connection.deliver_to(self.routes, self._marked)
 
     def _marked(self, kind: FrameKind, route: int, sequence: int) -> None:
         """Answer a fence on the express lane, whichever lane it arrived on; pass other marks to the handlers."""

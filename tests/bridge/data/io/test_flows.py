@@ -431,6 +431,18 @@ def test_parts_that_make_no_message_are_the_peers_error(
     assert not inlet.outlet.in_the_middle
 
 
+NO_MESSAGE = pytest.mark.parametrize("payload", [b"", b"\0\0\0", b"\3\0\0\0hi", b"\1\0\0\0hi"])
+
+
+@NO_MESSAGE
+@pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
+def test_a_frame_that_does_not_hold_one_message_breaks_the_protocol(payload: bytes, contract: Contract) -> None:
+    inlet = Inlet(contract)
+    with pytest.raises(RemoteProtocolError, match="does not hold one message"):
+        inlet.flow.message(1, 0, memoryview(payload))
+    assert inlet.got == []
+
+
 def test_a_claimed_size_is_not_stored() -> None:
     inlet = Inlet(RELIABLE)
     inlet.flow.begin_epoch(1, 1)

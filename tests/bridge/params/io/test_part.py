@@ -107,14 +107,12 @@ class Side:
                 asyncio.get_running_loop().call_soon(other.asks.message, back, decode(payload))
 
         wire = Wire()
-        wire.name, wire.send_control = other.name, send
-        attached = cast(
-            "PeerSession", SimpleNamespace(peer=number, linked=True, link=wire, handlers={}, time=LinkTime())
-        )
+        wire.name, wire.send_control, wire.routes = other.name, send, {}
+        attached = cast("PeerSession", SimpleNamespace(peer=number, linked=True, link=wire, time=LinkTime()))
         self.links[number] = attached
         self.asks.link_up(attached)
         if (back := other.links.get(number)) is not None:
-            wire.takers, cast("Any", back.link).takers = cast("Any", back.handlers), attached.handlers
+            wire.takers, cast("Any", back.link).takers = cast("Any", back.link.routes), attached.link.routes
         return attached
 
     def up(self, number: int) -> None:

@@ -367,6 +367,14 @@ def test_parts_that_cannot_be_break_the_protocol(parts: list[tuple[int, bytes]],
         take()
 
 
+@pytest.mark.parametrize("payload", [b"", b"\0\0\0", b"\3\0\0\0hi", b"\1\0\0\0hi"])
+def test_a_frame_that_does_not_hold_one_body_breaks_the_protocol(payload: bytes) -> None:
+    taker = Kept()
+    with pytest.raises(RemoteProtocolError, match="does not hold one message"):
+        taker.message(1, 0, memoryview(payload))
+    assert not taker.bodies
+
+
 def test_parts_that_are_not_followed_are_told_and_let_go() -> None:
     taker = Kept()
     taker.part(1, 0, FIRST, memoryview(b"\4\0\0\0ab"))

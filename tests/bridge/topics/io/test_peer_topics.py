@@ -77,7 +77,7 @@ class Proxied:
         self.proxies = PeerProxies("/rmpa/b", ProxyNodes(core))
         self.topics = PeerTopics(
             core,
-            PeerSession(1, cast("Any", None), self.proxies),
+            PeerSession(1, cast("Any", SimpleNamespace(routes={})), self.proxies),
             on_demand=lambda _source, wanted: self.demands.append(wanted),
             on_mismatch=lambda _source, _who, text: pytest.fail(text),
             on_occurred=lambda _source, occurred: self.occurred.append((self.loop.time(), occurred)),
