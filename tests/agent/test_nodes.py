@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rmpa.bridge.nodes import NODES, NodePresence
+from rmpa.bridge.nodes import NODES, Nodes
 from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
@@ -230,7 +230,7 @@ async def test_modules_that_ignore_each_other_do_not_show_their_nodes(settings: 
         await viewer.subscribe("/chatter", "std_msgs/String")
         await other.subscribe("/chatter", "std_msgs/String")
         for each in (a, b):
-            (presence,) = [part for part in each.bridge._parts if isinstance(part, NodePresence)]
+            (presence,) = [part for part in each.bridge._parts if isinstance(part, Nodes)]
             presence._tell()
         await ask(a, tuple[PeerNodes, ...], "node.list")  # behind what was told, over the same link
         await ask(b, tuple[PeerNodes, ...], "node.list", peer="a")

@@ -16,7 +16,7 @@ from rmpa.agent.network import Network
 from rmpa.agent.process import Reloader, WebProcess, run_process, serve, web_command, web_environment
 from rmpa.agent.trust import AgentTrust, PlainOperations, TrustOperations, open_membership
 from rmpa.bridge.bridge import Bridge, TwinWatch
-from rmpa.bridge.nodes import NodePresence, NodeRequests
+from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.services.part import Services
@@ -202,10 +202,9 @@ class Agent:
             permissions=Permissions(settings.trust) if membership is not None else None,
         )
         self.params, self.services = Params(self.bridge), Services(self.bridge)
-        self._nodes = NodeRequests(self.bridge)
-        presence = NodePresence(self.bridge, self.bridge.topics, self.services, self._nodes.visible)
+        nodes = Nodes(self.bridge, self.services)
         twins = TwinWatch(self.bridge)
-        for part in (self.params, self.services, presence, twins):
+        for part in (self.params, self.services, nodes, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
@@ -241,7 +240,7 @@ class Agent:
         """Answers questions about other sites; a gateway answers them itself."""
         self.why = WhyService(settings.name, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(
-            settings.name, self.bridge, self.params, self.snapshots, self._nodes, self.sites
+            settings.name, self.bridge, self.params, self.snapshots, nodes, self.sites
         )
         self.trust_commands = self._trust_operations()
         handlers: dict[str, Handler] = {

@@ -1,11 +1,4 @@
-"""The nodes of peers: those of which nothing crosses, questions about them, and ``rosnode kill`` of proxies.
-
-Nodes of which nothing crosses: each peer is told of them, and they stand in every graph by their proxies.
-
-Topics and services bring the proxies of their nodes. A node that only subscribes, or whose services stay home, would
-not be known to ``rosnode`` in the other modules. Its proxy is registered with one service of its own,
-``~get_loggers``, as every ROS node has it: no publisher, relay or subscriber takes notice of that.
-"""
+"""The nodes of peers: those of which nothing crosses, questions about them, and ``rosnode kill`` of proxies."""
 
 from __future__ import annotations
 
@@ -16,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.proxies import ProxyCallbacks
@@ -37,55 +29,72 @@ from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Collection, Mapping
 
-    from rmpa.bridge.context import Shared
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.part import Topics
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
 
+_log = logging.getLogger(__name__)
+
 NODES: Final = "nodes"
 """The notification of the sender's nodes of which nothing crosses: ``nodes``, their names."""
+LIST: Final = "node.list"
+"""The request for a module's own nodes."""
+INFO: Final = "node.info"
+"""The request for the facts about a ``node``: ``NodeFacts``."""
+PING: Final = "node.ping"
+"""The request to ping a ``node``."""
+KILL: Final = "node.kill"
+"""The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
+
+The response is a ``NodeEnd``.
+"""
+REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
+"""The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
+_VISIBLE: Final = Needs(
+    (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
+    "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
+)
 _HELD: Final = "node"
 _EVERYWHERE: Final = "/rosout"
 """Every module has this node."""
 _NO_LOGGERS: Final = LENGTH.pack(0)
+_REFUSED: Final = 0
 
 
-class NodePresence(Part):
-    """The part of the bridge that tells of nodes and shows those of peers.
+class Nodes(Part):
+    """The part of the bridge that tells peers of this module's nodes, and shows theirs.
+
+    Topics and services bring the proxies of their nodes. A node that only subscribes, or whose services stay home,
+    would not be known to ``rosnode`` in the other modules. Its proxy is registered with one service of its own,
+    ``~get_loggers``, as every ROS node has it: no publisher, relay or subscriber takes notice of that.
 
     Args:
-        shared: The core, the peers and the rules. ``limits.nodes`` bounds how many nodes a peer shows, and is told.
-        topics: The part with the topics' plans.
-        services: The part with the services' plans.
-        visible: ``(peer) -> nodes``: which nodes a peer may know of.
+        bridge: Has the peers, the rules and the topics that cross. ``limits.nodes`` bounds how many nodes a peer
+            shows, and is told.
+        services: The part with the services that cross.
     """
 
-    def __init__(
-        self,
-        shared: Shared,
-        topics: Topics,
-        services: Services,
-        visible: Callable[[str], Collection[str]],
-    ) -> None:
-        self._shared = shared
-        self._core = shared.core
-        self._sessions = shared.sessions
-        self._rpc = shared.rpc
-        self._topics = topics
+    def __init__(self, bridge: Bridge, services: Services) -> None:
+        self._bridge = bridge
+        self._core = bridge.core
         self._services = services
-        self._visible = visible
         self._told: dict[int, tuple[str, ...]] = {}
         """What each linked peer was told, by the number of its session."""
         self._shown: dict[int, set[str]] = {}
         """The nodes that each peer has told of."""
         self._soon: asyncio.TimerHandle | None = None
-        shared.rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
+        rpc = bridge.rpc
+        rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
+        rpc.on_request(LIST, self._list, _VISIBLE)
+        rpc.on_request(INFO, self._info, _VISIBLE)
+        rpc.on_request(PING, self._ping, _VISIBLE)
+        rpc.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
 
     async def close(self) -> None:
         """Tell nothing any more."""
@@ -105,22 +114,18 @@ class NodePresence(Part):
         """Register missing proxies again: the core has been restarted."""
         services = self._core.state().services
         for peer, nodes in self._shown.items():
-            session = self._sessions.get(peer)
+            session = self._bridge.sessions.get(peer)
             for node in nodes:
                 proxy = session.proxies.get(node) if session is not None else None
                 if proxy is not None and _service(proxy) not in services:
                     self._register(proxy)
 
-    # --- to the peers -------------------------------------------------------------------------------------------
+    # --- nodes of which nothing crosses, to the peers ----------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Tell a peer with a new link."""
         self._told.pop(session.peer, None)
         self._later()
-
-    def link_down(self, session: PeerSession) -> None:
-        """Forget what a peer was told: it is told anew over its next link."""
-        self._told.pop(session.peer, None)
 
     def _later(self) -> None:
         """In a moment: a node that starts registers its loggers first, and then perhaps a topic that crosses."""
@@ -131,7 +136,7 @@ class NodePresence(Part):
         if self._soon is not None:
             self._soon.cancel()
             self._soon = None
-        crossing = {source.node for source in self._topics.exports.offered}
+        crossing = {source.node for source in self._bridge.topics.exports.offered}
         crossing |= {server.node for server in self._services.exports.offered.values()}
         nodes = [
             node
@@ -142,28 +147,28 @@ class NodePresence(Part):
             and not node.startswith(MEASURING)
             and is_crossing_name(node)
         ]
-        for session in self._sessions.linked():
+        most = self._bridge.context.settings.limits.nodes
+        for session in self._bridge.sessions.linked():
             peer = session.link.name
             visible = self._visible(peer)
-            passing = sorted(one for one in nodes if one in visible and self._passes(peer, one))
-            names = tuple(passing[: self._shared.context.settings.limits.nodes])
+            names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[:most])
             if names != self._told.get(session.peer):  # over a new link also that there are none any more
                 self._told[session.peer] = names
-                self._rpc.notify(session, NODES, {"nodes": list(names)})
+                self._bridge.rpc.notify(session, NODES, {"nodes": list(names)})
 
     def _passes(self, peer: str, node: str) -> bool:
         """Whether the rules for a peer let a node's name cross, as they do its topics and services."""
-        return self._shared.context.policy.judge_for(peer, node, wire=node).allowed
+        return self._bridge.context.policy.judge_for(peer, node, wire=node).allowed
 
-    # --- of the peers -------------------------------------------------------------------------------------------
+    # --- and of the peers ---------------------------------------------------------------------------------------
 
     def _told_by_peer(self, session: PeerSession, args: dict[str, Any]) -> None:
         told = args.get("nodes")
-        names: list[Any] = told[: self._shared.context.settings.limits.nodes] if isinstance(told, list) else [None]
+        names: list[Any] = told[: self._bridge.context.settings.limits.nodes] if isinstance(told, list) else [None]
         if not all(isinstance(name, str) and is_crossing_name(name) for name in names):
             raise RemoteProtocolError(f"{NODES} has no list of nodes' names")
         wanted = {name for name in names if self._passes(session.link.name, name)}
-        shown = self._shown.setdefault(session.peer, set())
+        shown = self._shown.get(session.peer, set())
         for node in sorted(shown - wanted):
             session.proxies.release(node, _HELD)
         for node in sorted(wanted - shown):
@@ -173,8 +178,7 @@ class NodePresence(Part):
     def gone(self, session: PeerSession) -> None:
         """Forget a peer; its proxies go with its session."""
         self._told.pop(session.peer, None)
-        for node in self._shown.pop(session.peer, ()):
-            session.proxies.release(node, _HELD)
+        self._shown.pop(session.peer, None)
 
     def _show(self, proxy: SlaveNode) -> None:
         proxy.add_service(ServiceEndpoint(_service(proxy), proxy.name, _answer, description=GET))
@@ -187,6 +191,110 @@ class NodePresence(Part):
         self._core.call("unregisterService", proxy.name, _service(proxy), proxy.service_uri)
         proxy.remove_service(_service(proxy))
 
+    # --- the peers' requests ------------------------------------------------------------------------------------
+
+    def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
+        problems = {node: found.problem for node, found in self._core.unreachable().items()}
+        found = list_nodes(*self._tables(asker.link.name), self._core.state().nodes, problems, yielding_to_data)
+        return tuple(line for line in found if not is_own(line.name))
+
+    def _tables(self, peer: str = "") -> list[Mapping[str, Collection[str]]]:
+        """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
+        state, gate = self._core.state(), self._bridge.gate
+        tables: list[Mapping[str, Collection[str]]] = [state.publishers, state.subscribers, state.services]
+        if not peer or not gate.on:
+            return tables
+        return [
+            {
+                name: nodes
+                for name, nodes in yielding_to_data(list(table.items()))
+                if gate.judge(access, peer, name).allowed
+            }
+            for access, table in zip(_VISIBLE.access, tables, strict=True)
+        ]
+
+    def _visible(self, peer: str) -> Collection[str]:
+        """The nodes that a peer is told of: those of which it may have something."""
+        if not self._bridge.gate.on:
+            return self._core.state().nodes
+        return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
+
+    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+        return await self.info(args, asker.link.name)
+
+    async def info(self, args: Mapping[str, object], peer: str = "") -> NodeFacts:
+        """The facts about the ``node`` of this module that a request names.
+
+        Args:
+            args: The request's.
+            peer: A peer that asks, which is not told the names of what it may not have; empty: this module.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        node, uri = self._own(args, self._visible(peer) if peer else None)
+        state, gate = self._core.state(), self._bridge.gate
+        facts = describe_node(node, uri, *self._tables(peer), state.types)
+        try:
+            answer = await ping_node(node, uri, OWN_NODE)
+        except RmpaError as error:
+            return msgspec.structs.replace(facts, problem=str(error))
+        names = {address: name for name, address in state.nodes.items()}
+        connections = await node_connections(uri, OWN_NODE, names)
+        if peer and connections is not None:
+            connections = tuple(
+                one
+                for one in connections
+                if gate.judge(Access.PUBLISH if one.inbound else Access.SUBSCRIBE, peer, one.topic).allowed
+            )
+        return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
+
+    async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
+        node, uri = self._own(args, self._visible(asker.link.name))
+        return await ping_node(node, uri, OWN_NODE)
+
+    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
+        peer, gate = asker.link.name, self._bridge.gate
+        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+        if why := gate.why_not(Access.KILL, peer, named):
+            raise RmpaError(why)  # before whether there is such a node
+        nodes = [node for node in self._core.state().nodes if gate.judge(Access.KILL, peer, node).allowed]
+        node, uri = self._own(args, nodes)
+        who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
+        if not any(matches(glob, node) for glob in self._bridge.context.settings.nodes.kill):
+            _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
+            here = self._bridge.context.settings.name
+            raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
+        _log.warning("= %s ends %s", who, node)
+        gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
+        self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
+        return NodeEnd(gone=gone)
+
+    def _own(self, args: Mapping[str, object], told: Collection[str] | None) -> tuple[str, str]:
+        """The node of this module that a request names, and its slave API.
+
+        Args:
+            args: The request's.
+            told: The nodes that may be told of; ``None``: all.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        here = self._bridge.context.settings.name
+        node = args.get("node")
+        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
+            raise RmpaError("the question names no node")
+        if is_own(node):
+            origin = proxied_node(node)
+            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
+            raise RmpaError(f"{node} is no node of {here}: {whose}")
+        nodes = self._core.state().nodes
+        known = nodes if told is None else told
+        if node not in known or node not in nodes:
+            near = did_you_mean(node, [name for name in known if not is_own(name)])
+            raise RmpaError(f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""))
+        return node, nodes[node]
+
 
 def _service(proxy: SlaveNode) -> str:
     return f"{proxy.name}/get_loggers"
@@ -197,21 +305,8 @@ def _answer(call: ServiceCall) -> None:
     call.reply(True, _NO_LOGGERS)
 
 
-# Answers ``rosnode kill`` of a proxy: asks the agent of the node's module to end the node itself.
-
-
-_log = logging.getLogger(__name__)
-
-KILL: Final = "node.kill"
-"""The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
-
-The response is a ``NodeEnd``.
-"""
-_REFUSED: Final = 0
-
-
 class ProxyKills:
-    """Answers the ``shutdown`` calls to proxies and to the agent's own node.
+    """Answers the ``shutdown`` calls (``rosnode kill``) to proxies and to the agent's own node.
 
     ``rosnode kill -a`` calls every node of the graph in the order of their names, so the agent's own node comes
     before the proxies. It ends only the nodes of this module; nodes of other modules live on.
@@ -223,6 +318,7 @@ class ProxyKills:
     def __init__(self, rpc: PeerRpc) -> None:
         self._rpc = rpc
         self._all: dict[str, float] = {}
+        """By caller of ``kill -a``: until when its further calls are taken for a part of that."""
         self._under_way = 0
 
     async def own(self, caller: str, reason: str) -> RosReply:
@@ -257,9 +353,9 @@ class ProxyKills:
 
     async def _ask(self, session: PeerSession, node: str, caller: str, reason: str) -> str:
         """Asks the peer to end the node; returns why it is not ended, or empty."""
-        loop = asyncio.get_running_loop()
-        if self._all.get(caller, 0.0) > loop.time():
-            self._all[caller] = loop.time() + limits.NODE_KILL_ALL
+        now = asyncio.get_running_loop().time()
+        if self._all.get(caller, 0.0) > now:
+            self._all[caller] = now + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
         if not session.linked:
             return f"{session.link.name} is not linked"
@@ -273,154 +369,5 @@ class ProxyKills:
             return str(error)
         finally:
             self._under_way -= 1
-        if isinstance(answer, dict) and answer.get("gone"):
-            return ""
-        return f"it was asked, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"
-
-
-# The peers' requests about this module's nodes: list, describe, ping and end them.
-
-
-LIST: Final = "node.list"
-"""The request for a module's own nodes."""
-INFO: Final = "node.info"
-"""The request for the facts about a ``node``: ``NodeFacts``."""
-PING: Final = "node.ping"
-"""The request to ping a ``node``."""
-_VISIBLE: Final = Needs(
-    (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
-    "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
-)
-REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
-"""The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
-
-
-class NodeRequests:
-    """Answers the peers' requests about this module's nodes.
-
-    Args:
-        shared: The core, the peers and the rules.
-    """
-
-    def __init__(self, shared: Shared) -> None:
-        self._shared = shared
-        self._gate = shared.context.gate
-        self._core = shared.core
-        asks = shared.rpc
-        asks.on_request(LIST, self._list, _VISIBLE)
-        asks.on_request(INFO, self._info, _VISIBLE)
-        asks.on_request(PING, self._ping, _VISIBLE)
-        asks.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
-
-    def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
-        state, peer = self._core.state(), asker.link.name
-        problems = {node: found.problem for node, found in self._core.unreachable().items()}
-        publishers, subscribers, services = self._tables(peer)
-        found = list_nodes(publishers, subscribers, services, state.nodes, problems, yielding_to_data)
-        return tuple(line for line in found if not is_own(line.name))
-
-    def _tables(self, peer: str) -> list[Mapping[str, Collection[str]]]:
-        """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
-        state = self._core.state()
-        tables: list[Mapping[str, Collection[str]]] = [state.publishers, state.subscribers, state.services]
-        if not self._gate.on:
-            return tables
-        return [
-            {
-                name: nodes
-                for name, nodes in yielding_to_data(list(table.items()))
-                if self._gate.judge(access, peer, name).allowed
-            }
-            for access, table in zip((Access.SUBSCRIBE, Access.PUBLISH, Access.CALL), tables, strict=True)
-        ]
-
-    def visible(self, peer: str) -> Collection[str]:
-        """The nodes that a peer is told of: those of which it may have something."""
-        if not self._gate.on:
-            return self._core.state().nodes
-        return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
-
-    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
-        self._own(args, self.visible(asker.link.name))
-        return self._permitted(asker.link.name, await self.info(args))
-
-    async def info(self, args: Mapping[str, object]) -> NodeFacts:
-        """The facts about the ``node`` of this module that a request names.
-
-        Raises:
-            RmpaError: There is no such node.
-        """
-        node, uri = self._own(args)
-        state = self._core.state()
-        facts = describe_node(node, uri, state.publishers, state.subscribers, state.services, state.types)
-        try:
-            answer = await ping_node(node, uri, OWN_NODE)
-        except RmpaError as error:
-            return msgspec.structs.replace(facts, problem=str(error))
-        names = {address: name for name, address in state.nodes.items()}
-        connections = await node_connections(uri, OWN_NODE, names)
-        return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
-
-    def _permitted(self, asker: str, facts: NodeFacts) -> NodeFacts:
-        """The facts about a node, without the names of what a peer may not have."""
-
-        def may(access: Access, name: str) -> bool:
-            return self._gate.judge(access, asker, name).allowed
-
-        connections = facts.connections
-        if connections is not None:
-            needed = {True: Access.PUBLISH, False: Access.SUBSCRIBE}
-            connections = tuple(one for one in connections if may(needed[one.inbound], one.topic))
-        return msgspec.structs.replace(
-            facts,
-            publications={name: kind for name, kind in facts.publications.items() if may(Access.SUBSCRIBE, name)},
-            subscriptions={name: kind for name, kind in facts.subscriptions.items() if may(Access.PUBLISH, name)},
-            services=tuple(name for name in facts.services if may(Access.CALL, name)),
-            connections=connections,
-        )
-
-    async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
-        node, uri = self._own(args, self.visible(asker.link.name))
-        return await ping_node(node, uri, OWN_NODE)
-
-    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
-        peer = asker.link.name
-        named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
-        if why := self._gate.why_not(Access.KILL, peer, named):
-            raise RmpaError(why)  # before whether there is such a node
-        nodes = [node for node in self._core.state().nodes if self._gate.judge(Access.KILL, peer, node).allowed]
-        node, uri = self._own(args, nodes)
-        who = f"{peer}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
-        here = self._shared.context.settings.name
-        if not any(matches(glob, node) for glob in self._shared.context.settings.nodes.kill):
-            _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
-            raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
-        _log.warning("= %s ends %s", who, node)
-        gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
-        self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
-        return NodeEnd(gone=gone)
-
-    def _own(self, args: Mapping[str, object], told: Collection[str] | None = None) -> tuple[str, str]:
-        """The node of this module that a request names, and its slave API.
-
-        Args:
-            args: The request's.
-            told: The nodes that may be told of; ``None``: all.
-
-        Raises:
-            RmpaError: There is no such node.
-        """
-        here = self._shared.context.settings.name
-        node = args.get("node")
-        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
-            raise RmpaError("the question names no node")
-        if is_own(node):
-            origin = proxied_node(node)
-            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
-            raise RmpaError(f"{node} is no node of {here}: {whose}")
-        nodes = self._core.state().nodes
-        known = nodes if told is None else told
-        if node not in known or node not in nodes:
-            near = did_you_mean(node, [name for name in known if not is_own(name)])
-            raise RmpaError(f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""))
-        return node, nodes[node]
+        gone = isinstance(answer, dict) and answer.get("gone")
+        return "" if gone else f"it was asked, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"

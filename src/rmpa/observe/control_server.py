@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.nodes import NodeRequests
+    from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
     from rmpa.observe.peers_section import SiteRequests
@@ -374,7 +374,7 @@ class ControlOperations:
         bridge: Bridge,
         params: Params,
         snapshots: SnapshotBuilder,
-        nodes: NodeRequests,
+        nodes: Nodes,
         sites: SiteRequests,
     ) -> None:
         self._name = name
