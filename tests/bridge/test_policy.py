@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.policy import BUILT_IN_DENY, Policy
+from rmpa.bridge.policy import Policy
 from rmpa.config.settings import PolicySettings
+from rmpa.core.identity import NEVER_CROSSING
 
 
 @pytest.mark.parametrize(
@@ -37,5 +38,5 @@ def test_the_first_no_wins_and_names_its_rule(
 
 @pytest.mark.trap(36)
 def test_no_user_rule_can_open_what_is_built_in() -> None:
-    policy = Policy(PolicySettings(allow=tuple(BUILT_IN_DENY)))
-    assert not any(policy.judge(topic.rstrip("/*"), "a/B", "/n").allowed for topic in BUILT_IN_DENY)
+    policy = Policy(PolicySettings(allow=tuple(NEVER_CROSSING)))
+    assert not any(policy.judge(topic.rstrip("/*"), "a/B", "/n").allowed for topic in NEVER_CROSSING)

@@ -15,14 +15,13 @@ from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.context import ServiceRules
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy, Relay, RelayPaths, may_have
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths, may_have
 from rmpa.bridge.services.bodies import ExportAction, ImportAction, LocalService, Provide, Withdraw
 from rmpa.bridge.services.exports import ServiceExports
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import PolicySettings, ServiceSettings
-from rmpa.core.identity import Guid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -130,8 +129,7 @@ class Map:
             module = self.modules[here]
             module.numbers += 1
             number = module.links[there] = module.numbers
-            who = LinkedPeer(f"m{there}", instance(there), Guid(there))
-            self.act(here, module.imports.link_up(number, f"m{there}", who))
+            self.act(here, module.imports.link_up(number, f"m{there}", instance(there), there))
             self.act(here, module.exports.link_up(number, f"m{there}", instance(there)))
             self.act(here, module.service_imports.link_up(number, f"m{there}", there, instance(there)))
             self.act(here, module.service_exports.link_up(number, f"m{there}", instance(there)))
@@ -284,14 +282,14 @@ def test_nothing_goes_back_where_it_came_from() -> None:
 def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     ways = RelayPaths()
     ways.instance = instance(9)
-    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
-    assert not ways.add(1, origin(9, 2))
+    ways.linked(1, "r", instance(2), 2)
+    assert not ways.count(1, origin(9, 2), 1)
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
-    assert not ways.add(1, origin(1, 9, 2))
+    assert not ways.count(1, origin(1, 9, 2), 1)
     assert ways.why_not(1, origin(1, 9, 2)) == "we passed it on ourselves"
-    assert ways.add(1, origin(1, 2))
+    assert ways.count(1, origin(1, 2), 1)
     assert not ways.why_not(1, origin(1, 2))
-    assert ways.remove(1, origin(1, 2))
+    assert ways.count(1, origin(1, 2), -1)
     assert list(ways) == []
 
 
@@ -299,12 +297,12 @@ def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> No
     """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
     ways = RelayPaths()
     ways.instance = instance(9)
-    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
-    ways.add(1, origin(1, 2))
-    ways.linked(2, LinkedPeer("thief", instance(1), Guid(1)))
+    ways.linked(1, "r", instance(2), 2)
+    ways.count(1, origin(1, 2), 1)
+    ways.linked(2, "thief", instance(1), 1)
     assert not ways.why_not(1, origin(1, 2))
     assert list(ways) == [(origin(1, 2), "r")]
-    ways.linked(3, LinkedPeer("m1", instance(1), Guid(1)))
+    ways.linked(3, "m1", instance(1), 1)
     assert ways.why_not(1, origin(1, 2)) == "m1 has a link of its own"
     assert list(ways) == []
 
@@ -312,10 +310,10 @@ def test_a_peer_that_claims_the_run_of_a_relayed_module_does_not_hide_it() -> No
 def test_a_peer_that_may_not_relay_does_not_rename_a_module() -> None:
     ways = RelayPaths(lambda name: name == "r")
     ways.instance = instance(9)
-    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
-    ways.linked(2, LinkedPeer("liar", instance(3), Guid(3)))
+    ways.linked(1, "r", instance(2), 2)
+    ways.linked(2, "liar", instance(3), 3)
     renamed = msgspec.structs.replace(origin(1, 3), name="other")
-    ways.add(2, renamed)
-    ways.add(1, origin(1, 2))
-    ways.add(2, renamed)
+    ways.count(2, renamed, 1)
+    ways.count(1, origin(1, 2), 1)
+    ways.count(2, renamed, 1)
     assert list(ways) == [(origin(1, 2), "r")]

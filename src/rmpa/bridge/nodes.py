@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
 
+    _Table = Mapping[str, Collection[str]]
+
 _log = logging.getLogger(__name__)
 
 NODES: Final = "nodes"
@@ -198,20 +200,21 @@ class Nodes(Part):
         found = list_nodes(*self._tables(asker.link.name), self._core.state().nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    def _tables(self, peer: str = "") -> list[Mapping[str, Collection[str]]]:
+    def _tables(self, peer: str = "") -> tuple[_Table, _Table, _Table]:
         """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
         state, gate = self._core.state(), self._bridge.gate
-        tables: list[Mapping[str, Collection[str]]] = [state.publishers, state.subscribers, state.services]
-        if not peer or not gate.on:
-            return tables
-        return [
-            {
-                name: nodes
-                for name, nodes in yielding_to_data(list(table.items()))
-                if gate.judge(access, peer, name).allowed
-            }
-            for access, table in zip(_VISIBLE.access, tables, strict=True)
-        ]
+
+        def permitted(access: Access, table: _Table) -> _Table:
+            if not peer or not gate.on:
+                return table
+            rows = yielding_to_data(list(table.items()))
+            return {name: nodes for name, nodes in rows if gate.judge(access, peer, name).allowed}
+
+        return (
+            permitted(Access.SUBSCRIBE, state.publishers),
+            permitted(Access.PUBLISH, state.subscribers),
+            permitted(Access.CALL, state.services),
+        )
 
     def _visible(self, peer: str) -> Collection[str]:
         """The nodes that a peer is told of: those of which it may have something."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -25,13 +26,11 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Source
     from rmpa.config.peer_rules import Access
     from rmpa.config.settings import PeerRule, PolicySettings, TrustSettings
-    from rmpa.core.identity import Guid, Identity
+    from rmpa.core.identity import Identity
     from rmpa.trust.permissions import Permissions
 
 
-BUILT_IN_DENY: Final = NEVER_CROSSING
-"""Topics that never cross, each with the reason."""
-
+_log = logging.getLogger(__name__)
 
 _NO_TIME: Final = TimeSettings()
 
@@ -59,7 +58,7 @@ class Policy:
         self._settings = settings
         self._peers = peers
         self._time = time
-        self._known: dict[str, list[tuple[str, PolicySettings]]] = {}
+        self._rules_for = lru_cache(config_limits.NAMES_REMEMBERED)(self._filled)
 
     def judge(self, topic: str, type_name: str, node: str) -> PolicyDecision:
         """Decide about one source by the rules for all peers; a refusal wins over an ``allow``."""
@@ -83,18 +82,20 @@ class Policy:
         """Whether there are globs for this peer."""
         return bool(self._rules_for(peer))
 
-    def _rules_for(self, peer: str) -> list[tuple[str, PolicySettings]]:
+    def _filled(self, peer: str) -> tuple[tuple[str, PolicySettings], ...]:
         """The rules for a peer: the place of each in the file, as text, and its globs with the name filled in."""
-        known = self._known.get(peer)
-        if known is None:
-            if len(self._known) >= config_limits.NAMES_REMEMBERED:
-                self._known.clear()
-            known = self._known[peer] = [
-                (f'peer "{rule.name}"', _filled(rule.policy, peer))
-                for rule in self._peers
-                if matches(rule.name, peer)
-            ]
-        return known
+        return tuple(
+            (
+                f'peer "{rule.name}"',
+                replace(
+                    rule.policy,
+                    allow=tuple(glob.replace(PEER, peer) for glob in rule.policy.allow),
+                    deny=tuple(glob.replace(PEER, peer) for glob in rule.policy.deny),
+                ),
+            )
+            for rule in self._peers
+            if matches(rule.name, peer)
+        )
 
     def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> PolicyDecision:
         """Decide whether a source that ``judge`` allows may cross between this module and one peer.
@@ -105,24 +106,18 @@ class Policy:
             type_name: A topic's message type; ``None`` for a service, or if the type is unknown.
             wire: The wire name, if it differs.
         """
-        decision = PolicyDecision(True, "")
         if wire and wire != name and (why := never_crosses(wire)):
             return PolicyDecision(False, f"built in: {why} (it is {wire} there)")
         for where, settings in self._rules_for(peer):
             decision = _judge(settings, where, name, type_name)
             if not decision.allowed:
                 return decision
-        return decision
+        return PolicyDecision(True, "")
 
 
 def never_crosses(topic: str) -> str:
     """The reason why a topic never crosses, or empty."""
-    return next((why for pattern, why in BUILT_IN_DENY.items() if matches(pattern, topic)), "")
-
-
-def _filled(settings: PolicySettings, peer: str) -> PolicySettings:
-    allow, deny = (tuple(glob.replace(PEER, peer) for glob in globs) for globs in (settings.allow, settings.deny))
-    return replace(settings, allow=allow, deny=deny)
+    return next((why for pattern, why in NEVER_CROSSING.items() if matches(pattern, topic)), "")
 
 
 def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> PolicyDecision:
@@ -141,11 +136,6 @@ def _judge(settings: PolicySettings, where: str, name: str, type_name: str | Non
             return PolicyDecision(True, f"{where}.allow has {pattern!r}")
     return PolicyDecision(False, f"no glob of {where}.allow fits {name}")
 
-
-# Asks the permissions of a secured mesh for all parts of the bridge, and reports what they refuse.
-
-
-_log = logging.getLogger(__name__)
 
 _WITHOUT_TRUST: Final = PermissionDecision(True, "trust is off")
 _RELAY: Final = "relay"
@@ -372,34 +362,6 @@ def may_have(instance: str, origin: Origin) -> bool:
     return instance != origin.instance and instance not in origin.path
 
 
-@dataclass(frozen=True, slots=True)
-class LinkedPeer:
-    """A peer with a link of its own.
-
-    Args:
-        name: Its name.
-        instance: Its run, as 32 hexadecimal digits.
-        guid: Its GUID, which ranks it among relays.
-    """
-
-    name: str
-    instance: str
-    guid: Guid | None
-
-
-@dataclass(slots=True)
-class _Origin:
-    """One module that relays offer.
-
-    Args:
-        origin: Its origin in the last offer of a peer that may relay; in the first offer if there is none.
-        ways: By relay: the number of its sources that the relay offers, and the length of the path in relays.
-    """
-
-    origin: Origin
-    ways: dict[int, list[int]] = field(default_factory=dict)
-
-
 class RelayPaths:
     """The receiving side: selects the path to each module, its own link first, else the best relay.
 
@@ -415,58 +377,58 @@ class RelayPaths:
         """Our own, as 32 hexadecimal digits."""
         self.reached_here: set[str] = set()
         """Instances that this module reaches by itself, outside the mesh: a gateway's sites."""
-        self._linked: dict[int, LinkedPeer] = {}
-        self._origins: dict[str, _Origin] = {}
+        self._linked: dict[int, tuple[str, str, int]] = {}
+        """By number of a peer with a link of its own: its name, its instance, and its rank among relays."""
+        self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
+        """By instance and relay: the origin as the relay offered it last, and the number of its sources there."""
 
     def __iter__(self) -> Iterator[tuple[Origin, str]]:
         """Each module that is reached by a relay, and that relay's name."""
-        for instance, known in self._origins.items():
+        for instance, ways in self._ways.items():
             best = self._best(instance)
-            if best is not None and not self._direct(known.origin):
-                yield known.origin, self._linked[best].name
+            if best is not None and not self._direct(ways[best][0]):
+                yield ways[best][0], self._linked[best][0]
 
     def __contains__(self, instance: str) -> bool:
-        return instance in self._origins
+        return instance in self._ways
 
-    def linked(self, peer: int, who: LinkedPeer) -> set[str]:
-        """Register a linked peer; return the instances whose path may have changed."""
-        self._linked[peer] = who
-        return {who.instance}
+    def linked(self, peer: int, name: str, instance: str, rank: int) -> set[str]:
+        """Register a linked peer; return the instances whose path may have changed.
+
+        Args:
+            peer: The number of its session.
+            name: Its name.
+            instance: Its run, as 32 hexadecimal digits.
+            rank: Its GUID, as a number.
+        """
+        self._linked[peer] = name, instance, rank
+        return {instance}
 
     def unlinked(self, peer: int) -> set[str]:
         """Forget a peer and all paths through it; return the instances whose path may have changed."""
         gone = self._linked.pop(peer, None)
-        changed = {gone.instance} if gone is not None else set()
-        for instance, known in list(self._origins.items()):
-            if known.ways.pop(peer, None) is not None:
+        changed = {gone[1]} if gone is not None else set()
+        for instance, ways in list(self._ways.items()):
+            if ways.pop(peer, None) is not None:
                 changed.add(instance)
-                if not known.ways:
-                    del self._origins[instance]
+                if not ways:
+                    del self._ways[instance]
         return changed
 
-    def add(self, peer: int, origin: Origin) -> bool:
-        """Count a source of a module that a peer offers; return whether the best relay has changed."""
-        if self._ours(origin) or peer not in self._linked:
-            return False
-        before = self._best(origin.instance)
-        known = self._origins.setdefault(origin.instance, _Origin(origin))
-        if self._may_relay(self._linked[peer].name):
-            known.origin = origin
-        count, _ = known.ways.get(peer, (0, 0))
-        known.ways[peer] = [count + 1, len(origin.path)]
-        return self._best(origin.instance) != before
+    def count(self, peer: int, origin: Origin, more: int) -> bool:
+        """Count a source of a module that a peer offers (1) or offers no longer (-1).
 
-    def remove(self, peer: int, origin: Origin) -> bool:
-        """Count off a source that a peer offers no longer; return whether the best relay has changed."""
-        known = self._origins.get(origin.instance)
-        if known is None or self._ours(origin) or peer not in known.ways:
+        Returns:
+            Whether the best relay to the module has changed.
+        """
+        if self._is_ours(origin) or peer not in self._linked:
             return False
-        before = self._best(origin.instance)
-        known.ways[peer][0] -= 1
-        if not known.ways[peer][0]:
-            del known.ways[peer]
-        if not known.ways:
-            del self._origins[origin.instance]
+        before, ways = self._best(origin.instance), self._ways.setdefault(origin.instance, {})
+        known, count = ways.pop(peer, (origin, 0))
+        if count + more > 0:
+            ways[peer] = origin if more > 0 else known, count + more
+        if not ways:
+            del self._ways[origin.instance]
         return self._best(origin.instance) != before
 
     def why_not(self, peer: int, origin: Origin) -> str:
@@ -481,23 +443,17 @@ class RelayPaths:
             return f"{origin.name} has a link of its own"
         best = self._best(origin.instance)
         if best is not None and best != peer:
-            return f"{origin.name} is reached by way of {self._linked[best].name}"
+            return f"{origin.name} is reached by way of {self._linked[best][0]}"
         return ""
 
-    def _ours(self, origin: Origin) -> bool:
+    def _is_ours(self, origin: Origin) -> bool:
         return origin.instance == self.instance or self.instance in origin.path
 
     def _direct(self, origin: Origin) -> bool:
         # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.
-        return any((one.instance, one.name) == (origin.instance, origin.name) for one in self._linked.values())
+        return any((name, instance) == (origin.name, origin.instance) for name, instance, _ in self._linked.values())
 
     def _best(self, instance: str) -> int | None:
-        known = self._origins.get(instance)
-        if known is None:
-            return None
-        ways = (peer for peer in known.ways if self._may_relay(self._linked[peer].name))
-        return min(ways, key=lambda peer: self._rank(known, peer), default=None)
-
-    def _rank(self, known: _Origin, peer: int) -> tuple[int, int, int]:
-        guid = self._linked[peer].guid
-        return known.ways[peer][1], guid.value if guid is not None else 0, peer
+        ways = self._ways.get(instance, {})
+        relays = (peer for peer in ways if self._may_relay(self._linked[peer][0]))
+        return min(relays, key=lambda peer: (len(ways[peer][0].path), self._linked[peer][2], peer), default=None)

@@ -35,7 +35,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import NodePlaces, PeerOffers
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, RelayPaths, is_outside
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, RelayPaths, is_outside
 from rmpa.bridge.services.bodies import (
     EndedService,
     ForgetAbout,
@@ -49,7 +49,6 @@ from rmpa.bridge.services.exports import TRANSITIONS, RemoteService, ServiceRout
 from rmpa.config.peer_rules import Access
 from rmpa.config.settings import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from rmpa.core.identity import Guid
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -156,7 +155,7 @@ class ServiceImports:
             known.away = False
             known.serial = -1
             known.rank = rank
-        return self._choose_of(self.ways.linked(peer, LinkedPeer(name, instance, Guid(rank)))) if instance else []
+        return self._choose_of(self.ways.linked(peer, name, instance, rank)) if instance else []
 
     def unlinked(self, peer: int) -> list[ImportAction]:
         """Choose other paths to the modules that were reached by a peer that is gone.
@@ -271,7 +270,7 @@ class ServiceImports:
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
-        if offer.origin is not None and self.ways.add(peer, offer.origin):
+        if offer.origin is not None and self.ways.count(peer, offer.origin, 1):
             actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
             remote.hidden = f"the rules of names make {name!r} of it"
@@ -291,7 +290,7 @@ class ServiceImports:
         known.nodes.leave(remote.node, remote.name)
         # Messages may have crossed: the route asked for last may be open at the peer, for another server perhaps.
         actions = self._release(peer, remote, reason)
-        another_way = remote.origin is not None and self.ways.remove(peer, remote.origin)
+        another_way = remote.origin is not None and self.ways.count(peer, remote.origin, -1)
         was_shown, remote.shown = remote.shown, False
         if was_shown:
             del self._shown[remote.name]

@@ -29,7 +29,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.offers import NodePlaces, PeerOffers
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, RelayPaths
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, RelayPaths
 from rmpa.bridge.proxies import Names, PeerNames
 from rmpa.bridge.topics.routes import ImportRoutes, RemoteTopic, RouteState
 from rmpa.config.peer_rules import Access
@@ -219,19 +219,20 @@ class Imports:
             actions += self._routes.open(peer, source, entry, now) if entry.wanted else []
         return actions
 
-    def link_up(self, peer: int, name: str = "", who: LinkedPeer | None = None) -> list[Action]:
+    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> list[Action]:
         """Registers a link, of a new peer or of one that was away; its first message begins a full advertisement.
 
         Args:
             peer: The peer's number.
             name: The peer's name, which selects the rules for it.
-            who: The peer itself: sources of it that relays offer are hidden while it has a link of its own.
+            instance: Its run: sources of it that relays offer are hidden while it has a link of its own.
+            rank: Its GUID, as a number, which ranks it among relays.
         """
         new = _ImportPeer(name=name, nodes=NodePlaces(self.limit_settings.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
         known.away = known.silent = False
         self._routes.link_up(peer)
-        return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
+        return self._ways_changed(self.ways.linked(peer, name, instance, rank)) if instance else []
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
         """Suspends the routes of a peer that may come back; sources that do not outlive the link are dropped.
@@ -399,7 +400,7 @@ class Imports:
         self._peers[peer].topics.setdefault(topic, {})[source] = None
         if offer.origin is not None:
             self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
-            if self.ways.add(peer, offer.origin):
+            if self.ways.count(peer, offer.origin, 1):
                 actions += self._ways_changed({offer.origin.instance})
         actions += self._show_or_hide(peer, source, entry)
         if entry.crowded:
@@ -555,7 +556,7 @@ class Imports:
             del known.relayed[instance][source]
             if not known.relayed[instance]:
                 del known.relayed[instance]
-            if self.ways.remove(peer, entry.origin):
+            if self.ways.count(peer, entry.origin, -1):
                 actions += self._ways_changed({instance})
         return actions
 

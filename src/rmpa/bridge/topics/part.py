@@ -19,7 +19,6 @@ from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.nodes import LocalEndpoints
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import Advertise, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
-from rmpa.bridge.policy import LinkedPeer
 from rmpa.bridge.sessions import Part, UnchangedGraph
 from rmpa.bridge.topics.direct import DirectImporter
 from rmpa.bridge.topics.exports import Exports
@@ -181,9 +180,9 @@ class Topics(Part):
         else:
             self._begin(session)
         self.imports.ways.instance = self._shared.relay.instance
-        linked = LinkedPeer(identity.name, identity.instance.hex(), identity.guid)
-        self._act(self.imports.link_up(peer, identity.name, linked))
-        self._act(self.exports.link_up(peer, identity.name, linked.instance))
+        instance = identity.instance.hex()
+        self._act(self.imports.link_up(peer, identity.name, instance, identity.guid.value))
+        self._act(self.exports.link_up(peer, identity.name, instance))
         self.direct_imports.link_up(session)
         self.direct_exports.link_up(session)
         self._driver.schedule()

@@ -23,14 +23,13 @@ from rmpa.bridge.messages import (
     TopicOffer,
     decode,
 )
-from rmpa.bridge.policy import OPEN_GATE, LinkedPeer, PermissionGate, Policy
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import subscribers as module
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
-from rmpa.core.identity import Guid
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
@@ -219,7 +218,7 @@ def test_listeners_behind_a_relay_are_named_only_if_both_may(world: World) -> No
     ):
         Connection.made.clear()
         secured = World(PermissionGate(Permissions(trust)))
-        secured.imports.link_up(1, "base", LinkedPeer("base", "2" * 32, Guid(2)))
+        secured.imports.link_up(1, "base", "2" * 32, 2)
         secured.imports.advertised(1, Advertise(added=(goal_of_arm,)))
         secured.publish(GOAL, TYPE, 7)
         assert secured.told(7, "/own", "/rmpa/arm/server", "/rmpa/leg/server") == expected
