@@ -169,7 +169,6 @@ async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPa
         await until(lambda: any("requestTopic" in reason for reason in lost))  # a core has none: it was asked
     finally:
         link.close()
-        await link.closed()
         await core.close()
 
 

@@ -173,9 +173,9 @@ async def test_trap_9_tcp_nodelay_is_what_the_listener_asks_for(
     publisher = await node.advertise("/chatter", BYTES)
     ros.node(library, "listener", nodelay=nodelay)
     await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
-    (link,) = publisher.publication._open
+    (link,) = publisher.publication._connections
     assert isinstance(link, AcceptedConnection)
-    assert link._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == nodelay
+    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == nodelay
 
 
 @pytest.mark.trap(1)

@@ -93,8 +93,8 @@ async def test_only_rospy_subscribers_send_a_definition(core: RosCore, ros: Ros,
         publisher = await ours.advertise("/chatter", BYTES, latch=True)
         publisher.publish_raw(framed(Pattern(64).payload(1, 1)))
         listener = ros.node(library, "listener", count=1)
-        await until(lambda: publisher.publication._open)
-        fields = publisher.publication._open[0].fields
+        await until(lambda: publisher.publication._connections)
+        fields = publisher.publication._connections[0].request
         assert {"callerid", "md5sum", "tcp_nodelay", "topic", "type"} <= fields.keys()
         assert ("message_definition" in fields) is (library == "rospy")
         await listener.expect_event("done", DEADLINE)

@@ -16,10 +16,9 @@ from rmpa.bridge.policy import service_place
 from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RmpaError
-from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, printable
 
 if TYPE_CHECKING:
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription
 
 
@@ -163,7 +163,7 @@ class TopicTap:
         self._on_described = on_described
         self._on_lost = on_lost
         self._on_closed = on_closed
-        self.connection: PublisherConnection | InProcessConnection | None = None
+        self.connection: TopicConnection | None = None
         """The connection to the publisher; ``None`` while its address is not known."""
         self._description: TopicDescription | None = None
         self._closed = False
@@ -193,29 +193,23 @@ class TopicTap:
 
     def _connect(self, uri: str) -> None:
         on_message, here, proxy = self._on_message, self.source.here, self.source.proxy
-        if self._find(proxy, uri, here) is not None:
-            self.connection = InProcessConnection(
-                here,
-                uri,
-                self._caller_id,
-                lambda: self._find(proxy, uri, here),
-                on_message=lambda framed: on_message(framed[_PREFIX:]),
-                on_header=self._described,
-                on_refused=self._refused,
-                on_lost=self._on_lost,
-                number=self._number(),
-            )
-        else:
-            self.connection = PublisherConnection(
-                here,
-                uri,
-                self._caller_id,
-                on_message=lambda framed: on_message(framed[_PREFIX:]),
-                on_header=self._described,
-                on_refused=self._refused,
-                on_lost=self._on_lost,
-                number=self._number(),
-            )
+
+        def find() -> Callable[[InProcessConnection], None] | None:
+            publication = self._find(proxy, uri, here)
+            return publication.attach if publication is not None else None
+
+        kind = PublisherConnection if find() is None else InProcessConnection
+        self.connection = kind(
+            here,
+            uri,
+            self._caller_id,
+            on_message=lambda framed: on_message(framed[_PREFIX:]),
+            on_header=self._described,
+            on_refused=self._refused,
+            on_lost=self._on_lost,
+            number=self._number(),
+            find=find,
+        )
         self.connection.start()
 
     def _refused(self, text: str) -> None:

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.neighbour import SourceKey
     from rmpa.ros.master.parameters import GraphChange
-    from rmpa.ros.node.in_process import InProcessConnection
-    from rmpa.ros.node.subscription import PublisherConnection
+    from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
 _INSTANCE_LABEL: Final = b"rmpa site 1"
@@ -386,7 +385,7 @@ class AgentGraph(Part):
         for tap in tuple(self._taps.get(topic, ())):
             tap.follow(publishers.get(tap.source.proxy, ""))
 
-    def _connections(self) -> list[PublisherConnection | InProcessConnection]:
+    def _connections(self) -> list[TopicConnection]:
         taps = [tap for taps in self._taps.values() for tap in taps]
         return [tap.connection for tap in taps if tap.connection is not None]
 

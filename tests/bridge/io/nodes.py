@@ -219,6 +219,7 @@ class PublisherConnection:
         on_lost: Callable[[str], None],
         on_oversized: Callable[[int], None],
         number: int,
+        find: object,
     ) -> None:
         self.topic, self.uri, self.number = topic, uri, number
         self._on_message, self._parts, self._on_header, self._on_lost = on_message, on_parts, on_header, on_lost
@@ -308,12 +309,12 @@ class Ear:
     info = ""
     caller_id = "/ear"
     peer = ("127.0.0.1", 1)
-    dropped = messages = 0
+    dropped = pending_bytes = bytes_out = since = 0
 
     def __init__(self, listener: Listener, publication: Publication) -> None:
-        self.fields = {"topic": publication.topic, "callerid": self.caller_id, "md5sum": "*", "type": "*"}
+        self.request = {"topic": publication.topic, "callerid": self.caller_id, "md5sum": "*", "type": "*"}
         self.publication = publication
-        self.stream = SimpleNamespace(closed=False, bytes_out=0)
+        self.closed = False
         self.on_end: Callable[[object, Exception | None], None] = lambda *_: None
         self._listener = listener
         self._parcel: QueuedMessage | None = None
@@ -329,13 +330,13 @@ class Ear:
         """Nobody is refused here."""
         raise AssertionError(text)
 
-    def send(self, framed: bytes | bytearray | memoryview) -> int:
+    def send(self, parts: tuple[bytes | bytearray | memoryview], _key: int) -> int:
         """A message came."""
         assert not self._half, "a message in the middle of another one"
-        self._listener.heard(self, bytes(framed))
+        self._listener.heard(self, bytes(parts[0]))
         return 0
 
-    def begin(self, size: int) -> QueuedMessage:
+    def open(self, _key: int, size: int) -> QueuedMessage:
         """A message begins."""
         assert not self._half, "a message in the middle of another one"
         self._parcel = QueuedMessage(0, size)
@@ -343,7 +344,7 @@ class Ear:
 
     def extend(self, parcel: QueuedMessage, part: bytes | bytearray | memoryview) -> int:
         """A part came."""
-        if self.stream.closed:
+        if self.closed:
             return 0
         assert parcel is self._parcel
         self._half += part
@@ -357,14 +358,14 @@ class Ear:
         assert parcel is self._parcel
         return bool(self._half)
 
-    def close(self) -> None:
+    def hang_up(self) -> None:
         """We were hung up on."""
-        self.stream.closed = True
+        self.closed = True
         self._listener.ears.pop(self.publication, None)
 
     def leave(self) -> None:
         """We hang up."""
-        self.stream.closed = True
+        self.closed = True
         self.on_end(self, None)
 
 

@@ -6,11 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
-from rmpa.ros.node.in_process import InProcessConnection
 from rmpa.ros.node.publication import Publication, PublicationEvents
+from rmpa.ros.node.subscription import InProcessConnection
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.ros.wire.tcpros import Header
 
 STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
@@ -62,7 +64,7 @@ class Bed(PublicationEvents):
             "/chatter",
             "http://127.0.0.1:1/",
             "/rmpa",
-            lambda: self.there,
+            find=self.found,
             on_message=lambda message: self.got.append(bytes(message)),
             on_parts=self.parts,
             on_header=self.headers.append,
@@ -74,6 +76,9 @@ class Bed(PublicationEvents):
     def publish(self, description: TopicDescription | None) -> Publication:
         self.publication = self.there = Publication("/chatter", "/talker", description, events=self)
         return self.publication
+
+    def found(self) -> Callable[[InProcessConnection], None] | None:
+        return self.there.attach if self.there is not None else None
 
     def first_subscriber(self) -> None:
         self.demand.append(True)
@@ -161,7 +166,7 @@ async def test_what_may_be_sent_on_is_not_overwritten_by_the_next_message() -> N
     bed = Bed(parts=True)
     views: list[memoryview] = []
     keeping = InProcessConnection(
-        "/chatter", "http://127.0.0.1:1/", "/a", lambda: bed.there, on_message=views.append, on_parts=bed.parts
+        "/chatter", "http://127.0.0.1:1/", "/a", find=bed.found, on_message=views.append, on_parts=bed.parts
     )
     keeping.start()
     await asyncio.sleep(0)
@@ -226,8 +231,8 @@ async def test_nothing_is_called_after_close() -> None:
 
 async def test_a_subscriber_may_close_while_it_gets_a_message() -> None:
     bed = Bed()
-    closing = InProcessConnection(
-        "/chatter", "http://127.0.0.1:1/", "/a", lambda: bed.there, on_message=lambda _: closing.close()
+    closing: InProcessConnection = InProcessConnection(
+        "/chatter", "http://127.0.0.1:1/", "/a", find=bed.found, on_message=lambda _: closing.close()
     )
     closing.start()
     await bed.connect()
@@ -244,7 +249,7 @@ async def test_a_wrong_topic_is_refused_once() -> None:
         "/other",
         "http://127.0.0.1:1/",
         "/a",
-        lambda: bed.there,
+        find=bed.found,
         on_message=lambda _: None,
         on_refused=bed.refused.append,
         on_lost=bed.lost.append,

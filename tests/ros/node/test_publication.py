@@ -129,7 +129,7 @@ async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held:
 
 async def test_a_held_subscriber_that_has_just_left_costs_no_other_the_topic(held: Owner) -> None:
     gone, stays = await held.subscriber(callerid="/gone", tcp_nodelay="1"), await held.subscriber()
-    stream = held.publication._held[0].stream
+    stream = held.publication._connections[0]
     gone.close()
     while not stream.closed:  # at once, before the publication is told of the end
         await asyncio.sleep(0)
@@ -221,9 +221,9 @@ async def test_a_wildcard_is_never_described(held: Owner) -> None:
 @pytest.mark.parametrize(("asked", "given"), [("1", 1), ("0", 0), ("true", 0), ("", 0)])
 async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, given: int) -> None:
     link = await known.subscriber(tcp_nodelay=asked)
-    (inbound,) = known.publication._open
+    (inbound,) = known.publication._connections
     assert isinstance(inbound, AcceptedConnection)
-    assert inbound._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == given
+    assert inbound._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == given
     link.close()
 
 
@@ -240,10 +240,10 @@ async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
     link = await known.subscriber()
     for _ in range(40):
         await link.send(b"j" * 100_000)
-    (inbound,) = known.publication._open
+    (inbound,) = known.publication._connections
     assert isinstance(inbound, AcceptedConnection)
-    await until(lambda: inbound.stream.bytes_in > 4_000_000)
-    assert len(inbound.stream._buffer) <= 1 << 18
+    await until(lambda: inbound.bytes_in > 4_000_000)
+    assert len(inbound._buffer) <= 1 << 18
     known.publication.publish_framed(frame_message(b"still here"))
     await link.header()
     assert await link.message() == b"still here"
@@ -293,8 +293,8 @@ async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
     slow = await owner.subscriber(buffer=4096)
     for _ in range(200):
         owner.publication.publish_framed(frame_message(bytes(100_000)))
-    (inbound,) = owner.publication._open
-    assert inbound.stream.pending_bytes <= 1_000_000 + 100_004
+    (inbound,) = owner.publication._connections
+    assert inbound.pending_bytes <= 1_000_000 + 100_004
     slow.close()
     owner.close()
 
@@ -338,7 +338,7 @@ async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
 @pytest.mark.trap(18)
 async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
     link = await known.subscriber()
-    (inbound,) = known.publication._open
+    (inbound,) = known.publication._connections
     assert isinstance(inbound, AcceptedConnection)
     for level, option, value in (
         (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
@@ -346,7 +346,7 @@ async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: O
         (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
         (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 9),
     ):
-        assert inbound._sock.getsockopt(level, option) == value
+        assert inbound._socket.getsockopt(level, option) == value
     link.close()
 
 
@@ -430,8 +430,8 @@ async def test_slow_subscriber_is_bounded_for_parts_too() -> None:
     for _ in range(20):
         begin(owner.publication)
         extend(owner.publication, *PARTS)
-    (inbound,) = owner.publication._open
-    assert inbound.stream.pending_bytes <= 1_000_000 + 2 * len(WHOLE)
+    (inbound,) = owner.publication._connections
+    assert inbound.pending_bytes <= 1_000_000 + 2 * len(WHOLE)
     slow.close()
     owner.close()
 
@@ -471,9 +471,9 @@ async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
     half = await owner.subscriber(callerid="/half")
     stuck = await owner.subscriber(callerid="/stuck", buffer=4096)
     await stuck.header()
-    (blocked,) = [link for link in owner.publication._open if link.caller_id == "/stuck"]
+    (blocked,) = [link for link in owner.publication._connections if link.caller_id == "/stuck"]
     fills = 0
-    while not blocked.stream.pending_bytes:
+    while not blocked.pending_bytes:
         owner.publication.publish_framed(frame_message(bytes(100_000)))
         fills += 1
     owner.publication.publish_framed(frame_message(b"last"))
@@ -481,7 +481,7 @@ async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
     extend(owner.publication, *PARTS[:3])
     late = await owner.subscriber(callerid="/late")
     assert owner.publication.abort() == 1
-    assert {link.caller_id for link in owner.publication._open} == {"/stuck", "/late"}
+    assert {link.caller_id for link in owner.publication._connections} == {"/stuck", "/late"}
     assert owner.said == ["first"]
     await half.header()
     assert [len(await half.message()) for _ in range(fills + 1)] == [100_000] * fills + [4]
@@ -577,9 +577,9 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     late = await owner.subscriber(callerid="/late", buffer=4096)
     for _ in range(100):
         owner.publication.publish_framed(frame_message(bytes(200_000)))
-    links = [link for link in owner.publication._open if isinstance(link, AcceptedConnection)]
+    links = [link for link in owner.publication._connections if isinstance(link, AcceptedConnection)]
     assert len(links) == 2
-    assert all(link.dropped > 50 and link.stream.outbox.pending_entries <= 4 for link in links)
+    assert all(link.dropped > 50 and link.outbox.pending_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
     early.close()

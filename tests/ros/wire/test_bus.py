@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.ros.wire.slave_api import BusConnection, BusLink, SlaveApi, read_bus_info
+from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, read_bus_info
 from rmpa.ros.wire.xmlrpc import parse_response
 
 if TYPE_CHECKING:
@@ -141,31 +141,20 @@ def test_the_connections_of_each_library_are_read(answer: XmlRpcValue, links: li
     assert read_bus_info(answer) == links
 
 
-class Connections:
-    """A node of ours, with one connection each way."""
-
-    def publications(self) -> list[tuple[str, str]]:
-        return [("/out", "a/B")]
-
-    def subscriptions(self) -> list[tuple[str, str]]:
-        return [("/in", "a/B")]
-
-    def connections(self) -> list[BusConnection]:
-        text = "TCPROS connection on port {} to [10.0.0.2:{}]"
-        return [
+def test_a_node_of_ours_is_read_too() -> None:
+    text = "TCPROS connection on port {} to [10.0.0.2:{}]"
+    value = bus_info(
+        [
             BusConnection(1, "/s", "o", "/out", True, text.format(1, 2), 70, 7),
             BusConnection(2, "http://10.0.0.2:3/", "i", "/in", False, text.format(4, 5), 50, 5),
         ]
-
-
-def test_a_node_of_ours_is_read_too() -> None:
-    api = SlaveApi("/n", "", 1, Connections())  # type: ignore[arg-type] # nothing else is asked
+    )
     links = [
         BusLink(1, "/s", False, "/out", True, 1, ("10.0.0.2", 2)),
         BusLink(2, "http://10.0.0.2:3/", True, "/in", False, 4, ("10.0.0.2", 5)),
     ]
-    assert read_bus_info([*api.dispatch("getBusInfo", ["/c"])]) == links
-    assert read_bus_info(api.dispatch("getBusInfo", ["/c"]).value) == links
+    assert read_bus_info([1, "bus info", value]) == links
+    assert read_bus_info(value) == links
 
 
 ROW: tuple[XmlRpcValue, ...] = (

@@ -30,8 +30,7 @@ from rmpa.core.identity import OWN_NODE, is_own, is_type_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
-from rmpa.ros.node.in_process import InProcessConnection
-from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
 from rmpa.runtime.accept import DESCRIPTORS
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     from rmpa.ros.master.registrations import Unreachable
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.node.subscription import TopicConnection
 
 
 class DirectExporter(Grants):
@@ -303,7 +303,7 @@ class LocalSubscriptions:
         self._node = node
         self._on_described = on_described
         self._on_lost = on_lost
-        self._connections: dict[Source, PublisherConnection | InProcessConnection] = {}
+        self._connections: dict[Source, TopicConnection] = {}
         self.flows: dict[Source, ExportFlow] = {}
         """The flow of each connected source, for snapshots."""
         self._senders: dict[tuple[int, int], RouteSender] = {}
@@ -314,7 +314,7 @@ class LocalSubscriptions:
         self._on_missed = on_missed
 
     @property
-    def connections(self) -> Iterable[PublisherConnection | InProcessConnection]:
+    def connections(self) -> Iterable[TopicConnection]:
         """The connections to local publishers."""
         return self._connections.values()
 
@@ -328,24 +328,15 @@ class LocalSubscriptions:
         connection = self._connections[source] = self._connection(source, action.uri, flow)
         connection.start()
 
-    def _connection(self, source: Source, uri: str, flow: ExportFlow) -> PublisherConnection | InProcessConnection:
+    def _connection(self, source: Source, uri: str, flow: ExportFlow) -> TopicConnection:
         """A connection to a publisher, without a socket if it is a proxy of this process."""
-        connection: PublisherConnection | InProcessConnection
-        if self._find(source.node, uri, source.topic) is not None:
-            connection = InProcessConnection(
-                source.topic,
-                uri,
-                OWN_NODE,
-                lambda: self._find(source.node, uri, source.topic),
-                on_message=flow.message,
-                on_parts=flow,
-                on_header=lambda fields: self._header(source, fields),
-                on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
-                on_lost=lambda reason: self._gone(source, connection, reason),
-                number=self._node.next_number(),
-            )
-            return connection
-        connection = PublisherConnection(
+
+        def find() -> Callable[[InProcessConnection], None] | None:
+            publication = self._find(source.node, uri, source.topic)
+            return publication.attach if publication is not None else None
+
+        kind = PublisherConnection if find() is None else InProcessConnection
+        connection: TopicConnection = kind(
             source.topic,
             uri,
             OWN_NODE,
@@ -356,6 +347,7 @@ class LocalSubscriptions:
             on_lost=lambda reason: self._gone(source, connection, reason),
             on_oversized=lambda size: self._left_out(source, flow, size),
             number=self._node.next_number(),
+            find=find,
         )
         return connection
 
@@ -488,7 +480,7 @@ class LocalSubscriptions:
         flow.left_out(size)
         self._on_oversized(source, flow)
 
-    def _gone(self, source: Source, connection: PublisherConnection | InProcessConnection, reason: str) -> None:
+    def _gone(self, source: Source, connection: TopicConnection, reason: str) -> None:
         if self._connections.get(source) is not connection:
             return
         self._connections.pop(source).close()

@@ -164,4 +164,3 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
         return {}
     finally:
         connection.close()
-        await connection.closed()

@@ -6,6 +6,7 @@ The addresses of this machine, from which a node chooses the one to register.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import itertools
 import logging
@@ -23,15 +24,12 @@ from rmpa.ros.http.rpc import ResetConnection, XmlRpcServer
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage
-from rmpa.runtime.loop import SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.core.counters import Clock
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceEndpoint
-    from rmpa.ros.wire.tcpros import Header
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
     Adopt = Callable[[socket.socket, tuple[str, int]], None]
@@ -139,7 +137,6 @@ class TcprosServer:
         counters: Count ``tcpros.refused.*``.
         numbers: The numbers of connections, shared with the node's outgoing ones.
         services: By name; read again at each header.
-        clock: For the rate limit of the log.
     """
 
     def __init__(
@@ -150,14 +147,12 @@ class TcprosServer:
         services: Mapping[str, ServiceEndpoint] | None = None,
         counters: Counters | None = None,
         numbers: Iterator[int] | None = None,
-        clock: Clock | None = None,
     ) -> None:
         self._name = name
         self._publications = publications
-        self._services: Mapping[str, ServiceEndpoint] = services if services is not None else {}
+        self._services = services if services is not None else {}
         self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
         self._numbers = numbers if numbers is not None else itertools.count(1)
-        self._clock = clock if clock is not None else SystemClock()
         self._acceptor: Acceptor | None = None
         self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
         self._accepted: set[AcceptedConnection] = set()
@@ -171,23 +166,20 @@ class TcprosServer:
         Raises:
             StartError: The address cannot be used.
         """
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        where = f"TCPROS server of {self._name} at {host}:{port}"
+        name = f"TCPROS server of {self._name}"
         try:
-            sock = DESCRIPTORS.open_socket(Use.DATA, family, what=f"TCPROS server of {self._name}")
+            with contextlib.ExitStack() as on_error:
+                family = socket.AF_INET6 if ":" in host else socket.AF_INET
+                sock = on_error.enter_context(DESCRIPTORS.open_socket(Use.DATA, family, what=name))
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                sock.bind((host, port))
+                sock.listen(limits.TCPROS_BACKLOG)
+                on_error.pop_all()
         except OSError as error:
-            if is_shortage(error):
-                raise StartError(where, "no file descriptors left", remedy()) from error
-            raise StartError(where, str(error)) from error
-        try:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            sock.bind((host, port))
-            sock.listen(limits.TCPROS_BACKLOG)
-        except OSError as error:
-            sock.close()
-            raise StartError(where, str(error)) from error
+            problem = ("no file descriptors left", remedy()) if is_shortage(error) else (str(error),)
+            raise StartError(f"{name} at {host}:{port}", *problem) from error
         self.address = sock.getsockname()[:2]
-        self._acceptor = Acceptor(sock, self.adopt, name=f"TCPROS server of {self._name}")
+        self._acceptor = Acceptor(sock, self.adopt, name=name)
         self._acceptor.start()
 
     def close(self) -> None:
@@ -213,13 +205,11 @@ class TcprosServer:
             sock.close()
             return
         if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
-            self._forget_closed()
+            # Closed connections, which publications do not report, may be half of all.
+            self._accepted = {one for one in self._accepted if not one.closed}
+            self._forget_at = 2 * len(self._accepted) + 16
         if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
-            self._refuse(
-                "full",
-                connection.peer[0],
-                f"{self._name}: too many connections, one from {connection.peer[0]} closed",
-            )
+            self._refuse("full", connection, f"too many connections, one from {connection.peer[0]} closed")
             connection.close()
             return
         self._accepted.add(connection)
@@ -227,38 +217,24 @@ class TcprosServer:
             limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
         )
 
-    def _forget_closed(self) -> None:
-        """Drop closed connections, which publications do not report; called when they may be half of all."""
-        self._accepted = {connection for connection in self._accepted if not connection.stream.closed}
-        self._forget_at = 2 * len(self._accepted) + 16
-
-    def _header(self, connection: AcceptedConnection, fields: Header) -> None:
-        timer = self._waiting.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
+    def _header(self, connection: AcceptedConnection) -> None:
+        self._waiting.pop(connection).cancel()
+        fields = connection.request
         problem = check_request(fields)
         if problem is not None:
-            self._refuse(
-                "header", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {problem}"
-            )
+            self._refuse("header", connection, f"a connection from {connection.peer[0]}: {problem}")
             connection.refuse(problem)
             return
-        if "service" in fields:
-            endpoint = self._services.get(fields["service"])
-            if endpoint is not None:
-                endpoint.attach(connection)
-                return
-            # At debug level: a client may have looked up a service that is gone by now.
-            _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
-            connection.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
+        kind = "service" if "service" in fields else "topic"
+        name = fields[kind]
+        taker = self._services.get(name) if kind == "service" else self._publications.get(name)
+        if taker is not None:
+            taker.attach(connection)
             return
-        publication = self._publications.get(fields["topic"])
-        if publication is None:
-            # At debug level: a subscriber may have the address of a publisher that is gone by now.
-            _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
-            connection.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
-            return
-        publication.attach(connection)
+        # At debug level: the other node may have looked up something that is gone by now.
+        _log.debug("! %s: no %s %s", self._name, kind, printable(name))
+        verb = "does not offer the service" if kind == "service" else "is not a publisher of"
+        connection.refuse(f"[{self._name}] {verb} [{printable(name)}]")
 
     def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
         """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
@@ -266,21 +242,17 @@ class TcprosServer:
         if timer is not None:
             timer.cancel()
         if error is not None and not isinstance(error, OSError):
-            self._refuse(
-                "malformed", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {error}"
-            )
+            self._refuse("malformed", connection, f"a connection from {connection.peer[0]}: {error}")
 
     def _timed_out(self, connection: AcceptedConnection) -> None:
         del self._waiting[connection]
         connection.close()
-        self._refuse(
-            "silent",
-            connection.peer[0],
-            f"{self._name}: {connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
-        )
+        text = f"{connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed"
+        self._refuse("silent", connection, text)
 
-    def _refuse(self, kind: str, who: str, text: str) -> None:
-        self._refusals.refuse(self._clock.now(), f"tcpros.refused.{kind}", who, text)
+    def _refuse(self, kind: str, connection: AcceptedConnection, text: str) -> None:
+        now = asyncio.get_running_loop().time()
+        self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self._name}: {text}")
 
 
 # Two listening sockets for any number of nodes: each node has a loopback address, all have the same two ports.

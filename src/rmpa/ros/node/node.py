@@ -244,7 +244,7 @@ class Node:
             await self._register_subscriber(subscriber)
         except BaseException:
             self._subscribers.pop(resolved, None)
-            await self._slave.remove_subscription(resolved)
+            self._slave.remove_subscription(resolved)
             raise
         return subscriber
 
@@ -477,7 +477,7 @@ class Node:
         if self._subscribers.pop(topic, None) is not None:
             with contextlib.suppress(RmpaError):
                 await self.call_master("unregisterSubscriber", topic, self.uri)
-            await self._slave.remove_subscription(topic)
+            self._slave.remove_subscription(topic)
 
     async def _watch_master(self) -> None:
         while True:

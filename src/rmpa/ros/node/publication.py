@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -23,16 +22,16 @@ if TYPE_CHECKING:
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.accepted_connection import AcceptedConnection
-    from rmpa.ros.node.in_process import InProcessSubscriber
+    from rmpa.ros.node.subscription import InProcessConnection
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply
 
-    SubscriberConnection: TypeAlias = AcceptedConnection | InProcessSubscriber
+    SubscriberConnection: TypeAlias = AcceptedConnection | InProcessConnection
 
 _log = logging.getLogger(__name__)
-
-
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
+_MESSAGES: Final = 0
+"""The outbox key of messages."""
 
 
 class PublicationEvents:
@@ -69,7 +68,7 @@ _NO_EVENTS: Final = PublicationEvents()
 class Publication:
     """One topic of one (real or proxy) node, with its subscribers.
 
-    Demand is the number of connections, held ones included.
+    Demand is the number of connections. While there is no description they are held, and get no messages.
 
     Args:
         topic: Its global name; compared literally with what subscribers ask for.
@@ -80,27 +79,7 @@ class Publication:
         queue_bytes: Bytes queued for one slow subscriber; one message always fits.
     """
 
-    __slots__ = (
-        "_description",
-        "_dropped_before",
-        "_held",
-        "_latched",
-        "_left",
-        "_open",
-        "_partial",
-        "_queue_bytes",
-        "_queue_messages",
-        "_reply",
-        "_size",
-        "_whole",
-        "_withdrawn",
-        "bytes",
-        "caller_id",
-        "events",
-        "messages",
-        "topic",
-    )
-
+    # More than 12 fields: what is sent to new subscribers, the bounds of their queues, and the message in progress.
     def __init__(
         self,
         topic: str,
@@ -113,92 +92,76 @@ class Publication:
     ) -> None:
         self.topic = topic
         self.caller_id = caller_id
+        self.events = events
         self.messages = 0
         """Messages published."""
         self.bytes = 0
         """Bytes published, lengths included; each message counts once, whatever the number of subscribers."""
-        self._description: TopicDescription | None = None
-        self._reply: Mapping[str, str] = _NOTHING
-        self.events = events
-        """Latched messages that a subscriber has had by another path, by its caller id."""
+        self.description: TopicDescription | None = None
+        """The description, once it is known."""
+        self.latched: tuple[bytes, ...] = ()
+        """The messages kept for later subscribers, oldest first, with their lengths in front."""
+        self._keeps = 1
+        self._reply = _NOTHING
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
-        self._held: tuple[SubscriberConnection, ...] = ()
-        self._open: tuple[SubscriberConnection, ...] = ()
-        # Empty containers take most of the memory of a topic without a subscriber; these are made when needed.
-        self._latched: deque[bytes] | None = None
+        self._connections: tuple[SubscriberConnection, ...] = ()
+        # The message in progress: the bytes to come, who has its beginning, and what has come if it will be latched.
+        self._left = 0
         self._partial: Sequence[tuple[SubscriberConnection, QueuedMessage]] = ()
         self._whole: bytearray | None = None
-        self._size = self._left = 0
         self._dropped_before = 0
-        self._withdrawn = False
         if description is not None:
             self.describe(description)
 
     @property
-    def description(self) -> TopicDescription | None:
-        """The description, once it is known."""
-        return self._description
-
-    @property
-    def latched(self) -> tuple[bytes, ...]:
-        """The messages kept for later subscribers, oldest first, with their lengths in front."""
-        return tuple(self._latched) if self._latched is not None else ()
-
-    @property
     def subscribers(self) -> int:
         """Connections, held ones included."""
-        return len(self._held) + len(self._open)
+        return len(self._connections)
 
     @property
     def listeners(self) -> tuple[str, ...]:
         """The caller ids of the subscribers that are served."""
-        return tuple(connection.caller_id for connection in self._open)
+        return tuple(one.caller_id for one in self._connections) if self.description is not None else ()
 
     @property
     def callers(self) -> frozenset[str]:
         """The caller ids of all subscribers that are connected, held ones included."""
-        return frozenset(connection.caller_id for connection in (*self._open, *self._held))
+        return frozenset(one.caller_id for one in self._connections)
 
     @property
     def dropped(self) -> int:
         """Messages dropped for slow subscribers, those that have disconnected included."""
-        return self._dropped_before + sum(connection.dropped for connection in self._open)
+        return self._dropped_before + sum(one.dropped for one in self._connections)
 
     def connections(self) -> list[BusConnection]:
         """All connections, for ``getBusInfo`` and ``getBusStats``."""
+        served = self.description is not None
         return [
             BusConnection(
-                connection.number,
-                connection.caller_id,
+                one.number,
+                one.caller_id,
                 OUTBOUND,
                 self.topic,
-                connection in self._open,
-                connection.info,
-                connection.stream.bytes_out,
-                connection.messages,
-                connection.dropped,
-                connection.stream.pending_bytes,
+                served,
+                one.info,
+                one.bytes_out,
+                self.messages - one.since if served else 0,
+                one.dropped,
+                one.pending_bytes,
             )
-            for connection in (*self._open, *self._held)
+            for one in self._connections
         ]
 
     def attach(self, connection: SubscriberConnection) -> None:
         """Take over a connection whose header names this topic: serve it, hold it, or refuse it."""
-        problem = check_subscriber(connection.fields, self.topic, self.caller_id, self._description)
-        if problem is not None:
-            self._refuse(connection, problem)
-            return
-        first = self.subscribers == 0
         connection.on_end = self._gone
-        if self._description is None:
-            _log.debug(
-                "= %s: holds subscriber %s until the type is known", self.topic, printable(connection.caller_id)
-            )
-            self._held += (connection,)
-        else:
-            self._serve(connection)
-        if first and self.subscribers:
+        if not self._admit(connection):
+            return
+        self._connections += (connection,)
+        if self.description is not None:
+            self.events.listeners_changed()
+        if len(self._connections) == 1:
             self.events.first_subscriber()
 
     def describe(self, description: TopicDescription) -> int:
@@ -213,29 +176,24 @@ class Publication:
         Raises:
             ValueError: Type or md5 sum is ``*``; see ``tcpros.publisher_header``.
         """
-        before = self.subscribers
         reply = publisher_header(self.topic, self.caller_id, description)
-        old: tuple[SubscriberConnection, ...] = ()
-        if self._reply and self._reply != reply:
-            self._latched = None
-            old, self._open = self._open, ()
-            self.events.listeners_changed()
-            for connection in old:
-                self._count_dropped(connection)
-                connection.close()
-        self._description = description
-        self._reply = reply
-        for connection in self._held:
-            problem = check_subscriber(connection.fields, self.topic, self.caller_id, description)
-            with logged_failure(_log, "%s: subscriber %s failed", self.topic, printable(connection.caller_id)):
-                if problem is None:
-                    self._serve(connection)
-                else:
-                    self._refuse(connection, problem)
-            self._held = tuple(other for other in self._held if other is not connection)
-        if before and not self.subscribers:
-            self.events.last_subscriber()
-        return len(old)
+        before, connections, held = self._reply, self._connections, self.description is None
+        self.description, self._reply = description, reply
+        if held:
+            self._connections = ()
+            for connection in connections:
+                with logged_failure(_log, "%s: subscriber %s failed", self.topic, printable(connection.caller_id)):
+                    if self._admit(connection):
+                        self._connections += (connection,)
+            if connections:
+                self.events.listeners_changed()
+                if not self._connections:
+                    self.events.last_subscriber()
+        elif before != reply:
+            self.latched = ()
+            self._end(connections)
+            return len(connections)
+        return 0
 
     def publish_framed(self, framed: Buffer) -> int:
         """Send one message to all subscribers, independently of each other.
@@ -248,11 +206,13 @@ class Publication:
         """
         self.messages += 1
         self.bytes += len(framed)
-        if self._description is not None and self._description.latching:
-            self._keep_latched(bytes(framed))
-        dropped = 0
-        for connection in self._open:
-            dropped += connection.send(framed)
+        if self.description is None:
+            return 0
+        if self.description.latching:
+            self._latch(bytes(framed))
+        parts, dropped = (framed,), 0
+        for connection in self._connections:
+            dropped += connection.send(parts, _MESSAGES)
         return dropped
 
     def begin(self, size: int) -> None:
@@ -260,30 +220,30 @@ class Publication:
 
         A subscriber that connects before the message's end does not get it, unless the topic is latched.
         """
-        self._size = self._left = size
-        self._partial = [(connection, connection.begin(size)) for connection in self._open]
-        latching = self._description is not None and self._description.latching
-        self._whole = bytearray() if latching else None
+        self._left = size
+        if self.description is not None:
+            self._partial = [(connection, connection.open(_MESSAGES, size)) for connection in self._connections]
+            self._whole = bytearray() if self.description.latching else None
 
     def extend(self, part: Buffer) -> None:
         """Send the next part to all subscribers that have the message's beginning."""
         for connection, message in self._partial:
             connection.extend(message, part)
+        self.bytes += len(part)
         self._left -= len(part)
         if self._whole is not None:
             self._whole += part
         if self._left:
             return
         self.messages += 1
-        self.bytes += self._size
-        partial, self._partial = self._partial, ()
+        served = {connection for connection, _ in self._partial}
+        self._partial = ()
         if self._whole is not None:
             framed, self._whole = bytes(self._whole), None
-            self._keep_latched(framed)
-            served = {connection for connection, _ in partial}
-            for connection in self._open:
+            self._latch(framed)
+            for connection in self._connections:
                 if connection not in served:
-                    connection.send(framed)
+                    connection.send((framed,), _MESSAGES)
 
     def abort(self) -> int:
         """Give up the message in progress, whose rest will not arrive.
@@ -294,88 +254,78 @@ class Publication:
             The number of disconnected subscribers: if any, the owner should register the topic again.
         """
         broken = [connection for connection, message in self._partial if connection.abandon(message)]
-        self._partial = ()
-        self._whole = None
-        before = self.subscribers
-        for connection in broken:
-            self._count_dropped(connection)
-            connection.close()
-        self._open = tuple(connection for connection in self._open if connection not in broken)
-        self.events.listeners_changed()
-        if before and not self.subscribers:
-            self.events.last_subscriber()
+        self._partial, self._whole = (), None
+        self._end(broken)
         return len(broken)
 
     def bound(self, messages: int) -> None:
         """Set the bound on messages queued for one slow subscriber."""
         self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
-        for connection in self._open:
+        for connection in self._connections:
             connection.bound(self._queue_messages, self._queue_bytes)
 
     def keep(self, depth: int) -> None:
         """Set the number of latched messages that are kept for later subscribers."""
-        self._latched = deque(self._latched or (), maxlen=min(depth, limits.LATCHED_MAX))
+        self._keeps = max(1, min(depth, limits.LATCHED_MAX))
+        self.latched = self.latched[-self._keeps :]
 
     def forget_latched(self) -> None:
         """Drop the latched messages, because their source is gone or will send them again."""
-        if self._latched is not None:
-            self._latched.clear()
+        self.latched = ()
 
     def hang_up(self, caller_id: str) -> bool:
         """Close the connections of one subscriber; return whether there was one."""
-        gone = [connection for connection in (*self._open, *self._held) if connection.caller_id == caller_id]
-        for connection in gone:
-            connection.close()
-            self._gone(connection, None)
+        gone = [connection for connection in self._connections if connection.caller_id == caller_id]
+        self._end(gone)
         return bool(gone)
 
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all published messages are sent, at most ``timeout`` seconds."""
-        if self._open:
-            await asyncio.gather(*(connection.stream.drained(timeout) for connection in self._open))
+        await asyncio.gather(*(connection.drained(timeout) for connection in self._connections))
 
     def withdraw(self) -> None:
-        """Close all connections without calling ``last_subscriber``."""
-        self._withdrawn = True
-        connections, self._held, self._open = (*self._held, *self._open), (), ()
-        for connection in connections:
-            self._count_dropped(connection)
-            connection.close()
-        self._latched = None
-        self._partial = ()
-        self._whole = None
+        """Close all connections without an event."""
+        self.events = _NO_EVENTS
+        self.latched, self._whole = (), None
+        self._end(self._connections)
 
-    def _keep_latched(self, framed: bytes) -> None:
-        if self._latched is None:
-            self._latched = deque(maxlen=1)
-        self._latched.append(framed)
+    def _latch(self, framed: bytes) -> None:
+        self.latched = (*self.latched, framed)[-self._keeps :]
 
-    def _serve(self, connection: SubscriberConnection) -> None:
-        _log.debug(
-            "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
-        )
+    def _admit(self, connection: SubscriberConnection) -> bool:
+        """Serve a connection, or hold it until the type is known; return ``False`` if it is refused or has ended."""
+        who = printable(connection.caller_id)
+        problem = check_subscriber(connection.request, self.topic, self.caller_id, self.description)
+        if problem is not None:
+            _log.debug("! %s: refuses subscriber %s: %s", self.topic, who, problem)
+            connection.refuse(problem)
+            self.events.mismatch(connection.request, problem)
+            return False
+        if self.description is None:
+            _log.debug("= %s: holds subscriber %s until the type is known", self.topic, who)
+            return True
+        _log.debug("> %s: serves subscriber %s at %s", self.topic, who, connection.peer[0])
         connection.accept(self._reply, self._queue_messages, self._queue_bytes)
+        connection.since = self.messages - len(self.latched)
         for framed in self.latched:
-            connection.send(framed)
-        if not connection.stream.closed:
-            self._open += (connection,)
-            self.events.listeners_changed()
+            connection.send((framed,), _MESSAGES)
+        return not connection.closed
 
-    def _refuse(self, connection: SubscriberConnection, text: str) -> None:
-        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(connection.caller_id), text)
-        connection.refuse(text)
-        self.events.mismatch(connection.fields, text)
-
-    def _count_dropped(self, connection: SubscriberConnection) -> None:
-        self._dropped_before += connection.dropped
+    def _end(self, connections: Sequence[SubscriberConnection]) -> None:
+        """Close connections and forget them."""
+        if not connections:
+            return
+        gone = set(connections)
+        self._dropped_before += sum(one.dropped for one in gone)
+        self._partial = [each for each in self._partial if each[0] not in gone]
+        left = tuple(one for one in self._connections if one not in gone)
+        ended, self._connections = len(left) < len(self._connections), left
+        for connection in connections:
+            connection.hang_up()
+        self.events.listeners_changed()
+        if ended and not left:
+            self.events.last_subscriber()
 
     def _gone(self, connection: SubscriberConnection, error: Exception | None) -> None:
         _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(connection.caller_id), error or "closed")
-        before = self.subscribers
-        self._count_dropped(connection)
-        self._partial = [(other, message) for other, message in self._partial if other is not connection]
-        self._held = tuple(other for other in self._held if other is not connection)
-        self._open = tuple(other for other in self._open if other is not connection)
-        self.events.listeners_changed()
-        if before and not self.subscribers and not self._withdrawn:
-            self.events.last_subscriber()
+        self._end((connection,))

@@ -258,7 +258,7 @@ class _ClientConnection:
         self._endpoint = endpoint
         self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = is_persistent(connection.fields)
+        self._persistent = is_persistent(connection.request)
         self._open = False
         self._ended = False
         self._taking = False
@@ -270,7 +270,7 @@ class _ClientConnection:
         self._deadline: asyncio.TimerHandle | None = None
         self._stall: asyncio.TimerHandle | None = None
         self._seen = 0
-        connection.on_bytes = self._take
+        connection.on_data = self._take
         connection.on_end = self._left
 
     @property
@@ -286,16 +286,16 @@ class _ClientConnection:
             resume: Read requests that are buffered already; ``False`` within the read that received the header.
         """
         connection, endpoint = self._connection, self._endpoint
-        problem = check_client(connection.fields, endpoint.service, endpoint.caller_id, description)
+        problem = check_client(connection.request, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
-            endpoint.mismatch(connection.fields, problem)
+            endpoint.mismatch(connection.request, problem)
             self.refuse(problem)
             return
         self._open = True
-        connection.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
+        connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = server_header(endpoint.caller_id, description)
         connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or is_probe(connection.fields):
+        if not self._persistent or is_probe(connection.request):
             self._start_stall_timer()
         if resume:
             self._resume()
@@ -435,7 +435,7 @@ class _ClientConnection:
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
         head, body = frame_reply(ok, body)
-        stream = self._connection.stream
+        stream = self._connection
         if len(body) > INLINE:
             if isinstance(body, memoryview):
                 body = bytes(body)  # a view may be valid during this call only
@@ -450,7 +450,7 @@ class _ClientConnection:
 
     async def _send_large(self, head: bytes, body: Buffer) -> None:
         try:
-            await send_large(self._connection.stream, head, body)
+            await send_large(self._connection, head, body)
             await self._drained()
         finally:
             self._sending = None
@@ -464,7 +464,7 @@ class _ClientConnection:
         self._reply_sent()
 
     async def _drained(self) -> None:
-        stream = self._connection.stream
+        stream = self._connection
         while stream.pending_bytes and not stream.closed:
             await stream.drained()
 
@@ -482,21 +482,21 @@ class _ClientConnection:
     def _close_served(self) -> None:
         if self._ended:
             return
-        if self._connection.stream.pending_bytes and self._sending is None:
+        if self._connection.pending_bytes and self._sending is None:
             self._sending = self._loop.create_task(self._drain(), name="service response drains")
             return
         self.close()
 
     def _resume(self) -> None:
         if not self._taking and not self._ended:
-            self._connection.stream.feed(b"")
+            self._connection.feed(b"")
 
     # --- the end ----------------------------------------------------------------------------------------------
 
     def _start_stall_timer(self) -> None:
         """Close the connection if no bytes arrive within ``limits.SERVICE_STALL`` seconds."""
         if self._stall is None:
-            self._seen = self._connection.stream.bytes_in
+            self._seen = self._connection.bytes_in
             self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
 
     def _stop_stall_timer(self) -> None:
@@ -506,7 +506,7 @@ class _ClientConnection:
 
     def _stalled(self) -> None:
         self._stall = None
-        if self._connection.stream.bytes_in != self._seen:
+        if self._connection.bytes_in != self._seen:
             self._start_stall_timer()
             return
         who = printable(self._connection.caller_id)
@@ -526,7 +526,7 @@ class _ClientConnection:
             self._deadline = None
         if self._sending is not None:
             self._sending.cancel()
-        self._connection.on_bytes = None
+        self._connection.on_data = None
         self._connection.on_end = _ended
         self._endpoint.remove(self)
         call, self._call = self._call, None

@@ -20,18 +20,17 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.http.rpc import XmlRpcServer
 from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.wire.slave_api import METHODS, SlaveApi
+from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
 from rmpa.ros.wire.tcpros import ANY, LENGTH, ServiceDescription, printable
 from rmpa.ros.wire.xmlrpc import RosFault
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Mapping
 
-    from rmpa.ros.node.in_process import InProcessConnection
     from rmpa.ros.node.listeners import SharedListener
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceCall
-    from rmpa.ros.node.subscription import PublisherConnection, Subscription
+    from rmpa.ros.node.subscription import Subscription, TopicConnection
     from rmpa.ros.wire.slave_api import BusConnection
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
@@ -60,7 +59,7 @@ class SlaveNode:
     Args:
         name: The node's global name.
         host: The address to listen at, and to register unless ``advertised_host`` is given.
-        master_uri: The answer to ``getMasterUri``.
+        master_uri: The answer to ``getMasterUri``; the owner sets it later if its master does not listen yet.
         advertised_host: The address to register, if it differs from ``host``.
         port: The XML-RPC server's; 0 lets the system choose.
         listener: A started listener that accepts this node's connections and assigns its address; ``host``,
@@ -68,11 +67,11 @@ class SlaveNode:
         counters: Count refusals.
         on_shutdown: ``(reason)``: the master shuts this node down; the owner has to close it.
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
-        on_publisher_update: ``(topic, uris)``, called after the node's own subscription is updated.
         on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
         taps: The owner's own connections to publishers, for ``getBusInfo`` and ``getBusStats``.
     """
 
+    # More than 12 fields: the tables of topics and services, the two servers, and the callbacks of the Slave API.
     def __init__(
         self,
         name: str,
@@ -85,11 +84,13 @@ class SlaveNode:
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] = _ignore,
         on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
-        on_publisher_update: Callable[[str, Sequence[str]], None] = _ignore,
         on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None,
-        taps: Callable[[], Iterable[PublisherConnection | InProcessConnection]] = tuple,
+        taps: Callable[[], Iterable[TopicConnection]] = tuple,
     ) -> None:
         self.name = name
+        self.master_uri = master_uri
+        self.uri = ""
+        """The slave API's URI, ``http://host:port/``; empty before ``start()``."""
         self.counters = counters if counters is not None else Counters()
         self._host = host
         self._listener = listener
@@ -101,27 +102,11 @@ class SlaveNode:
         self._on_shutdown = on_shutdown
         self._on_kill = on_kill
         self._on_param_update = on_param_update
-        self._on_publisher_update = on_publisher_update
         self._taps = taps
-        self._api = SlaveApi(name, master_uri, os.getpid(), self)
         self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
         self._tcpros = TcprosServer(
             name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
         )
-
-    @property
-    def master_uri(self) -> str:
-        """The answer to ``getMasterUri``; to be set by the owner of a node that is made before its master listens."""
-        return self._api.master_uri
-
-    @master_uri.setter
-    def master_uri(self, uri: str) -> None:
-        self._api.master_uri = uri
-
-    @property
-    def uri(self) -> str:
-        """The slave API's URI, ``http://host:port/``; empty before ``start()``."""
-        return self._api.uri
 
     async def start(self) -> None:
         """Listen.
@@ -133,37 +118,32 @@ class SlaveNode:
             self._advertised = self._listener.attach(self.name, self._http.adopt, self._tcpros.adopt)
             self._http.port, tcpros_port = self._listener.ports
             self._tcpros.address = (self._advertised, tcpros_port)
-            self._api.uri = f"http://{self._advertised}:{self._http.port}/"
-            return
-        await self._http.start()
-        try:
-            self._tcpros.start(self._host)
-        except BaseException:
-            await self._http.close()
-            raise
-        self._api.uri = f"http://{self._advertised}:{self._http.port}/"
+        else:
+            await self._http.start()
+            try:
+                self._tcpros.start(self._host)
+            except BaseException:
+                await self._http.close()
+                raise
+        self.uri = f"http://{self._advertised}:{self._http.port}/"
 
     async def close(self) -> None:
         """Close the topics and services, then the servers; the owner has unregistered them before."""
+        services = tuple(self._services.values())
         for topic in tuple(self._publications):
             self.remove_publication(topic)
-        services = tuple(self._services.values())
-        for endpoint in services:
-            self.remove_service(endpoint.service)
-        subscriptions, self._subscriptions = self._subscriptions, {}
-        for subscription in subscriptions.values():
-            subscription.close()
+        for topic in tuple(self._subscriptions):
+            self.remove_subscription(topic)
+        for service in tuple(self._services):
+            self.remove_service(service)
         if self._listener is not None and self.uri:
             self._listener.detach(self._advertised)
             self._listener = None  # a second close must not free the next node's address
         self._tcpros.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
-        for subscription in subscriptions.values():
-            await subscription.closed()
         # The node and its servers are a reference cycle, which must not hold the owner until it is collected.
-        self._on_shutdown, self._on_publisher_update, self._on_kill = _ignore, _ignore, None
-        self._on_param_update, self._taps = _not_followed, tuple
+        self._on_shutdown, self._on_kill, self._on_param_update, self._taps = _ignore, None, _not_followed, tuple
 
     def next_number(self) -> int:
         """A number for a connection of this node."""
@@ -193,12 +173,11 @@ class SlaveNode:
         """Pass ``publisherUpdate`` of its topic on to a subscription."""
         self._subscriptions[subscription.topic] = subscription
 
-    async def remove_subscription(self, topic: str) -> None:
+    def remove_subscription(self, topic: str) -> None:
         """Disconnect from a topic's publishers."""
         subscription = self._subscriptions.pop(topic, None)
         if subscription is not None:
             subscription.close()
-            await subscription.closed()
 
     @property
     def service_uri(self) -> str:
@@ -224,17 +203,16 @@ class SlaveNode:
         if endpoint is not None:
             endpoint.withdraw(text)
 
-    # --- wire.slave_api.NodeView ------------------------------------------------------------------------------
+    # --- the Slave API ----------------------------------------------------------------------------------------
 
-    def publications(self) -> list[tuple[str, str]]:
+    def publications(self) -> dict[str, str]:
         """Published topics and types; ``*`` where the type is not known yet."""
-        return [(p.topic, p.description.type if p.description else ANY) for p in self._publications.values()]
+        return {p.topic: p.description.type if p.description else ANY for p in self._publications.values()}
 
-    def subscriptions(self) -> list[tuple[str, str]]:
+    def subscriptions(self) -> dict[str, str]:
         """Subscribed topics and types."""
         found = {s.topic: s.type_name for s in self._subscriptions.values()}
-        found |= {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
-        return list(found.items())
+        return found | {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
 
     def connections(self) -> list[BusConnection]:
         """All topic connections."""
@@ -246,50 +224,74 @@ class SlaveNode:
         """Host and port for subscribers of a topic; ``None`` if it is not published."""
         return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
 
-    def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """Apply the master's list of publishers of a topic."""
-        subscription = self._subscriptions.get(topic)
-        if subscription is not None:
-            subscription.update(publishers)
-        self._on_publisher_update(topic, publishers)
-
-    def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        """Pass a changed parameter on; return whether the node subscribed to its key."""
-        return self._on_param_update(key, value)
-
-    def shut_down(self, reason: str) -> None:
-        """Pass the master's request to shut down on to ``on_shutdown``."""
-        _log.info("< %s: asked to shut down: %s", self.name, reason)
-        self._on_shutdown(reason)
-
     def _call(
         self, method: str, params: tuple[XmlRpcValue, ...], _client: str
     ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
         if method not in METHODS:
             raise RosFault(-1, f"{self.name} has no method {method}")
-        reply = self._api.dispatch(method, params)
-        if method == "shutdown" and reply.code == 1 and self._on_kill is not None:
-            caller, reason = [*map(str, params), ""][:2]
-            return self._answer(self._on_kill(caller, reason))
-        if method == "requestTopic" and reply.code == 1:
-            publication = self._publications.get(str(params[1]))
-            if publication is not None:
-                other = publication.events.request(str(params[0]))
-                if other is not None:
-                    return self._answer_other(other, reply)
-        return list(reply)
+        problem = check_call(method, params)
+        if problem is not None:
+            return [-1, problem, METHODS[method][1]]
+        match method, params:
+            case "shutdown", [str(caller), *reason]:
+                return self._shut_down(caller, "".join(map(str, reason)))
+            case "requestTopic", [str(caller), str(topic), list(protocols)]:
+                return self._request_topic(caller, topic, protocols)
+            case "publisherUpdate", [_, str(topic), list(publishers)]:
+                if topic in self._subscriptions:
+                    self._subscriptions[topic].update(map(str, publishers))
+                return [1, "", 0]
+            case "paramUpdate", [_, str(key), value]:
+                # rosmaster appends a slash to the key, and roscpp removes it.
+                followed = self._on_param_update(key.rstrip("/") or "/", value)
+                return [1, "", 0] if followed else [-1, "not subscribed", 0]
+        return self._told(method)
 
-    @staticmethod
-    async def _answer_other(other: Awaitable[RosReply | None], own: RosReply) -> XmlRpcValue:
-        try:
-            return list(await other or own)
-        except Exception:  # noqa: BLE001 - the subscriber would not ask again
-            _log.exception("! a requestTopic was not decided; answered with the own address")
-            return list(own)
+    def _told(self, method: str) -> XmlRpcValue:
+        """Answer a method that has no parameters."""
+        match method:
+            case "getBusStats":
+                return [1, "", bus_stats(self.publications(), self.subscriptions(), self.connections())]
+            case "getBusInfo":
+                return [1, "bus info", bus_info(self.connections())]
+            case "getSubscriptions":
+                return [1, "subscriptions", [list(pair) for pair in self.subscriptions().items()]]
+            case "getPublications":
+                return [1, "publications", [list(pair) for pair in self.publications().items()]]
+            case "getMasterUri":
+                return [1, self.master_uri, self.master_uri] if self.master_uri else [0, "master URI not set", ""]
+            case "getPid":
+                return [1, "", os.getpid()]
+        return [1, "", self.name if method == "getName" else self.uri]
 
-    @staticmethod
-    async def _answer(reply: Awaitable[RosReply]) -> XmlRpcValue:
-        return list(await reply)
+    def _shut_down(self, caller: str, reason: str) -> XmlRpcValue | Awaitable[XmlRpcValue]:
+        _log.info("< %s: asked to shut down: %s", self.name, reason)
+        self._on_shutdown(reason)
+        return [1, "shutdown", 0] if self._on_kill is None else _as_list(self._on_kill(caller, reason))
+
+    def _request_topic(
+        self, caller: str, topic: str, protocols: list[XmlRpcValue]
+    ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
+        address = self.address_of(topic)
+        if address is None:
+            return [-1, f"Not a publisher of [{topic}]", []]
+        if not any(isinstance(p, list) and p and p[0] == TCPROS for p in protocols):
+            return [0, "no supported protocol implementations", []]
+        own: list[XmlRpcValue] = [1, f"ready on {address[0]}:{address[1]}", [TCPROS, *address]]
+        other = self._publications[topic].events.request(caller)
+        return own if other is None else _decided(other, own)
+
+
+async def _decided(other: Awaitable[RosReply | None], own: list[XmlRpcValue]) -> XmlRpcValue:
+    try:
+        return list(await other or own)
+    except Exception:  # noqa: BLE001 - the subscriber would not ask again
+        _log.exception("! a requestTopic was not decided; answered with the own address")
+        return own
+
+
+async def _as_list(reply: Awaitable[RosReply]) -> XmlRpcValue:
+    return list(await reply)
 
 
 GET: Final = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
@@ -365,20 +367,14 @@ def _string(text: str) -> bytes:
     return LENGTH.pack(len(raw)) + raw
 
 
-def _strings(raw: Buffer) -> tuple[str, str]:
-    """The two strings of a request."""
+def _strings(raw: Buffer) -> list[str]:
+    """The strings of a request."""
     found: list[str] = []
-    start = 0
-    for _ in range(2):
-        end = start + LENGTH.size
-        if end > len(raw):
-            break
-        (size,) = LENGTH.unpack_from(raw, start)
-        start, end = end, end + size
-        if end > len(raw):
-            break
-        found.append(str(raw[start:end], "utf-8", "replace"))
-        start = end
-    if len(found) != 2 or start != len(raw):
+    at = 0
+    while len(found) < 2 and at + LENGTH.size <= len(raw):
+        start = at + LENGTH.size
+        at = start + LENGTH.unpack_from(raw, at)[0]
+        found.append(str(raw[start:at], "utf-8", "replace"))
+    if at != len(raw) or len(found) != 2:
         raise RemoteProtocolError(f"{len(raw)} bytes are not a roscpp/SetLoggerLevelRequest")
-    return found[0], found[1]
+    return found

@@ -1,4 +1,4 @@
-"""The subscribing end of a topic: a connection to one publisher, and the connections to all publishers."""
+"""The subscribing end of a topic: a connection to one publisher, by TCPROS or within the process, or to all."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final, Protocol
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Backoff
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api, connect
-from rmpa.ros.node.accepted_connection import keep_alive
+from rmpa.ros.node.accepted_connection import keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import INBOUND, TCPROS, BusConnection
 from rmpa.ros.wire.tcpros import (
     ANY,
@@ -30,9 +30,11 @@ from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.ros.wire.tcpros import Header
+    from rmpa.ros.wire.tcpros import Buffer, Header
+
+    Attach = Callable[["InProcessConnection"], None]
 
 _log = logging.getLogger(__name__)
 _PORT_MAX: Final = 65535
@@ -58,11 +60,12 @@ class PartsTaker(Protocol):
 OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"
 
 
-class PublisherConnection:
-    """Connects to one publisher of one topic, and reconnects until it is closed or the publisher refuses it.
+class TopicConnection:
+    """A subscriber's connection to one publisher of one topic.
 
-    The owner closes the connection when the publisher is no longer registered, and makes a new one for a restarted
-    node, which has a new URI. All callbacks are called in the loop, and none after ``close()``.
+    It connects again until it is closed or the publisher refuses it. The owner closes it when the publisher is no
+    longer registered, and makes a new one for a restarted node, which has a new URI. All callbacks are called in the
+    loop, and none after ``close()``.
 
     Args:
         topic: The topic's global name.
@@ -82,9 +85,15 @@ class PublisherConnection:
         definition: The definition to send, if known.
         nodelay: Whether to ask for TCP_NODELAY on the publisher's side.
         number: The connection's number within the node, for ``getBusInfo``.
-        rng: Uniform numbers in [0, 1), for the jitter of the back-off.
+        find: Returns ``Publication.attach`` while there is one at that address, if it is one of this process.
     """
 
+    info = ""
+    """The addresses, in the form of ``rosnode info``."""
+    malformed = False
+    """Whether the last connection ended because the publisher broke the protocol."""
+
+    # More than 12 fields: the counts of ``getBusStats``, and a callback for each thing that happens to a connection.
     def __init__(
         self,
         topic: str,
@@ -102,42 +111,30 @@ class PublisherConnection:
         definition: str = "",
         nodelay: bool = True,
         number: int = 0,
-        rng: Callable[[], float] = random.random,
+        find: Callable[[], Attach | None] = lambda: None,
     ) -> None:
         self.topic = topic
         self.uri = uri
+        self.number = number
+        self.request = subscriber_header(
+            topic, caller_id, type_name=type_name, md5sum=md5sum, definition=definition, nodelay=nodelay
+        )
+        """The subscriber's header."""
         self.fields: Header = {}
         """The publisher's reply header; empty while there is no connection."""
-        self.messages = 0
-        self.bytes = 0
-        self.oversized = 0
-        """Messages dropped because they are too long."""
-        self.malformed = False
-        """Whether the last connection ended because the publisher broke the protocol."""
-        self.number = number
+        self.messages = self.bytes = self.oversized = 0
         self.refused: str | None = None
         """Why the publisher refused or does not match; ``None`` while it has not refused."""
-        self._caller_id = caller_id
-        self._type = type_name
-        self._md5sum = md5sum
-        self._request = encode_header(
-            subscriber_header(
-                topic, caller_id, type_name=type_name, md5sum=md5sum, definition=definition, nodelay=nodelay
-            )
-        )
         self._on_message = on_message
         self._parts = on_parts
-        self._left = 0
-        self._skipping = 0
-        self._on_oversized = on_oversized
         self._on_header = on_header
         self._on_refused = on_refused
         self._on_lost = on_lost
-        self._backoff = Backoff(limits.TCPROS_RETRY_FIRST, limits.TCPROS_RETRY_MAX, rng)
-        self._stream: Stream | None = None
-        self._info = ""
-        self._ended: asyncio.Future[Exception | None] | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._on_oversized = on_oversized
+        self._find = find
+        self._left = 0
+        """Bytes to come of a message that is taken in parts."""
+        self._backoff = Backoff(limits.TCPROS_RETRY_FIRST, limits.TCPROS_RETRY_MAX, random.random)
         self._closed = False
 
     @property
@@ -145,48 +142,50 @@ class PublisherConnection:
         """Whether the headers have been exchanged."""
         return bool(self.fields)
 
-    @property
-    def ended(self) -> bool:
-        """Whether the connection's task has ended, or was never started."""
-        return self._task is None or self._task.done()
+    def start(self) -> None:
+        """Connect, in a later turn of the loop."""
+        raise NotImplementedError
 
-    @property
-    def _over(self) -> bool:
-        return self._closed or self.refused is not None
+    def close(self) -> None:
+        """Disconnect at once; no callback is called any more."""
+        raise NotImplementedError
+
+    def connection(self) -> BusConnection:
+        """The connection's row in ``getBusInfo`` and ``getBusStats``."""
+        return BusConnection(
+            self.number, self.uri, INBOUND, self.topic, self.connected, self.info, self.bytes, self.messages
+        )
+
+
+class PublisherConnection(TopicConnection):
+    """A connection by TCPROS to a publisher of another process."""
+
+    _stream: Stream | None = None
+    _task: asyncio.Task[None] | None = None
+    _ended: asyncio.Future[Exception | None]
+    _handshake: asyncio.Timeout
+    _skips = False
+    """Whether the message in progress is too long, and dropped."""
 
     def start(self) -> None:
         """Connect, in a task of its own."""
         self._task = asyncio.get_running_loop().create_task(self._run(), name=f"subscribe {self.topic} {self.uri}")
-        self._task.add_done_callback(self._forget_task)
 
     def close(self) -> None:
         """Disconnect at once; no callback is called any more."""
         self._closed = True
         if self._task is not None:
             self._task.cancel()
+            self._task = None  # a cancelled task refers to its frames, and so to this object
         self._drop()
-
-    async def closed(self) -> None:
-        """Wait, after ``close()``, until the task has ended."""
-        if self._task is not None:
-            await asyncio.wait([self._task])
-
-    def connection(self) -> BusConnection:
-        """The connection's row in ``getBusInfo`` and ``getBusStats``."""
-        return BusConnection(
-            self.number, self.uri, INBOUND, self.topic, self.connected, self._info, self.bytes, self.messages
-        )
-
-    def _forget_task(self, _: asyncio.Task[None]) -> None:
-        """Drop the reference to the ended task: a cancelled task refers to its frames, and so to this object."""
-        self._task = None
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             began = loop.time()
             reason = await self._attempt()
-            if self._over:
+            if self._closed or self.refused is not None:
+                self._task = None
                 return
             _log.debug("< %s: lost publisher %s: %s", self.topic, self.uri, reason)
             self._on_lost(reason)
@@ -200,28 +199,23 @@ class PublisherConnection:
             host, port = await self._request_topic()
             async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
                 sock = await connect(host, port)
+            self._open(sock)
         except TimeoutError:
             return f"no TCPROS server answers in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
         except (OSError, RmpaError) as error:
             return OUT_OF_FILES if is_shortage(error) else str(error)
-        loop = asyncio.get_running_loop()
-        self._ended = loop.create_future()
         try:
-            self._open(sock)
-        except OSError as error:
-            sock.close()
-            return str(error)
-        silent = loop.call_later(limits.TCPROS_HANDSHAKE_TIMEOUT, self._handshake_timed_out)
-        try:
-            ended = await self._ended
+            async with asyncio.timeout(limits.TCPROS_HANDSHAKE_TIMEOUT) as self._handshake:
+                ended = await self._ended
+        except TimeoutError:
+            return f"no header from the publisher in {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s"
         finally:
-            silent.cancel()
             self._drop()
         self.malformed = isinstance(ended, RemoteProtocolError)
         return str(ended) if ended is not None else "the publisher closed the connection"
 
     async def _request_topic(self) -> tuple[str, int]:
-        reply = await call_api(self.uri, "requestTopic", self._caller_id, self.topic, [[TCPROS]])
+        reply = await call_api(self.uri, "requestTopic", self.request["callerid"], self.topic, [[TCPROS]])
         match reply.value:
             case [str(protocol), str(host), int(port)] if reply.code == 1 and protocol == TCPROS:
                 if 0 < port <= _PORT_MAX:
@@ -229,126 +223,229 @@ class PublisherConnection:
         raise RemoteProtocolError(f"{self.uri} answers requestTopic with {reply.code}: {printable(reply.status)}")
 
     def _open(self, sock: socket.socket) -> None:
-        keep_alive(sock)
-        host, port = sock.getpeername()[:2]
-        self._info = f"TCPROS connection on port {sock.getsockname()[1]} to [{host}:{port}]"
-        self._stream = Stream(
-            sock,
-            on_bytes=self._take,
-            on_close=self._end,
-            outbox=Outbox(1, limits.TCPROS_HEADER_MAX),
-        )
+        try:
+            keep_alive(sock)
+            self.info = tcpros_info(sock)
+        except OSError:  # the publisher has disconnected already
+            sock.close()
+            raise
+        self._ended = asyncio.get_running_loop().create_future()
+        outbox = Outbox(1, limits.TCPROS_HEADER_MAX)
+        self._stream = Stream(sock, on_bytes=self._take, on_close=self._end, outbox=outbox)
         # At once: a rospy node accepts no other connection while it waits for a header.
-        self._stream.send([self._request], URGENT)
+        self._stream.send([encode_header(self.request)], URGENT)
 
     def _take(self, data: memoryview) -> tuple[int, int]:
-        start = 0
-        if self._skipping or self._left or not self.fields:
-            start, wanted = self._take_rest_or_header(data)
-            if wanted >= 0:
-                return start, wanted
-        try:
-            messages, consumed, wanted = split_messages(data[start:])
-        except LimitExceeded as error:
-            self._begin_skipping(error.claimed)
-            return self._take_next(data, start)
-        for message in messages:
-            if self._closed:
-                break
-            self.messages += 1
-            self.bytes += len(message)
-            self._on_message(message)
-        start += consumed
-        if self._parts is not None and wanted > core_limits.CUT_THROUGH_BYTES and not self._closed:
-            self._left = wanted
-            self._parts.begin(wanted)
-            if self._left:  # the callback may have closed this connection
-                self._take_part(self._parts, data[start:])
-            return len(data), 0
-        if wanted == LENGTH.size and len(data) - start >= LENGTH.size:
-            return self._take_next(data, start)  # a message that is too long
-        return start, wanted
-
-    def _take_rest_or_header(self, data: memoryview) -> tuple[int, int]:
-        """Consume the rest of a message, or the header, before further messages.
-
-        Returns:
-            The number of consumed bytes, and ``_take``'s second result; the latter is -1 if messages may follow.
-        """
-        start = 0
-        if self._skipping:
-            start = self._skip(data)
-        elif self._left and self._parts is not None:
-            start = self._take_part(self._parts, data)
-        if self._skipping or self._left or self._closed:
-            return start, 0
+        at = 0
         if not self.fields:
-            fields, start, wanted = parse_header(data)
+            fields, at, wanted = parse_header(data)
             if fields is None:
                 return 0, wanted
-            if not self._accept_header(fields):
-                return len(data), 0
-        return start, -1
+            self._accept_header(fields)
+        while self.fields:  # a callback may close the connection
+            if self._left:
+                at += self._take_part(data[at:])
+                if self._left:
+                    return at, 0
+            try:
+                messages, consumed, wanted = split_messages(data[at:])
+            except LimitExceeded as error:
+                self._begin(LENGTH.size + error.claimed, skip=True)
+                continue
+            for message in messages:
+                if self._closed:
+                    break
+                self.messages += 1
+                self.bytes += len(message)
+                self._on_message(message)
+            at += consumed
+            if self._parts is not None and wanted > core_limits.CUT_THROUGH_BYTES and not self._closed:
+                self._begin(wanted, skip=False)
+            elif wanted > LENGTH.size or len(data) - at < LENGTH.size:  # else a message that is too long follows
+                return at, wanted
+        return len(data), 0
 
-    def _take_next(self, data: memoryview, start: int) -> tuple[int, int]:
-        if self._closed:
-            return len(data), 0
-        consumed, wanted = self._take(data[start:])
-        return start + consumed, wanted
+    def _begin(self, size: int, *, skip: bool) -> None:
+        """Begin a message that is taken in parts, or one that is too long and dropped."""
+        self._left, self._skips = size, skip
+        if skip:
+            self.oversized += 1
+            self._on_oversized(size - LENGTH.size)
+        elif self._parts is not None:
+            self._parts.begin(size)
 
-    def _begin_skipping(self, size: int) -> None:
-        """Begin to drop a message of ``size`` bytes that is longer than ``limits.TCPROS_MESSAGE_MAX``."""
-        self._skipping = LENGTH.size + size
-        self.oversized += 1
-        self._on_oversized(size)
-
-    def _skip(self, data: memoryview) -> int:
-        """Drop the received bytes of a message that is too long; return their number."""
-        count = min(self._skipping, len(data))
-        self._skipping -= count
-        self.bytes += count
-        return count
-
-    def _take_part(self, parts: PartsTaker, data: memoryview) -> int:
-        """Pass on the received bytes of a large message; return their number."""
+    def _take_part(self, data: memoryview) -> int:
+        """Pass on, or drop, the received bytes of the message in progress; return their number."""
         count = min(self._left, len(data))
         self._left -= count
         self.bytes += count
-        self.messages += not self._left
-        parts.part(data[:count])
+        if self._parts is not None and not self._skips:
+            self.messages += not self._left
+            self._parts.part(data[:count])
         return count
 
-    def _accept_header(self, fields: Header) -> bool:
-        problem = check_publisher(fields, self._type, self._md5sum)
+    def _accept_header(self, fields: Header) -> None:
+        problem = check_publisher(fields, self.request["type"], self.request["md5sum"])
         if problem is None:
             self.fields = fields
+            self._handshake.reschedule(None)
             _log.debug("= %s: connected to publisher %s", self.topic, self.uri)
             self._on_header(fields)
-            return not self._closed
+            return
         self.refused = problem
         self._drop()
         self._end(None)
         _log.debug("! %s: publisher %s refuses: %s", self.topic, self.uri, problem)
         self._on_refused(problem)
-        return False
-
-    def _handshake_timed_out(self) -> None:
-        if not self.fields:
-            self._end(TimeoutError(f"no header from the publisher in {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s"))
 
     def _end(self, error: Exception | None) -> None:
-        if self._ended is not None and not self._ended.done():
+        if not self._ended.done():
             self._ended.set_result(error)
 
     def _drop(self) -> None:
         self.fields = {}
-        self._skipping = 0
-        if self._left and self._parts is not None:
-            self._left = 0
+        left, self._left = self._left, 0
+        if left and self._parts is not None and not self._skips:
             self._parts.abort()
         if self._stream is not None:
             self._stream.close()
             self._stream = None
+
+
+class InProcessConnection(TopicConnection):
+    """A subscription to a publication of this process, without a socket.
+
+    A relay or a gateway subscribes to its own proxies. Each message goes from the publication to the subscriber by a
+    call, while it is received: nothing is copied, and no queue is between them. The publication uses it as it uses
+    an ``AcceptedConnection``.
+    """
+
+    peer: Final = ("in this process", 0)
+    info = "in this process"
+    dropped: Final = 0
+    pending_bytes: Final = 0
+    closed = True
+    """Whether no publication has the connection."""
+    since = 0
+    _whole: bytearray | None = None
+    """What has come of a message in parts, for a subscriber that takes it whole."""
+    _next: asyncio.Handle | None = None
+
+    on_end: Callable[[InProcessConnection, Exception | None], None]
+
+    @property
+    def caller_id(self) -> str:
+        """The subscribing node."""
+        return self.request["callerid"]
+
+    @property
+    def bytes_out(self) -> int:
+        """Bytes passed on."""
+        return self.bytes
+
+    def start(self) -> None:
+        """Connect in the next turn of the loop."""
+        self._next = asyncio.get_running_loop().call_soon(self._attach)
+
+    def close(self) -> None:
+        """Disconnect at once; no callback is called any more."""
+        self._closed = True
+        if self._next is not None:
+            self._next.cancel()
+        attached = not self.closed
+        self._detach()
+        if attached:
+            self.on_end(self, None)
+
+    def _attach(self) -> None:
+        attach = self._find()
+        if attach is None:
+            self._lost("its publisher is not there any more")
+        else:
+            self.closed = False
+            attach(self)
+
+    def _detach(self) -> None:
+        self.closed, self.fields = True, {}
+        left, self._left = self._left, 0
+        if left and self._parts is not None and self._whole is None:
+            self._parts.abort()
+
+    def _lost(self, reason: str) -> None:
+        self._next = asyncio.get_running_loop().call_later(self._backoff.delay(), self._attach)
+        self._on_lost(reason)
+
+    # --- called by the publication ----------------------------------------------------------------------------
+
+    def accept(self, header: Mapping[str, str], _queue_messages: int, _queue_bytes: int) -> None:
+        """Take the publisher's header; messages may follow."""
+        if not self.closed:
+            self.fields = dict(header)
+            self._backoff.reset()
+            self._on_header(self.fields)
+
+    def bound(self, _queue_messages: int, _queue_bytes: int) -> None:
+        """Do nothing: there is no queue."""
+
+    def refuse(self, text: str) -> None:
+        """End for good: the publication refused."""
+        self._detach()
+        self.refused = text
+        self._on_refused(text)
+
+    def hang_up(self) -> None:
+        """End the connection, and report it in the next turn of the loop."""
+        if not self.closed:
+            self._detach()
+            self._next = asyncio.get_running_loop().call_soon(self._lost, "the publisher closed the connection")
+
+    async def drained(self, _within: float) -> None:
+        """Return at once: nothing waits."""
+
+    def send(self, parts: Sequence[Buffer], key: int) -> int:
+        """Pass on one message, the only one of ``parts``; none is ever dropped here."""
+        framed = memoryview(parts[0])
+        size = len(framed)
+        if self._parts is not None and size > core_limits.CUT_THROUGH_BYTES:
+            self.extend(self.open(key, size), framed)
+        elif not self.closed:
+            self.messages += 1
+            self.bytes += size
+            self._on_message(framed)
+        return 0
+
+    def open(self, key: int, size: int) -> QueuedMessage:
+        """Begin a message of ``size`` bytes that comes in parts."""
+        if not self.closed:
+            self._left = size
+            self._whole = bytearray()
+            if self._parts is not None and size > core_limits.CUT_THROUGH_BYTES:
+                self._whole = None
+                self._parts.begin(size)
+        return QueuedMessage(key, size)
+
+    def extend(self, _message: QueuedMessage, part: Buffer) -> int:
+        """Pass on a part; the last one completes the message."""
+        if self.closed:
+            return 0
+        self._left -= len(part)
+        self.bytes += len(part)
+        self.messages += not self._left
+        if self._whole is not None:
+            self._whole += part
+            if not self._left:
+                # Not used again: the subscriber may send it on, and then it is read until the read ends.
+                self._on_message(memoryview(self._whole))
+        elif self._parts is not None:
+            self._parts.part(memoryview(part))
+        return 0
+
+    def abandon(self, _message: QueuedMessage) -> bool:
+        """Drop the message in progress, whose rest will not come; the connection goes on."""
+        left, self._left = self._left, 0
+        if left and self._parts is not None and self._whole is None:
+            self._parts.abort()
+        return False
 
 
 class Subscription:
@@ -395,7 +492,6 @@ class Subscription:
         self._nodelay = nodelay
         self._number = number
         self._connections: dict[str, PublisherConnection] = {}
-        self._closing: set[PublisherConnection] = set()
 
     @property
     def publishers(self) -> int:
@@ -405,9 +501,7 @@ class Subscription:
     @property
     def callers(self) -> set[str]:
         """The names of the connected publishers, from their headers."""
-        return {
-            connection.fields.get("callerid", "") for connection in self._connections.values() if connection.connected
-        }
+        return {one.fields.get("callerid", "") for one in self._connections.values() if one.connected}
 
     def connections(self) -> list[BusConnection]:
         """The rows of all connections in ``getBusInfo`` and ``getBusStats``."""
@@ -421,26 +515,15 @@ class Subscription:
             keep: Disconnect from none, because the list of a restarted master is incomplete.
         """
         listed = {uri for uri in uris if uri != self._own_uri}
-        for uri in () if keep else self._connections.keys() - listed:
-            self._disconnect(uri)
-        for uri in listed:
-            connection = self._connections.get(uri)
-            if connection is not None and connection.refused is not None:
-                self._disconnect(uri)
-                connection = None
-            if connection is None:
-                self._connect(uri)
+        for uri, connection in tuple(self._connections.items()):
+            if connection.refused is not None if uri in listed else not keep:
+                self._connections.pop(uri).close()
+        for uri in listed - self._connections.keys():
+            self._connect(uri)
 
     def close(self) -> None:
         """Disconnect from all publishers."""
-        for uri in tuple(self._connections):
-            self._disconnect(uri)
-
-    async def closed(self) -> None:
-        """Wait, after ``close()``, until all tasks have ended."""
-        for connection in tuple(self._closing):
-            await connection.closed()
-        self._closing.clear()
+        self.update(())
 
     def _connect(self, uri: str) -> None:
         connection = PublisherConnection(
@@ -461,17 +544,10 @@ class Subscription:
 
     def _oversized(self, connection: PublisherConnection, size: int) -> None:
         if connection.oversized == 1:
-            limit = limits.TCPROS_MESSAGE_MAX
             _log.warning(
                 "! %s: a message of %d bytes of %s is left out: more than %d; others come as usual",
                 self.topic,
                 size,
                 connection.uri,
-                limit,
+                limits.TCPROS_MESSAGE_MAX,
             )
-
-    def _disconnect(self, uri: str) -> None:
-        connection = self._connections.pop(uri)
-        connection.close()
-        self._closing = {left for left in self._closing if not left.ended}
-        self._closing.add(connection)

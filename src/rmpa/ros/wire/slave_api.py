@@ -1,30 +1,25 @@
 """The Slave API: the methods that a node serves over XML-RPC (wiki.ros.org/ROS/Slave_API).
 
-Pure: a call is a method with its parameters, and its result a ``RosReply(code, status, value)``. ``NodeView`` gives
-the state of the node and takes the effects of calls.
+Pure: what is checked of a call before ``SlaveNode`` answers it, and the tables of connections, written and read.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.identity import is_global_name, is_legal_name
 from rmpa.core.limits import INT32_MAX
-from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 TCPROS: Final = "TCPROS"
 INBOUND: Final = "i"
 OUTBOUND: Final = "o"
-_ERROR: Final = -1
-_FAILURE: Final = 0
-_SUCCESS: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,169 +51,35 @@ class BusConnection:
     waiting: int = 0
 
 
-class NodeView(Protocol):
-    """A node as the Slave API needs it."""
-
-    def publications(self) -> Iterable[tuple[str, str]]:
-        """Published topics with their types (``*`` where unknown)."""
-
-    def subscriptions(self) -> Iterable[tuple[str, str]]:
-        """Subscribed topics with their types."""
-
-    def connections(self) -> Iterable[BusConnection]:
-        """All topic connections."""
-
-    def address_of(self, topic: str) -> tuple[str, int] | None:
-        """Host and port for subscribers of a topic; ``None`` if the node does not publish it."""
-
-    def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """Apply the master's list of publishers of a topic, as slave API URIs."""
-
-    def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        """Handle a changed parameter (``{}`` if deleted); return ``False`` if the node has not subscribed to it."""
-
-    def shut_down(self, reason: str) -> None:
-        """Handle the master's request that the node ends."""
+METHODS: Final[Mapping[str, tuple[int, XmlRpcValue]]] = {
+    "getBusStats": (0, []),
+    "getBusInfo": (0, []),
+    "getMasterUri": (0, ""),
+    "shutdown": (1, 0),
+    "getPid": (0, -1),
+    "getSubscriptions": (0, []),
+    "getPublications": (0, []),
+    "paramUpdate": (2, -1),
+    "publisherUpdate": (2, -1),
+    "requestTopic": (2, []),
+    "getName": (0, ""),
+    "getUri": (0, ""),
+}
+"""By method: the number of parameters after the caller id, and the value in an error's reply."""
 
 
-class SlaveApi:
-    """Dispatches the calls of the Slave API.
-
-    Args:
-        name: The node's global name.
-        master_uri: The URI of the node's master.
-        pid: The process id.
-        node: The node.
-    """
-
-    def __init__(self, name: str, master_uri: str, pid: int, node: NodeView) -> None:
-        self.name = name
-        self.master_uri = master_uri
-        self.uri = ""
-        """The node's own slave API; set once its server listens."""
-        self._pid = pid
-        self._node = node
-
-    def dispatch(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
-        """Answer one call; mistakes of the caller are answered with code -1, as rospy does.
-
-        Raises:
-            KeyError: There is no such method; see ``METHODS``.
-        """
-        arity, default, answer = self._METHODS[method]
-        if not params:
-            return RosReply(_ERROR, "missing required caller_id parameter", default)
-        # By the wiki the reason of shutdown is optional; rospy refuses a call without it.
-        if len(params) - 1 != arity and not (method == "shutdown" and len(params) == 1):
-            return RosReply(_ERROR, "Error: bad call arity", default)
-        if not isinstance(params[0], str):
-            return RosReply(_ERROR, "caller_id must be a string", default)
-        problem = _check(method, params[1:])
-        if problem is not None:
-            return RosReply(_ERROR, problem, default)
-        return answer(self, params[1:])
-
-    def _bus_stats(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        published: dict[str, list[XmlRpcValue]] = {topic: [] for topic, _type in self._node.publications()}
-        subscribed: dict[str, list[XmlRpcValue]] = {topic: [] for topic, _type in self._node.subscriptions()}
-        sent: dict[str, int] = {}
-        for c in self._node.connections():
-            size, messages = min(c.bytes, INT32_MAX), min(c.messages, INT32_MAX)
-            if c.direction == OUTBOUND:
-                published.setdefault(c.topic, []).append([c.number, size, messages, c.connected])
-                sent[c.topic] = min(sent.get(c.topic, 0) + c.bytes, INT32_MAX)
-            else:
-                subscribed.setdefault(c.topic, []).append([c.number, size, messages, -1, c.connected])
-        value: list[XmlRpcValue] = [
-            [[topic, sent.get(topic, 0), links] for topic, links in published.items()],
-            [[topic, links] for topic, links in subscribed.items()],
-            [],
-        ]
-        return RosReply(_SUCCESS, "", value)
-
-    def _bus_info(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(
-            _SUCCESS,
-            "bus info",
-            [
-                [c.number, c.other, c.direction, TCPROS, c.topic, c.connected, c.info]
-                for c in self._node.connections()
-            ],
-        )
-
-    def _master_uri(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        if not self.master_uri:
-            return RosReply(_FAILURE, "master URI not set", "")
-        return RosReply(_SUCCESS, self.master_uri, self.master_uri)
-
-    def _shutdown(self, params: Sequence[XmlRpcValue]) -> RosReply:
-        self._node.shut_down(str(params[0]) if params else "")
-        return RosReply(_SUCCESS, "shutdown", 0)
-
-    def _get_pid(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(_SUCCESS, "", self._pid)
-
-    def _subscriptions(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(_SUCCESS, "subscriptions", [list(pair) for pair in self._node.subscriptions()])
-
-    def _publications(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(_SUCCESS, "publications", [list(pair) for pair in self._node.publications()])
-
-    def _param_update(self, params: Sequence[XmlRpcValue]) -> RosReply:
-        # rosmaster appends a slash to the key, and roscpp removes it.
-        key = str(params[0]).rstrip("/") or "/"
-        if self._node.param_update(key, params[1]):
-            return RosReply(_SUCCESS, "", 0)
-        return RosReply(_ERROR, "not subscribed", 0)
-
-    def _publisher_update(self, params: Sequence[XmlRpcValue]) -> RosReply:
-        topic, publishers = params
-        if isinstance(publishers, list):
-            self._node.publisher_update(str(topic), [str(uri) for uri in publishers])
-        return RosReply(_SUCCESS, "", 0)
-
-    def _request_topic(self, params: Sequence[XmlRpcValue]) -> RosReply:
-        topic, protocols = str(params[0]), params[1]
-        address = self._node.address_of(topic)
-        if address is None:
-            return RosReply(_ERROR, f"Not a publisher of [{topic}]", [])
-        if isinstance(protocols, list) and any(isinstance(p, list) and p and p[0] == TCPROS for p in protocols):
-            return RosReply(_SUCCESS, f"ready on {address[0]}:{address[1]}", [TCPROS, address[0], address[1]])
-        return RosReply(_FAILURE, "no supported protocol implementations", [])
-
-    def _get_name(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(_SUCCESS, "", self.name)
-
-    def _get_uri(self, _: Sequence[XmlRpcValue]) -> RosReply:
-        return RosReply(_SUCCESS, "", self.uri)
-
-    _METHODS: ClassVar[
-        Mapping[str, tuple[int, XmlRpcValue, Callable[[SlaveApi, Sequence[XmlRpcValue]], RosReply]]]
-    ] = {
-        "getBusStats": (0, [], _bus_stats),
-        "getBusInfo": (0, [], _bus_info),
-        "getMasterUri": (0, "", _master_uri),
-        "shutdown": (1, 0, _shutdown),
-        "getPid": (0, -1, _get_pid),
-        "getSubscriptions": (0, [], _subscriptions),
-        "getPublications": (0, [], _publications),
-        "paramUpdate": (2, -1, _param_update),
-        "publisherUpdate": (2, -1, _publisher_update),
-        "requestTopic": (2, [], _request_topic),
-        "getName": (0, "", _get_name),
-        "getUri": (0, "", _get_uri),
-    }
-    """By method: the number of parameters after the caller id, the value in an error's reply, and the function."""
-
-
-METHODS: Final = tuple(SlaveApi._METHODS)  # noqa: SLF001 - the same module
-"""The names of all methods."""
-
-
-def _check(method: str, params: Sequence[XmlRpcValue]) -> str | None:
-    """Check the parameters after the caller id; return the text of an error, or ``None``."""
+def check_call(method: str, params: Sequence[XmlRpcValue]) -> str | None:
+    """Check the parameters of a call; return the text of an error, which is answered with code -1, or ``None``."""
+    arity = METHODS[method][0]
+    if not params:
+        return "missing required caller_id parameter"
+    # By the wiki the reason of shutdown is optional; rospy refuses a call without it.
+    if len(params) - 1 != arity and not (method == "shutdown" and len(params) == 1):
+        return "Error: bad call arity"
+    if not isinstance(params[0], str):
+        return "caller_id must be a string"
     if method in ("publisherUpdate", "requestTopic"):
-        topic, items = params
+        _, topic, items = params
         if not isinstance(topic, str) or not topic:
             return "topic name must be a non-empty string"
         if not is_legal_name(topic):
@@ -229,9 +90,35 @@ def _check(method: str, params: Sequence[XmlRpcValue]) -> str | None:
             return "ERROR: parameter [protocols] must be specified and non-empty"
         if method == "publisherUpdate" and not all(isinstance(uri, str) and "://" in uri for uri in items):
             return "publishers must be a list of URIs"
-    if method == "paramUpdate" and not (isinstance(params[0], str) and is_global_name(params[0].rstrip("/") or "/")):
+    if method == "paramUpdate" and not (isinstance(params[1], str) and is_global_name(params[1].rstrip("/") or "/")):
         return "parameter_key must be a global name"
     return None
+
+
+def bus_stats(
+    published: Iterable[str], subscribed: Iterable[str], connections: Iterable[BusConnection]
+) -> list[XmlRpcValue]:
+    """The value of ``getBusStats``, for a node that publishes and subscribes to these topics."""
+    out: dict[str, list[XmlRpcValue]] = {topic: [] for topic in published}
+    into: dict[str, list[XmlRpcValue]] = {topic: [] for topic in subscribed}
+    sent: dict[str, int] = {}
+    for c in connections:
+        size, messages = min(c.bytes, INT32_MAX), min(c.messages, INT32_MAX)
+        if c.direction == OUTBOUND:
+            out.setdefault(c.topic, []).append([c.number, size, messages, c.connected])
+            sent[c.topic] = min(sent.get(c.topic, 0) + c.bytes, INT32_MAX)
+        else:
+            into.setdefault(c.topic, []).append([c.number, size, messages, -1, c.connected])
+    return [
+        [[topic, sent.get(topic, 0), links] for topic, links in out.items()],
+        [[topic, links] for topic, links in into.items()],
+        [],
+    ]
+
+
+def bus_info(connections: Iterable[BusConnection]) -> list[XmlRpcValue]:
+    """The value of ``getBusInfo``, in rospy's form."""
+    return [[c.number, c.other, c.direction, TCPROS, c.topic, c.connected, c.info] for c in connections]
 
 
 # What other nodes answer to ``getBusInfo``: their topic connections. Pure.
@@ -246,8 +133,6 @@ _INFO: Final = re.compile(r"on port ([0-9]{1,5}) to \[([^\s\[\]]+):([0-9]{1,5})(
 _CLOSED: Final = "Closed "
 """How rospy's text begins for a connection that has ended; the row says that it is connected all the same."""
 _PORT_MAX: Final = 65535
-
-_REPLY_LENGTH: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,26 +165,21 @@ def read_bus_info(answer: XmlRpcValue) -> list[BusLink]:
     Args:
         answer: The node's answer to ``getBusInfo``: code, status and value, or the value alone.
     """
-    return [link for row in _list(_value_of(answer)) if (link := _link(_list(row))) is not None]
-
-
-def _value_of(answer: XmlRpcValue) -> XmlRpcValue:
-    """The value in an answer with code and status; nothing if the code is that of an error."""
-    parts = _list(answer)
-    if len(parts) == _REPLY_LENGTH and (code := _int(parts[0])) is not None:
-        return parts[2] if code == _SUCCESS else None
-    return answer
+    match answer:
+        case [int(code), _, rows] if not isinstance(code, bool):
+            answer = rows if code == 1 else None
+    return [link for row in _list(answer) if (link := _link(_list(row))) is not None]
 
 
 def _link(row: Sequence[XmlRpcValue]) -> BusLink | None:
-    number, other, direction, topic, info = _int(_at(row, 0)), _at(row, 1), _at(row, 2), _at(row, 4), _at(row, 6)
-    if number is None or not isinstance(other, str) or not isinstance(topic, str):
+    number, other, direction, transport, topic, connected, info = [*row, *(None,) * 7][:7]
+    if not isinstance(number, int) or isinstance(number, bool) or direction not in (INBOUND, OUTBOUND):
         return None
-    if direction not in (INBOUND, OUTBOUND):
+    if not isinstance(other, str) or not isinstance(topic, str):
         return None
     text = info if isinstance(info, str) else ""
-    local, remote = _addresses(text) if _at(row, 3) == TCPROS else (None, None)
-    standing = _at(row, 5) in (True, 1) and not text.startswith(_CLOSED)
+    local, remote = _addresses(text) if transport == TCPROS else (None, None)
+    standing = connected in (True, 1) and not text.startswith(_CLOSED)
     return BusLink(number, other, direction == INBOUND, topic, standing, local, remote)
 
 
@@ -314,11 +194,3 @@ def _addresses(info: str) -> tuple[int | None, tuple[str, int] | None]:
 
 def _list(value: XmlRpcValue) -> Sequence[XmlRpcValue]:
     return value if isinstance(value, list | tuple) else ()
-
-
-def _at(row: Sequence[XmlRpcValue], index: int) -> XmlRpcValue:
-    return row[index] if index < len(row) else None
-
-
-def _int(value: XmlRpcValue) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None

@@ -81,7 +81,7 @@ async def test_a_node_on_loopback_is_not_granted_to_another_machine(talker: Talk
 async def test_a_node_at_every_address_is_granted_to_all() -> None:
     made = Talker("0.0.0.0")
     await made.node.start()
-    made.node._api.uri = made.node.uri.replace("0.0.0.0", "127.0.0.1")
+    made.node.uri = made.node.uri.replace("0.0.0.0", "127.0.0.1")
     assert await made.find("10.88.0.1") == Grant(made.port, "/talker", "")
     await made.endpoints.close()
     await made.node.close()

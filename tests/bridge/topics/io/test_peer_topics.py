@@ -60,7 +60,7 @@ class Heard:
 
     @property
     def closed(self) -> bool:
-        return bool(self.ear.stream.closed)
+        return self.ear.closed
 
 
 class Proxied:

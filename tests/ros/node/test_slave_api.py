@@ -1,26 +1,38 @@
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.ros.wire.slave_api import METHODS, BusConnection, SlaveApi
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.wire.slave_api import METHODS, BusConnection
+from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.ros.wire.xmlrpc import RosFault
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 
-class Node:
-    def __init__(self) -> None:
+class Node(SlaveNode):
+    def __init__(self, master_uri: str = "http://localhost:11311") -> None:
         self.calls: list[tuple[object, ...]] = []
 
-    def publications(self) -> list[tuple[str, str]]:
-        return [("/t", "std_msgs/String"), ("/quiet", "*")]
+        def follow(key: str, value: XmlRpcValue) -> bool:
+            self.calls.append(("param", key, value))
+            return key == "/followed"
 
-    def subscriptions(self) -> list[tuple[str, str]]:
-        return [("/in", "std_msgs/Empty")]
+        def shut_down(reason: str) -> None:
+            self.calls.append(("shutdown", reason))
+
+        super().__init__("/n", "127.0.0.1", master_uri, on_shutdown=shut_down, on_param_update=follow)
+        self.uri = "http://127.0.0.1:5000/"
+        self._tcpros.address = ("127.0.0.1", 4000)
+        self.add_publication(Publication("/t", "/n", TopicDescription("std_msgs/String", "5", "")))
+        self.add_publication(Publication("/quiet", "/n"))
+        self.add_subscription(Subscription("/in", "/n", on_message=lambda *_: None, type_name="std_msgs/Empty"))
 
     def connections(self) -> list[BusConnection]:
         return [
@@ -29,18 +41,10 @@ class Node:
             BusConnection(3, "http://10.0.0.1:1/", "i", "/in", True, "port 3", 20, 5),
         ]
 
-    def address_of(self, topic: str) -> tuple[str, int] | None:
-        return ("127.0.0.1", 4000) if topic == "/t" else None
-
-    def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        self.calls.append(("publishers", topic, publishers))
-
-    def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        self.calls.append(("param", key, value))
-        return key == "/followed"
-
-    def shut_down(self, reason: str) -> None:
-        self.calls.append(("shutdown", reason))
+    def ask(self, method: str, *params: XmlRpcValue) -> list[XmlRpcValue]:
+        answer = self._call(method, params, "127.0.0.1")
+        assert isinstance(answer, list)
+        return answer
 
 
 @pytest.fixture
@@ -48,18 +52,11 @@ def node() -> Node:
     return Node()
 
 
-@pytest.fixture
-def api(node: Node) -> SlaveApi:
-    made = SlaveApi("/n", "http://localhost:11311", 42, node)
-    made.uri = "http://127.0.0.1:5000/"
-    return made
-
-
 @pytest.mark.trap(21, 22)
 @pytest.mark.parametrize(
     ("method", "params", "reply"),
     [
-        ("getPid", ["/c"], (1, "", 42)),
+        ("getPid", ["/c"], (1, "", os.getpid())),
         ("getName", ["/c"], (1, "", "/n")),
         ("getUri", ["/c"], (1, "", "http://127.0.0.1:5000/")),
         ("getMasterUri", ["/c"], (1, "http://localhost:11311", "http://localhost:11311")),
@@ -85,63 +82,57 @@ def api(node: Node) -> SlaveApi:
         ("paramUpdate", ["/c", "relative", 1], (-1, "parameter_key must be a global name", -1)),
     ],
 )
-def test_answers(api: SlaveApi, method: str, params: list[XmlRpcValue], reply: tuple[XmlRpcValue, ...]) -> None:
-    assert tuple(api.dispatch(method, params)) == reply
+def test_answers(node: Node, method: str, params: list[XmlRpcValue], reply: tuple[XmlRpcValue, ...]) -> None:
+    assert tuple(node.ask(method, *params)) == reply
 
 
-def test_without_a_master_its_uri_is_a_failure(node: Node) -> None:
-    assert SlaveApi("/n", "", 42, node).dispatch("getMasterUri", ["/c"]) == (0, "master URI not set", "")
+def test_without_a_master_its_uri_is_a_failure() -> None:
+    assert Node("").ask("getMasterUri", "/c") == [0, "master URI not set", ""]
 
 
 @pytest.mark.trap(29)
-def test_bus_info_is_in_rospys_form(api: SlaveApi) -> None:
-    assert api.dispatch("getBusInfo", ["/c"]).value == [
+def test_bus_info_is_in_rospys_form(node: Node) -> None:
+    assert node.ask("getBusInfo", "/c")[2] == [
         [1, "/listener", "o", "TCPROS", "/t", True, "port 1"],
         [2, "/echo", "o", "TCPROS", "/t", False, "port 2"],
         [3, "http://10.0.0.1:1/", "i", "TCPROS", "/in", True, "port 3"],
     ]
 
 
-def test_bus_stats_fit_into_31_bits(api: SlaveApi) -> None:
-    assert api.dispatch("getBusStats", ["/c"]).value == [
+def test_bus_stats_fit_into_31_bits(node: Node) -> None:
+    assert node.ask("getBusStats", "/c")[2] == [
         [["/t", 2147483647, [[1, 2147483647, 7, True], [2, 10, 0, False]]], ["/quiet", 0, []]],
         [["/in", [[3, 20, 5, -1, True]]]],
         [],
     ]
 
 
-def test_publisher_updates_reach_the_node(api: SlaveApi, node: Node) -> None:
-    assert api.dispatch("publisherUpdate", ["/master", "/in", ["http://x:1/"]]) == (1, "", 0)
-    assert api.dispatch("publisherUpdate", ["/master", "/in", []]) == (1, "", 0)
-    assert node.calls == [("publishers", "/in", ["http://x:1/"]), ("publishers", "/in", [])]
-
-
 @pytest.mark.trap(34)
-def test_param_updates_lose_the_slash_at_their_end(api: SlaveApi, node: Node) -> None:
-    assert api.dispatch("paramUpdate", ["/master", "/followed/", {}]) == (1, "", 0)
-    assert api.dispatch("paramUpdate", ["/master", "/other", 1]) == (-1, "not subscribed", 0)
-    assert api.dispatch("paramUpdate", ["/master", "/", 1]).code == -1
+def test_param_updates_lose_the_slash_at_their_end(node: Node) -> None:
+    assert node.ask("paramUpdate", "/master", "/followed/", {}) == [1, "", 0]
+    assert node.ask("paramUpdate", "/master", "/other", 1) == [-1, "not subscribed", 0]
+    assert node.ask("paramUpdate", "/master", "/", 1)[0] == -1
     assert [call[1] for call in node.calls] == ["/followed", "/other", "/"]
 
 
 @pytest.mark.trap(29)
-def test_the_reason_of_a_shutdown_may_be_missing(api: SlaveApi, node: Node) -> None:
-    assert api.dispatch("shutdown", ["/master", "replaced"]) == (1, "shutdown", 0)
-    assert api.dispatch("shutdown", ["/master"]) == (1, "shutdown", 0)
+def test_the_reason_of_a_shutdown_may_be_missing(node: Node) -> None:
+    assert node.ask("shutdown", "/master", "replaced") == [1, "shutdown", 0]
+    assert node.ask("shutdown", "/master") == [1, "shutdown", 0]
     assert node.calls == [("shutdown", "replaced"), ("shutdown", "")]
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_survives_nonsense(api: SlaveApi, method: str) -> None:
+def test_every_method_survives_nonsense(node: Node, method: str) -> None:
     nonsense: list[XmlRpcValue] = [None, [], {}, "", "/", 3, [[]], [[1]], b"\xff", "http://x"]
     for first in nonsense:
         for second in nonsense:
             for params in ([first], ["/c", first], ["/c", first, second], ["/c", first, second, 1]):
-                code, status, _ = api.dispatch(method, params)
+                code, status, _ = node.ask(method, *params)
                 assert code in (-1, 0, 1)
                 assert isinstance(status, str)
 
 
-def test_an_unknown_method_is_a_key_error(api: SlaveApi) -> None:
-    with pytest.raises(KeyError):
-        api.dispatch("getNothing", ["/c"])
+def test_an_unknown_method_is_a_fault(node: Node) -> None:
+    with pytest.raises(RosFault, match="/n has no method getNothing"):
+        node.ask("getNothing", "/c")
