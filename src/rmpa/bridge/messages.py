@@ -17,12 +17,13 @@ from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import GLOBAL_NAME, TYPE_NAME, Guid, is_global_name, is_type_name, peer_name_problem
+from rmpa.core.identity import BASE_NAME, GLOBAL_NAME, TYPE_NAME, Guid, is_global_name, is_type_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
 Name = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{GLOBAL_NAME}\Z")]
 """A global ROS name. The types below are checked where a message of a peer is decoded, and nowhere else."""
+PeerName = Annotated[str, Meta(max_length=core_limits.PEER_NAME_MAX, pattern=rf"\A{BASE_NAME}\Z")]
 TypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{TYPE_NAME}\Z")]
 TypeNameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({TYPE_NAME})?\Z")]
 Md5 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
@@ -63,7 +64,7 @@ class Origin(msgspec.Struct, frozen=True):
         path: The instances of the relays on the path, the one nearest to the origin first; the last is the sender.
     """
 
-    name: str
+    name: PeerName
     guid: str
     instance: InstanceId
     node: Name
@@ -73,10 +74,8 @@ class Origin(msgspec.Struct, frozen=True):
         """Check the origin that a peer names.
 
         Raises:
-            ValueError: The name or the GUID is none.
+            ValueError: The GUID is none.
         """
-        if problem := peer_name_problem(self.name):
-            raise ValueError(problem)
         Guid.parse(self.guid)
 
 

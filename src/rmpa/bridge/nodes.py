@@ -11,7 +11,6 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config import limits as config_limits
@@ -174,7 +173,7 @@ class Nodes(Part):
         for node in sorted(shown - wanted):
             session.proxies.release(node, _HELD)
         for node in sorted(wanted - shown):
-            session.proxies.hold(node, _HELD, ProxyCallbacks(self._show, self._hide))
+            session.proxies.hold(node, _HELD, self._show, self._hide)
         self._shown[session.peer] = wanted
 
     def gone(self, session: PeerSession) -> None:

@@ -240,7 +240,9 @@ def is_earlier(number: int, than: int) -> bool:
     return number - than & SERIAL_MASK >= SERIAL_HALF
 
 
-_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+BASE_NAME: Final = r"[A-Za-z][A-Za-z0-9_]*"
+"""The regular expression of a ROS base name (REP 144)."""
+_NAME: Final = re.compile(BASE_NAME)
 
 
 def peer_name_problem(name: str) -> str | None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import service_place
-from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RmpaError
 from rmpa.ros.node.publication import Publication, PublicationEvents
@@ -83,7 +82,7 @@ class ProxiedSource(ABC):
         """Put it into the graph, in a later turn of the loop."""
         self._begun = True
         self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, ProxyCallbacks(self._ready, self._left))
+        self._proxies.hold(self._origin.node, self._key, self._ready, self._left)
 
     def refuse(self, text: str) -> None:
         """Say why it cannot be in the graph."""

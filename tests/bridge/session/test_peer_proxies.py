@@ -6,7 +6,7 @@ import asyncio
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.proxies import PeerProxies, ProxyCallbacks
+from rmpa.bridge.proxies import PeerProxies
 
 if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode
@@ -44,10 +44,8 @@ class World:
         self.proxies.hold(
             node,
             key,
-            ProxyCallbacks(
-                lambda proxy: self.happened.append(f"{key} at {proxy.name}"),
-                lambda proxy: self.happened.append(f"{key} left"),
-            ),
+            lambda proxy: self.happened.append(f"{key} at {proxy.name}"),
+            lambda proxy: self.happened.append(f"{key} left"),
         )
 
     async def settled(self) -> list[str]:

@@ -19,7 +19,6 @@ from rmpa.bridge import limits
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import AdvertiseServices, CloseService, OpenService, ServiceClosed, ServiceOpened, Source
 from rmpa.bridge.policy import Needs, service_place
-from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.services.bodies import (
     EndedService,
     ExportAction,
@@ -375,8 +374,7 @@ class Services(Part):
         shown = self._shown[action.peer, action.service] = ShownService(
             action.peer, action.service, action.node, self.imports.peer_name(action.peer)
         )
-        user = ProxyCallbacks(lambda proxy: self._expose(shown, proxy))
-        session.proxies.hold(action.node, f"service {action.service}", user)
+        session.proxies.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(action.peer, action.service)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:

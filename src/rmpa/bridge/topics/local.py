@@ -20,7 +20,6 @@ from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, unmet_by_contract
 from rmpa.bridge.direct.paths import Interruptions
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
-from rmpa.bridge.proxies import ProxyCallbacks
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.config.peer_rules import Access
@@ -138,8 +137,9 @@ class DirectExporter(Grants):
             return
         held, topic = f"subscriber of {want.name}", want.name
         if nodes:
-            user = ProxyCallbacks(lambda proxy: self._stand(topic, proxy), lambda proxy: self._go(topic, proxy))
-            session.proxies.hold(want.user, held, user)
+            session.proxies.hold(
+                want.user, held, lambda proxy: self._stand(topic, proxy), lambda proxy: self._go(topic, proxy)
+            )
         else:
             session.proxies.release(want.user, held)
 

@@ -160,7 +160,8 @@ class PeerTopics:
 
     def publish(self, action: Publish) -> None:
         """Publish a source at its proxy, in a later turn of the loop."""
-        self.session.proxies.hold(action.source.node, action.source, _Published(self, action))
+        published = _Published(self, action)
+        self.session.proxies.hold(action.source.node, action.source, published.ready, published.left)
 
     def retract(self, action: Retract) -> None:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""

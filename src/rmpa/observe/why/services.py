@@ -308,7 +308,7 @@ class TopicEvidence:
                 name=name,
                 permission=self._permission(session.link.name, entry),
                 denied=entry.denied,
-                registered=node in standing and publishers.get(name) == standing[node].node.uri,
+                registered=node in standing and publishers.get(name) == standing[node].uri,
                 conflict=entry.conflict,
                 connections=self._connections(session, source),
                 mismatches=self._bridge.topics.mismatches(source),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -24,6 +24,9 @@ from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.trust.permissions import Permissions
 from tests.ros.node.peers import until
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 SOURCE = Source("/chatter", "/talker")
 URI = "http://10.0.0.1:1234/"
 WANT = Want("/chatter", "/talker", "/viewer")
@@ -41,12 +44,12 @@ class Proxies:
     def get(self, node: str) -> Any:
         return SimpleNamespace(name=self._prefix + node, uri="http://10.0.0.1:99/")
 
-    def hold(self, node: str, key: object, user: Any) -> None:
-        self._users[node, key] = user
-        user.ready(self.get(node))
+    def hold(self, node: str, key: object, ready: Callable[[Any], None], left: Callable[[Any], None]) -> None:
+        self._users[node, key] = left
+        ready(self.get(node))
 
     def release(self, node: str, key: object) -> None:
-        self._users.pop((node, key)).left(self.get(node))
+        self._users.pop((node, key))(self.get(node))
 
 
 class Module:
