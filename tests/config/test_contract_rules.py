@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config.read import LISTS, Loaded, line_of, load_settings
-from rmpa.config.schema import read_duration, read_rate
+from rmpa.config.read import Loaded, line_of, load_settings
+from rmpa.config.rules import TERMS
 from rmpa.config.settings import Settings
-from rmpa.config.values import BadValue
+from rmpa.config.values import BadValue, read_duration, read_rate
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import (
     KEYS,
@@ -143,7 +143,7 @@ def test_the_documentation_has_every_key_and_every_default() -> None:
         key: str(
             getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
         )
-        for key in LISTS["contract",][2:]
+        for key in TERMS
     } | {"outage": f"{Contract().outage:g} s"}
     assert {key: value for key, value in written.items() if key in defaults} == defaults
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rmpa.config.module_name import (
     NAME_FILE,
     ModuleName,
-    NameFacts,
     NameSource,
     choose_name,
     keep_name,
@@ -27,28 +26,34 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize(
-    ("facts", "name", "source"),
+    ("names", "running", "name", "source"),
     [
-        (NameFacts(default="host"), "host", NameSource.DEFAULT),
-        (NameFacts(kept="first", default="host"), "first", NameSource.KEPT),
-        (NameFacts(running=("a",), kept="first"), "a", NameSource.RUNNING),
-        (NameFacts(running=("a", "first"), kept="first"), "first", NameSource.RUNNING),
-        (NameFacts(running=("a", "b"), of_master="b", kept="a"), "b", NameSource.RUNNING),
-        (NameFacts(running=("a", "a_gateway"), gateways=("a_gateway",)), "a", NameSource.RUNNING),
-        (NameFacts(running=("a_gateway",), gateways=("a_gateway",)), "a_gateway", NameSource.RUNNING),
-        (NameFacts(file="said", running=("a",), kept="first"), "said", NameSource.FILE),
-        (NameFacts(variable="v", file="said", running=("a", "b")), "v", NameSource.VARIABLE),
-        (NameFacts(agent_variable="r", variable="v", file="said"), "r", NameSource.AGENT_VARIABLE),
-        (NameFacts(option="o", agent_variable="r", variable="v", running=("a",)), "o", NameSource.OPTION),
+        ({"default": "host"}, {}, "host", NameSource.DEFAULT),
+        ({"kept": "first", "default": "host"}, {}, "first", NameSource.KEPT),
+        ({"kept": "first"}, {"running": ("a",)}, "a", NameSource.RUNNING),
+        ({"kept": "first"}, {"running": ("a", "first")}, "first", NameSource.RUNNING),
+        ({"kept": "a"}, {"running": ("a", "b"), "of_master": "b"}, "b", NameSource.RUNNING),
+        ({}, {"running": ("a", "a_gateway"), "gateways": ("a_gateway",)}, "a", NameSource.RUNNING),
+        ({}, {"running": ("a_gateway",), "gateways": ("a_gateway",)}, "a_gateway", NameSource.RUNNING),
+        ({"file": "said", "kept": "first"}, {"running": ("a",)}, "said", NameSource.FILE),
+        ({"variable": "v", "file": "said"}, {"running": ("a", "b")}, "v", NameSource.VARIABLE),
+        ({"agent_variable": "r", "variable": "v", "file": "said"}, {}, "r", NameSource.AGENT_VARIABLE),
+        ({"option": "o", "agent_variable": "r"}, {"running": ("a",)}, "o", NameSource.OPTION),
     ],
 )
-def test_what_is_said_wins_then_what_runs_then_what_is_kept(facts: NameFacts, name: str, source: NameSource) -> None:
-    assert choose_name(facts) == ModuleName(name, source)
+def test_what_is_said_wins_then_what_runs_then_what_is_kept(
+    names: dict[str, str], running: dict[str, Any], name: str, source: NameSource
+) -> None:
+    assert choose_name(_named(names), **running) == ModuleName(name, source)
+
+
+def _named(names: dict[str, str]) -> dict[NameSource, str]:
+    return {NameSource[source.upper()]: name for source, name in names.items()}
 
 
 def test_of_several_agents_none_is_guessed() -> None:
     with pytest.raises(RmpaError, match=r"several agents run on this machine: a, b; name one with --agent"):
-        choose_name(NameFacts(running=("a", "b"), kept="c", default="host"))
+        choose_name(_named({"kept": "c", "default": "host"}), ("a", "b"))
 
 
 def test_the_first_name_is_kept_and_holds_where_none_is_said(tmp_path: Path) -> None:

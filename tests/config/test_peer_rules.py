@@ -56,7 +56,7 @@ PEER = '[[peer]]\nname = "r"\n'
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[[peer]]\nprefix = '/r'", ":1: peer: a rule without a name"),
+        ("[[peer]]\nprefix = '/r'", ':1: peer: a rule without name; name = "robot*" makes it'),
         (PEER + "\n\nprefix = 'r'", ":5: peer.prefix: 'r' is not a namespace; did you mean \"/r\"?"),
         (PEER + "prefix = '/'", ":3: peer.prefix: '/' puts nothing in front"),
         (PEER + "prefix = '/rmpa/r'", ":3: peer.prefix: /rmpa/r never crosses"),

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from rmpa.cli.agent import up
 from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
-from rmpa.config.module_name import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
 from rmpa.config.read import load_settings
+from rmpa.config.reference import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
 from rmpa.config.settings import SETTINGS, TABLES, Multicast
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
@@ -55,7 +55,7 @@ def test_no_two_settings_share_a_name() -> None:
 
 def test_every_default_can_be_read_again() -> None:
     for setting in SETTINGS:
-        if setting.default not in ("", ()):
+        if setting.default not in ("", (), None):
             assert setting.type.read(json_value(setting.default)) == setting.default, setting.name
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
-from rmpa.config.read import LISTS, SCHEMAS, Loaded, find_config_file, line_of, load_settings, parse_config
+from rmpa.config.read import Loaded, find_config_file, line_of, load_settings, parse_config
 from rmpa.config.settings import (
     SETTINGS,
     GatewaySettings,
@@ -84,16 +84,17 @@ def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
     text = ""
     for name in dict.fromkeys(t for t, _ in kept):
         text += name + "\n" + "\n".join(line for (t, _), line in kept.items() if t == name) + "\n"
-    assert set(parse_config(text.encode(), None)) == set(SCHEMAS) - set(LISTS)
+    assert set(parse_config(text.encode(), None)) == {s.key for s in SETTINGS if s.key and not s.is_list_of_tables}
 
 
 def test_the_examples_lists_of_tables_load_and_show_every_key(load: Load) -> None:
     text = uncommented(EXAMPLE.read_text())
     found = parse_config(text.encode(), None)
-    for name, keys in LISTS.items():
-        tables = found[name]
+    for setting in (setting for setting in SETTINGS if setting.is_list_of_tables):
+        tables = found[setting.key]
         assert isinstance(tables, list)
-        assert {key for table in tables for key in table} == set(keys), name
+        keys = setting.type.json_schema["items"]["properties"]
+        assert {key for table in tables for key in table} == set(keys), setting.title
     assert load(text).notes == ()
 
 

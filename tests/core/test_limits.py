@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import pytest
 
 import rmpa
-from rmpa.config.read import SCHEMAS
+from rmpa.config.settings import SETTINGS, LimitSettings
 from rmpa.core.limits import KIB, MIB
 
 _SIZES: Final = {"KIB", "MIB", "INT32_MIN", "INT32_MAX", "UINT32_MAX"}
@@ -188,7 +188,7 @@ def test_each_row_has_the_codes_figure(row: Row) -> None:
 def test_each_row_names_existing_settings(row: Row) -> None:
     assert row.happens not in ("", _NONE), f"line {row.line}: what happens at it?"
     assert row.told, f"line {row.line}: where is it told? ({_NONE} for nowhere)"
-    known = {".".join(key) for key in SCHEMAS}
+    known = {".".join(setting.key) for setting in SETTINGS}
     for setting in re.findall(r"`([a-z_]+\.[a-z_]+)`", row.setting):
         assert setting in known, f"line {row.line}: there is no setting {setting}"
 
@@ -214,9 +214,9 @@ def test_the_settings_of_the_page_are_those_that_there_are() -> None:
     text = PAGE.read_text(encoding="utf-8")
     block = text.partition("```toml\n[limits]\n")[2].partition("```")[0]
     written = {key: int(value) for key, value in (line.split(" = ") for line in block.splitlines())}
-    from rmpa.config.settings import LimitSettings
-
     defaults = LimitSettings()
-    assert written == {key: getattr(defaults, key) for _, key in (k for k in SCHEMAS if k[0] == "limits")}
+    assert written == {
+        key: getattr(defaults, key) for _, key in (s.key for s in SETTINGS if s.key[:1] == ("limits",))
+    }
     for key in written:
         assert f"`RMPA_LIMIT_{key.upper()}`" in text

@@ -13,9 +13,9 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Origin
 from rmpa.config import limits as config_limits
-from rmpa.config.peer_rules import PEER
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
+from rmpa.config.values import PEER
 from rmpa.core.counters import Counters
 from rmpa.core.identity import NEVER_CROSSING, is_own, matches
 from rmpa.trust.permissions import PermissionDecision, prohibition, refusal

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Final
 from weakref import WeakValueDictionary
 
 from rmpa.config import limits
-from rmpa.config.peer_rules import PEER
 from rmpa.config.rules import CLOCK
+from rmpa.config.values import PEER
 from rmpa.core.counters import remedy
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import Guid, Identity, matches, proxy_name, proxy_prefix

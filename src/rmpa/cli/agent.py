@@ -25,20 +25,18 @@ from rmpa.config.module_name import (
     GATEWAY_SUFFIX,
     NameSource,
     choose_name,
-    json_value,
     keep_name,
-    schema_text,
     state_dir,
-    toml_value,
 )
 from rmpa.config.read import load_settings
+from rmpa.config.reference import json_value, schema_text, toml_value
 from rmpa.config.settings import SETTINGS
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe import limits
 from rmpa.observe.control import ReloadReply
-from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, with_running
+from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, running_agents
 from rmpa.observe.peer_info import FAIL, OK, WARN, CheckLevel, exit_code
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.runtime.process import LogWriter
@@ -47,7 +45,7 @@ from rmpa.trust.permissions import TrustStatus
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rmpa.config.module_name import ModuleName, NameFacts
+    from rmpa.config.module_name import ModuleName
     from rmpa.config.read import Loaded
     from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
@@ -234,10 +232,10 @@ def find_name(
             raise ConfigError(source, problem)
     loaded = load_settings(options, environ, host_name=socket.gethostname())
     agents = find_agents(environ)
-    facts = replace(loaded.name_facts, agent_variable=environ.get("RMPA_AGENT", ""))
+    names = {**loaded.names, NameSource.AGENT_VARIABLE: environ.get("RMPA_AGENT", "")}
     if name:
-        facts = replace(facts, option=name)
-    chosen = choose_name(with_running(facts, agents, environ))
+        names[NameSource.OPTION] = name
+    chosen = choose_name(names, *running_agents(agents, environ))
     loaded = replace(loaded, settings=replace(loaded.settings, name=chosen.name))
     return FoundName(chosen, loaded, next((agent.path for agent in agents if agent.name == chosen.name), None))
 
@@ -260,14 +258,14 @@ def find_module(
     return Module(chosen, loaded, state, path, trust, config_file)
 
 
-def keep_first_name(settings: Settings, facts: NameFacts) -> None:
+def keep_first_name(settings: Settings, names: Mapping[NameSource, str]) -> None:
     """Keep a name that was given by ``--name`` at the first start of a module, for the starts and commands to come.
 
     One that starts beside another agent is a second module of this machine, and a gateway is none.
     """
     directory = state_dir(os.environ, settings.state_dir)
-    name = facts.option
-    if not name or directory is None or facts.kept or name.endswith(GATEWAY_SUFFIX):
+    name = names[NameSource.OPTION]
+    if not name or directory is None or names[NameSource.KEPT] or name.endswith(GATEWAY_SUFFIX):
         return
     try:
         if any(agent.name != name for agent in find_agents(os.environ)):
@@ -463,7 +461,7 @@ def up(**options: object) -> int:
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
     for note in loaded.notes:
         _up_log.warning("%s", note)
-    chosen = choose_name(loaded.name_facts)
+    chosen = choose_name(loaded.names)
     if chosen.source is NameSource.KEPT:
         _up_log.info("= the module is %s, as at its first start (%s)", chosen.name, loaded.given["name"])
     # Imports leave no garbage: without collection the start takes a third less time. The agent turns it on again.
@@ -471,6 +469,6 @@ def up(**options: object) -> int:
     from rmpa.agent.agent import run
 
     try:
-        return run(loaded.settings, load, partial(keep_first_name, loaded.settings, loaded.name_facts))
+        return run(loaded.settings, load, partial(keep_first_name, loaded.settings, loaded.names))
     finally:
         writer.close()

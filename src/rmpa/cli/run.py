@@ -119,7 +119,7 @@ def _module_name(options: Sequence[str]) -> str:
     from rmpa.config.read import load_settings
 
     file = next((after for before, after in pairwise(options) if before == "--config"), None)
-    chosen = choose_name(load_settings({"config": file}, os.environ, host_name="").name_facts)
+    chosen = choose_name(load_settings({"config": file}, os.environ, host_name="").names)
     return "" if chosen.source is NameSource.DEFAULT else chosen.name
 
 

@@ -1,4 +1,4 @@
-"""Which module a command is about, where it keeps its state, and the text of docs/settings.md.
+"""Which module a command is about, and where it keeps its state.
 
 Which module a command is about: one decision for all commands.
 
@@ -13,35 +13,29 @@ A name that is *said* (the first four) holds, whatever runs. Agents that run cou
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import pwd
 import re
-from dataclasses import asdict, dataclass, is_dataclass
-from enum import Enum, StrEnum
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.config.settings import SETTINGS, TABLES
-from rmpa.config.values import HostPort, Multicast
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from rmpa.config.schema import Setting
-    from rmpa.config.values import JsonSchema
+    from collections.abc import Mapping, Sequence
 
 GATEWAY_SUFFIX = "_gateway"
 """What a gateway's name has behind that of its module."""
 
 
 class NameSource(Enum):
-    """Why a name was chosen."""
+    """Why a name was chosen, the strongest reason first."""
 
     OPTION = "the option"
     AGENT_VARIABLE = "RMPA_AGENT"
+    """Commands that start an agent leave it out."""
     VARIABLE = "RMPA_NAME"
     FILE = "name in rmpa.toml"
     RUNNING = "the agent that runs here"
@@ -51,41 +45,10 @@ class NameSource(Enum):
     @property
     def said(self) -> bool:
         """Whether the user has said it for this command; it then holds, whatever runs."""
-        return self in _SAID
+        return self not in (NameSource.RUNNING, NameSource.KEPT, NameSource.DEFAULT)
 
 
-_SAID = frozenset((NameSource.OPTION, NameSource.AGENT_VARIABLE, NameSource.VARIABLE, NameSource.FILE))
-
-
-@dataclass(frozen=True, slots=True)
-class NameFacts:
-    """What the choice depends on. Empty: there is none.
-
-    Attributes:
-        option: ``--name`` or ``--agent``.
-        agent_variable: RMPA_AGENT; commands that start an agent leave it out.
-        variable: RMPA_NAME.
-        file: ``name`` in ``rmpa.toml``.
-        running: The agents that run on this machine; commands that start one leave them out.
-        gateways: Those among them that are gateways.
-        of_master: The one among them whose core ROS_MASTER_URI names.
-        kept: The name that is kept in the state directory.
-        default: The name without any of these.
-    """
-
-    option: str = ""
-    agent_variable: str = ""
-    variable: str = ""
-    file: str = ""
-    running: tuple[str, ...] = ()
-    gateways: tuple[str, ...] = ()
-    of_master: str = ""
-    kept: str = ""
-    default: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class ModuleName:
+class ModuleName(NamedTuple):
     """A name, and why it was chosen."""
 
     name: str
@@ -96,45 +59,49 @@ class ModuleName:
         return f"{self.name} ({self.source.value})"
 
 
-def choose_name(facts: NameFacts) -> ModuleName:
+def choose_name(
+    names: Mapping[NameSource, str], running: Sequence[str] = (), gateways: Sequence[str] = (), of_master: str = ""
+) -> ModuleName:
     """The module that a command is about.
+
+    Args:
+        names: The name as each source has it; empty: that one has none.
+        running: The agents that run on this machine; commands that start one leave them out.
+        gateways: Those among them that are gateways.
+        of_master: The one among them whose core ROS_MASTER_URI names; empty: none.
 
     Raises:
         RmpaError: Several agents run, and nothing says which is meant.
     """
-    for name, source in (
-        (facts.option, NameSource.OPTION),
-        (facts.agent_variable, NameSource.AGENT_VARIABLE),
-        (facts.variable, NameSource.VARIABLE),
-        (facts.file, NameSource.FILE),
-    ):
-        if name:
-            return ModuleName(name, source)
-    if facts.running:
-        return ModuleName(running_agent(facts), NameSource.RUNNING)
-    if facts.kept:
-        return ModuleName(facts.kept, NameSource.KEPT)
-    return ModuleName(facts.default, NameSource.DEFAULT)
+    for source in NameSource:
+        if source is NameSource.RUNNING and running:
+            return ModuleName(running_agent(names, running, gateways, of_master), source)
+        if names.get(source):
+            return ModuleName(names[source], source)
+    return ModuleName("", NameSource.DEFAULT)
 
 
-def running_agent(facts: NameFacts) -> str:
+def running_agent(
+    names: Mapping[NameSource, str], running: Sequence[str], gateways: Sequence[str], of_master: str
+) -> str:
     """Which of the agents that run is meant: the only one, that of ROS_MASTER_URI, that of a name, the only module.
 
-    Args:
-        facts: With at least one agent. The names of variable, file and first start choose only among them.
+    Args as for ``choose_name``, with at least one agent; the names of variable, file and first start choose among
+    them alone.
 
     Raises:
         RmpaError: It could be several.
     """
-    if len(facts.running) == 1:
-        return facts.running[0]
-    for name in (facts.of_master, facts.variable, facts.file, facts.kept):
-        if name in facts.running:
+    if len(running) == 1:
+        return running[0]
+    said = (names.get(source) for source in (NameSource.VARIABLE, NameSource.FILE, NameSource.KEPT))
+    for name in (of_master, *said):
+        if name and name in running:
             return name
-    modules = [name for name in facts.running if name not in facts.gateways]
+    modules = [name for name in running if name not in gateways]
     if len(modules) == 1:
         return modules[0]
-    listed = ", ".join(facts.running)
+    listed = ", ".join(running)
     raise RmpaError(f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT")
 
 
@@ -295,133 +262,3 @@ def _read(path: Path) -> str:
             return file.read(_READ_MAX).decode("utf-8", "replace")
     except OSError:
         return ""
-
-
-# Made from the declarations of the settings: the tables of docs/settings.md, and the JSON Schema for editors.
-
-
-SCHEMA_FILE: Final = "rmpa.schema.json"
-"""The schema's name in docs/."""
-_TYPE_NAMES: Final = {"string": "text", "integer": "whole number", "boolean": "true, false", "object": "table"}
-
-
-def toml_value(value: object) -> str:
-    """A setting's value as it stands in ``rmpa.toml``."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return f"{value:.15g}"
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
-    if isinstance(value, Multicast) and not value.enabled:
-        return "false"
-    return json.dumps(str(value), ensure_ascii=False)
-
-
-def json_schema() -> JsonSchema:
-    """The JSON Schema (draft 7) of ``rmpa.toml``."""
-    properties: JsonSchema = {}
-    for setting in SETTINGS:
-        if not setting.key:
-            continue
-        entry = setting.type.json_schema | {"description": _plain(setting.help)}
-        if not setting.is_list_of_tables and not setting.shown_default and setting.default != "":
-            entry["default"] = json_value(setting.default)
-        inside = properties
-        for depth, name in enumerate(setting.key[:-1], 1):
-            inside = inside.setdefault(name, _table(".".join(setting.key[:depth])))["properties"]
-        inside[setting.key[-1]] = entry
-    return {
-        "$schema": "http://json-schema.org/draft-07/schema#",
-        "title": "rmpa.toml",
-        "description": "The settings of one RMPA agent.",
-        "type": "object",
-        "additionalProperties": False,
-        "properties": properties,
-    }
-
-
-def _table(name: str) -> JsonSchema:
-    return {"type": "object", "description": TABLES[name], "additionalProperties": False, "properties": {}}
-
-
-def json_value(value: object) -> object:
-    """A setting's value as JSON has it: addresses as text, rules as objects of the keys that they have."""
-    if isinstance(value, tuple):
-        return [json_value(element) for element in value]
-    if isinstance(value, Multicast | HostPort):
-        return str(value) if value != Multicast(enabled=False) else False
-    if is_dataclass(value) and not isinstance(value, type):
-        return {key: json_value(part) for key, part in asdict(value).items() if part is not None}
-    return value.value if isinstance(value, StrEnum) else value
-
-
-def settings_tables() -> str:
-    """The reference of all settings in Markdown: a heading and a table for each table of the file."""
-    parts: list[str] = []
-    for name in ("", *TABLES):
-        rows = [s for s in SETTINGS if not s.is_list_of_tables and ".".join(s.key[:-1]) == name and s.key]
-        title, text = (f"## `[{name}]`", TABLES[name]) if name else ("## Above the first table", "")
-        parts += [title, text, _markdown(_setting_rows(rows))]
-    for setting in SETTINGS:
-        if setting.is_list_of_tables:
-            rows_of_keys = list(_key_rows(setting.type.json_schema["items"]))
-            parts += [f"## `{setting.title}`", setting.help, _markdown(rows_of_keys)]
-    only_variables = [s for s in SETTINGS if not s.key]
-    parts += ["## Environment variables only", _markdown(_setting_rows(only_variables))]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _setting_rows(settings: list[Setting]) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [("setting", "default", "variable", "option", "reload", "what it does")]
-    for setting in settings:
-        default = setting.shown_default or f"`{toml_value(setting.default)}`"
-        key = f"`{setting.key[-1]}`" if setting.key else f"`{setting.env}`"
-        option = ", ".join(f"`{part}`" for part in setting.option.split("/")) if setting.option else ""
-        variable = f"`{setting.env}`" if setting.env and setting.key else ""
-        rows.append((key, default, variable, option, "yes" if setting.live else "", setting.help))
-    if not any(row[3] for row in rows[1:]):
-        rows = [(*row[:3], *row[4:]) for row in rows]
-    if not any(row[2] for row in rows[1:]):
-        rows = [(*row[:2], *row[3:]) for row in rows]
-    return rows
-
-
-def _key_rows(table: JsonSchema) -> Iterator[tuple[str, ...]]:
-    yield ("key", "value", "what it says")
-    for name, schema in table["properties"].items():
-        needed = " (needed)" if name in table.get("required", ()) else ""
-        yield (f"`{name}`{needed}", _type_name(schema), schema["description"])
-
-
-def _type_name(schema: JsonSchema) -> str:
-    if "enum" in schema:
-        return ", ".join(f"`{word}`" for word in schema["enum"])
-    if schema.get("type") == "array":
-        return "tables" if "properties" in schema["items"] else f"list of {_type_name(schema['items'])}s"
-    if "anyOf" in schema:
-        return ", ".join(f"`{toml_value(example)}`" for example in schema["examples"])
-    if "minimum" in schema:
-        return f"{schema['minimum']} to {schema['maximum']}"
-    return _TYPE_NAMES[schema["type"]]
-
-
-def _markdown(rows: list[tuple[str, ...]]) -> str:
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
-
-
-def _plain(text: str) -> str:
-    return text.replace("`", "")
-
-
-def schema_text() -> str:
-    """The JSON Schema as it is printed and stands in docs/."""
-    return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
-
-
-def with_settings_tables(page: str) -> str:
-    """A page of the documentation with its tables between the two marks written anew."""
-    before, begin, rest = page.partition("<!-- tables: begin")
-    mark, end = rest.partition("\n")[0], "<!-- tables: end -->"
-    return f"{before}{begin}{mark}\n\n{settings_tables()}\n{end}{rest.partition(end)[2]}"

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 from rmpa.config import limits
-from rmpa.config.module_name import NAME_FILE, NameFacts, choose_name, kept_name, state_dir
+from rmpa.config.module_name import NAME_FILE, NameSource, choose_name, kept_name, state_dir
 from rmpa.config.peer_rules import peer_warnings, permission_problems
-from rmpa.config.rules import contract_warnings, follow_problems
+from rmpa.config.reference import json_schema
+from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings
 from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown
@@ -92,19 +93,6 @@ _TYPES: Final[dict[str, tuple[type, str]]] = {
     "object": (dict, "a table"),
 }
 """By the name of a type in JSON Schema: the type of TOML values, and its name in errors."""
-SCHEMAS: Final[dict[Key, JsonSchema]] = {s.key: s.type.json_schema for s in SETTINGS if s.key}
-"""Every key that a file may have, ``("name",)``, ``("core", "port")`` and so on, and what its value may be.
-
-Each of ``LISTS`` is one: ``("contract",)`` has the list of all ``[[contract]]``.
-"""
-LISTS: Final = {s.key: tuple(s.type.json_schema["items"]["properties"]) for s in SETTINGS if s.is_list_of_tables}
-"""The tables that there may be many of (``("contract",)``), and the keys that each may have."""
-_TABLES: Final = {
-    key[:depth]: tuple(dict.fromkeys(other[depth] for other in SCHEMAS if other[:depth] == key[:depth]))
-    for key in SCHEMAS
-    for depth in range(len(key))
-}
-"""The keys and tables of each table; those of the file itself by ``()``."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -115,7 +103,7 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
         path: For the text of errors.
 
     Returns:
-        What it says, by key; only the types are checked.
+        What it says, by the key of a setting; only the keys and types are checked.
 
     Raises:
         ConfigError: With line and key, if the text is not TOML, has an unknown key or a value of a wrong type.
@@ -130,13 +118,34 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
         line = data.count(b"\n", 0, error.start) + 1
         raise ConfigError("the file", "not UTF-8 text", "save it as UTF-8", path, line) from None
     table = _parse_toml(text, path)
-    for place, suggestion in _unknown(table):
-        what = "an unknown table" if isinstance(value_at(table, place), dict) else "an unknown key"
-        raise ConfigError(dotted(place), what, REMOVED.get(dotted(place), suggestion), path, line_of(text, place))
-    for place, value, types in _mistyped(table):
-        problem, remedy = _type_mistake(place, value, types)
+    for place, problem, remedy in _mistakes((), table, json_schema()):
         raise ConfigError(dotted(place), problem, remedy, path, line_of(text, place))
-    return {key: value for key in SCHEMAS if (value := value_at(table, key)) is not None}
+    found = {setting.key: value_at(table, setting.key) for setting in SETTINGS if setting.key}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _mistakes(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple[Place, str, str]]:
+    """Each unknown key and wrong type in a value: place, problem and remedy. All else is checked by the readers."""
+    expected = schema.get("type", [])
+    types = [expected] if isinstance(expected, str) else expected
+    if types and type(value) not in [_TYPES[name][0] for name in types]:
+        if isinstance(value, dict) and "properties" in schema.get("items", {}):
+            remedy = f"write [[{dotted(place)}]], in two brackets"
+            yield place, "one table, where a list of them is expected", remedy
+            return
+        remedy = f'did you mean ["{value}"]?' if types == ["array"] and isinstance(value, str) else ""
+        yield place, f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}", remedy
+    elif isinstance(value, list):
+        for index, element in enumerate(value):
+            yield from _mistakes((*place, index), element, schema.get("items", {}))
+    elif isinstance(value, dict):
+        known, other = schema.get("properties", {}), schema.get("additionalProperties") or {}
+        for key, inner in value.items():
+            if known and key not in known:
+                what = "an unknown table" if isinstance(inner, dict) else "an unknown key"
+                remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known))
+                yield (*place, key), what, remedy
+            yield from _mistakes((*place, key), inner, known.get(key, other))
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -168,88 +177,32 @@ def dotted(place: Place) -> str:
     return ".".join(part for part in place if isinstance(part, str))
 
 
-def _unknown(table: dict[str, Any]) -> Iterator[tuple[Place, str]]:
-    """Unknown keys, each with what was probably meant."""
-    everywhere = [key for key in SCHEMAS if key not in LISTS]
-    everywhere += [(*name, key) for name, keys in LISTS.items() for key in keys]
-    for place, key_of_table, inside, known in _tables((), table):
-        for key in inside:
-            if key not in known:
-                yield (*place, key), _suggestion(key, key_of_table, everywhere, list(known))
-
-
-def _tables(key: Key, value: object) -> Iterator[tuple[Place, Key, dict[str, Any], Sequence[str]]]:
-    """A key's table and those in it: the place, the key, the table, and the keys that it may have."""
-    if isinstance(value, dict) and (known := _TABLES.get(key)):
-        yield key, key, value, known
-        for name in value:
-            yield from _tables((*key, name), value[name])
-    for index, element in enumerate(value if key in LISTS and isinstance(value, list) else ()):
-        if isinstance(element, dict):
-            yield (*key, index), key, element, LISTS[key]
-
-
-def _suggestion(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
+def _suggestion(place: Place, word: str, here: list[str]) -> str:
     """What to do about an unknown key: the key that was probably meant, or the table that it belongs in."""
+    everywhere = list(_keys(json_schema()))
     homes = [key for key in everywhere if key[-1] == word]
     near = did_you_mean(word, here)
-    if near is not None and (table or not homes):
-        return f"did you mean {'.'.join((*table, near))}?"
+    if near is not None and (place or not homes):
+        return f"did you mean {dotted((*place, near))}?"
     if homes:
-        return f"{word} belongs {_home(homes[0])}"
+        table = homes[0][:-1]
+        titles = [setting.title for setting in SETTINGS if setting.key == table != ()]  # a table that is a list
+        where = f"in a {titles[0]}" if titles else f"in [{dotted(table)}]" if table else "above the first table"
+        return f"{word} belongs {where}"
     near = did_you_mean(word, [key[-1] for key in everywhere])
     if near is not None:
-        key = next(key for key in everywhere if key[-1] == near)
-        return f"did you mean {'.'.join(key)}?"
+        return f"did you mean {next(dotted(key) for key in everywhere if key[-1] == near)}?"
     return f"known here: {', '.join(here)}"
 
 
-def _home(key: Key) -> str:
-    if len(key) == 1:
-        return "above the first table"
-    table = ".".join(key[:-1])
-    return f"in a [[{table}]]" if key[:-1] in LISTS else f"in [{table}]"
-
-
-def _mistyped(table: dict[str, Any]) -> Iterator[tuple[Place, object, list[str]]]:
-    """Values of a wrong type: place, value, and the types (in JSON Schema's words) that it may have."""
-    for place, value in _values((), table):
-        if place not in _TABLES:
-            yield from _mismatches(place, value, SCHEMAS[place])
-        elif not isinstance(value, dict):
-            yield place, value, ["object"]
-
-
-def _values(key: Key, value: object) -> Iterator[tuple[Key, object]]:
-    """Each value below a key that is not a table of settings; also what stands in the place of such a table."""
-    if key in _TABLES and isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _values((*key, name), inner)
-    else:
-        yield key, value
-
-
-def _mismatches(place: Place, value: object, schema: JsonSchema) -> Iterator[tuple[Place, object, list[str]]]:
-    """Mismatches of JSON Schema's ``type`` in a value and its elements; all else is checked by the readers."""
-    expected = schema.get("type", [])
-    types = [expected] if isinstance(expected, str) else expected
-    if types and type(value) not in [_TYPES[name][0] for name in types]:
-        yield place, value, types
-    elif isinstance(value, list):
-        for index, element in enumerate(value):
-            yield from _mismatches((*place, index), element, schema.get("items", {}))
-    elif isinstance(value, dict):
-        known, other = schema.get("properties", {}), schema.get("additionalProperties")
-        for key, inner in value.items():
-            yield from _mismatches((*place, key), inner, known.get(key) or other or {})
-
-
-def _type_mistake(place: Place, value: object, types: list[str]) -> tuple[str, str]:
-    """The problem and the remedy for a value of a wrong type."""
-    if place in LISTS and isinstance(value, dict):
-        return "one table, where a list of them is expected", f"write [[{dotted(place)}]], in two brackets"
-    problem = f"{shown(value)} is not {' or '.join(_TYPES[name][1] for name in types)}"
-    return problem, f'did you mean ["{value}"]?' if types == ["array"] and isinstance(value, str) else ""
+def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
+    """Every key of a table and of those in it."""
+    for name, inner in schema["properties"].items():
+        inside = inner.get("items", inner)
+        if "properties" in inside:
+            yield from _keys(inside, (*table, name))
+        else:
+            yield (*table, name)
 
 
 # Where settings come from, each source stronger than the one before it.
@@ -259,10 +212,8 @@ def _type_mistake(place: Place, value: object, types: list[str]) -> tuple[str, s
 #     defaults < ROS environment < rmpa.toml < RMPA_* < options
 #
 # The module's name has one more: the name of its first start, which the state directory keeps
-# (``config.module_name``).
-# A source gives raw values and says where each was written; the types of ``config.settings`` read them. A setting
-# that
-# cannot be used is a ``ConfigError`` that names that place.
+# (``config.module_name``). A source gives raw values and says where each was written; the types of
+# ``config.settings`` read them. A setting that cannot be used is a ``ConfigError`` that names that place.
 
 
 FILE_NAME: Final = "rmpa.toml"
@@ -275,7 +226,7 @@ _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 class Given:
     """A raw value, and where it was written.
 
-    Args:
+    Attributes:
         raw: The value as it was written.
         source: The option, the variable, or the key of the file.
         path: The file, for a value of a file.
@@ -323,8 +274,6 @@ class Given:
 
 _Layer = dict[str, Given]
 """The raw values of one source, by the setting's name."""
-_Tree = dict[str, Any]
-"""Values by key; those of a table are a dictionary again."""
 _Table = TypeVar("_Table")
 
 
@@ -332,17 +281,17 @@ _Table = TypeVar("_Table")
 class Loaded:
     """Settings, and how they came to be.
 
-    Args:
+    Attributes:
         settings: The settings.
         notes: What the user should know about them, for the log at level warning.
         given: By the setting's name: what its strongest source gives. A setting that is missing has its default.
-        name_facts: What the choice of the name depends on.
+        names: The module's name as each source has it; empty: that one has none.
     """
 
     settings: Settings
     notes: tuple[str, ...] = ()
     given: Mapping[str, Given] = field(default_factory=dict, repr=False)
-    name_facts: NameFacts = field(default_factory=NameFacts)
+    names: Mapping[NameSource, str] = field(default_factory=dict)
 
 
 def load_settings(
@@ -376,25 +325,27 @@ def load_settings(
     strongest = _ros_layer(environ, host_name, notes, external=external) | said
     values = {name: given.read(_BY_NAME[name]) for name, given in strongest.items()}
     directory = state_dir(environ, str(values.get("state_dir") or ""))
-    facts = NameFacts(
-        option=_name_in(from_options),
-        variable=_name_in(from_variables),
-        file=_name_in(from_file),
-        kept=kept_name(directory),
-        default=peer_name_from(host_name),
-    )
-    values["name"] = choose_name(facts).name
-    if directory is not None and facts.kept and "name" not in strongest:
-        strongest["name"] = Given(facts.kept, str(directory / NAME_FILE))
-    settings = _assemble(values, path)
+    names = {
+        NameSource.OPTION: _name_in(from_options),
+        NameSource.VARIABLE: _name_in(from_variables),
+        NameSource.FILE: _name_in(from_file),
+        NameSource.KEPT: kept_name(directory),
+        NameSource.DEFAULT: peer_name_from(host_name),
+    }
+    values["name"] = choose_name(names).name
+    if directory is not None and names[NameSource.KEPT] and "name" not in strongest:
+        strongest["name"] = Given(names[NameSource.KEPT], str(directory / NAME_FILE))
+    settings = Settings(config_file=path)
+    for name, value in values.items():
+        settings = _with(settings, name.split("."), value)
     for name, warnings in (
         ("contracts", contract_warnings(settings.contracts)),
         ("peers", peer_warnings(settings.peers)),
     ):
-        notes += [str(strongest[name].error(warning.text, "", warning.at)) for warning in warnings]
+        notes += [str(strongest[name].error(text, "", at)) for at, text in warnings]
     _check_core(strongest, notes, external=external)
     _check_together(settings, strongest)
-    return Loaded(settings, tuple(notes), strongest, facts)
+    return Loaded(settings, tuple(notes), strongest, names)
 
 
 def _name_in(layer: _Layer) -> str:
@@ -402,24 +353,11 @@ def _name_in(layer: _Layer) -> str:
     return str(layer["name"].read(_BY_NAME["name"])) if "name" in layer else ""
 
 
-def _assemble(values: Mapping[str, object], path: Path | None) -> Settings:
-    """The settings with these values, by name; those in a table (``realtime.cpus``) are set in its dataclass."""
-    tree: _Tree = {}
-    for name, value in values.items():
-        *tables, key = name.split(".")
-        inner = tree
-        for table in tables:
-            inner = inner.setdefault(table, {})
-        inner[key] = value
-    return _with(Settings(config_file=path), tree)
-
-
-def _with(table: _Table, tree: _Tree) -> _Table:
-    """A dataclass of settings with other values; a dictionary among them is one of its tables."""
-    values = {
-        key: _with(getattr(table, key), value) if isinstance(value, dict) else value for key, value in tree.items()
-    }
-    return replace(table, **values)  # type: ignore[type-var] # each is a dataclass, each value of its setting's type
+def _with(table: _Table, path: Sequence[str], value: object) -> _Table:
+    """A dataclass of settings with one other value, at a path of attributes."""
+    name, *rest = path
+    inner = _with(getattr(table, name), rest, value) if rest else value
+    return replace(table, **{name: inner})  # type: ignore[type-var] # each is a dataclass of settings
 
 
 def _check_together(settings: Settings, given: _Layer) -> None:
@@ -437,8 +375,13 @@ def _check_together(settings: Settings, given: _Layer) -> None:
         raise given["params.follow"].error(problem, "raise that, or follow a namespace as a whole", ())
     for at, problem, remedy in permission_problems(settings.trust.rules, settings.trust.groups):
         raise given["trust.rules"].error(problem, remedy, at)
-    for name, at, problem in follow_problems(settings.params.follow, settings.time.follow, settings.name):
-        raise given[name].error(problem, "name another module", at)
+    own = f"{settings.name} is this module itself; its own"
+    for index, rule in enumerate(settings.params.follow):
+        if rule.owner == settings.name:
+            problem = f"{own} parameters are here already"
+            raise given["params.follow"].error(problem, "name another module", (index, "from"))
+    if settings.time.follow == settings.name:
+        raise given["time.follow"].error(f"{own} time is here already", "name another module", ())
 
 
 def find_config_file(flag: str | None, environ: Mapping[str, str], cwd: Path, notes: list[str]) -> Path | None:

@@ -1,6 +1,6 @@
-"""Rules about topics and parameters in ``rmpa.toml``: ``[[contract]]``, ``[[param]]`` and ``[[gateway.rule]]``.
+"""Rules about topics, parameters and sites in ``rmpa.toml``: ``[[contract]]``, ``[[param]]`` and ``[gateway]``.
 
-The tables ``[[contract]]`` of ``rmpa.toml``: what topics need, in ROS 2's words (docs/contracts.md).
+A ``[[contract]]`` says what topics need, in ROS 2's words (docs/contracts.md).
 """
 
 from __future__ import annotations
@@ -8,31 +8,31 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
-from rmpa.config.schema import BYTES_A_SECOND, OUTAGE, RATE, duration_of, read_bytes_a_second, setting, table
+from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting, table
 from rmpa.config.values import (
     BOOL,
+    BYTES_A_SECOND,
     DOMAIN,
     NAME,
+    OUTAGE,
     PEER_GLOB,
+    RATE,
     TEXT,
     TOPIC_GLOB,
     TRANSPORT,
     TYPE_GLOB,
     BadValue,
     Place,
-    RuleKey,
     ValueType,
     did_you_mean,
+    duration_of,
     list_of,
     member_of,
-    read_at,
-    read_keys,
     read_text,
-    tables_of,
+    text_type,
     whole_number,
     word_of,
 )
@@ -51,105 +51,83 @@ from rmpa.core.contract import (
 from rmpa.core.identity import is_global_name, is_legal_name, matches
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
-KEYS: Final = (
-    RuleKey(
-        "topics",
+_LEASE: Final = "liveliness_lease_duration"
+"""The key of a contract's ``liveliness_lease``."""
+_CONTRACT_KEYS: Final = {
+    "topics": Setting(
         list_of(TOPIC_GLOB, if_empty="leave topics out, or name some"),
         "Globs over topics, one of which must fit; without it: any topic.",
     ),
-    RuleKey(
-        "types",
+    "types": Setting(
         list_of(TYPE_GLOB, if_empty="leave types out, or name some"),
         "Globs over message types, one of which must fit; without it: any type.",
     ),
-    RuleKey("reliability", member_of(Reliability, "a reliability"), "Whether messages survive the loss of a link."),
-    RuleKey(
-        "durability",
-        member_of(Durability, "a durability"),
-        "Whether a late subscriber gets each source's last ones.",
+    "reliability": Setting(member_of(Reliability, "a reliability"), "Whether messages survive the loss of a link."),
+    "durability": Setting(
+        member_of(Durability, "a durability"), "Whether a late subscriber gets each source's last ones."
     ),
-    RuleKey("history", member_of(History, "a history"), "What a full queue keeps."),
-    RuleKey(
-        "depth",
+    "history": Setting(member_of(History, "a history"), "What a full queue keeps."),
+    "depth": Setting(
         whole_number(1, core_limits.CONTRACT_DEPTH_MAX, "a depth"),
         "Messages that wait for one slow receiver; beyond it the oldest is dropped.",
     ),
-    RuleKey("deadline", duration_of("a deadline"), "The longest time from one message to the next."),
-    RuleKey("lifespan", duration_of("a lifespan"), "A message that is older is dropped."),
-    RuleKey(
-        "liveliness",
-        member_of(Liveliness, "a liveliness"),
-        "What shows that a source is alive: its link, or its own messages.",
+    "deadline": Setting(duration_of("a deadline"), "The longest time from one message to the next."),
+    "lifespan": Setting(duration_of("a lifespan"), "A message that is older is dropped."),
+    "liveliness": Setting(
+        member_of(Liveliness, "a liveliness"), "What shows that a source is alive: its link, or its own messages."
     ),
-    RuleKey(
-        "liveliness_lease_duration",
-        duration_of("a lease"),
-        "Without a sign of life for so long a source counts as dead; needs liveliness.",
+    _LEASE: Setting(
+        duration_of("a lease"), "Without a sign of life for so long a source counts as dead; needs liveliness."
     ),
-    RuleKey("priority", member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."),
-    RuleKey("max_rate", RATE, "Messages a second that cross at most; the newest are kept."),
-    RuleKey("outage", OUTAGE, "How long a reliable topic is kept when its link is gone."),
-    RuleKey("transport", TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
-)
-"""The keys that one ``[[contract]]`` may have."""
-_FIELDS: Final = {"liveliness_lease_duration": "liveliness_lease"}
-"""The contract's field, for a key that has another name."""
+    "priority": Setting(member_of(Priority, "a priority"), "The lane: high is express, low is bulk, normal by size."),
+    "max_rate": Setting(RATE, "Messages a second that cross at most; the newest are kept."),
+    "outage": Setting(OUTAGE, "How long a reliable topic is kept when its link is gone."),
+    "transport": Setting(TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
+}
+TERMS: Final = tuple(_CONTRACT_KEYS)[2:]
+"""The keys of a ``[[contract]]`` besides the topics and types that it is about."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConfigWarning:
-    """Something in the rules that can be used but is probably a mistake.
-
-    Args:
-        at: Where: the rule's index, and the key in it.
-        text: What about it.
-    """
-
-    at: Place
-    text: str
-
-
-def _read_contract(table: Mapping[str, object]) -> ContractRule:
-    values = read_keys(table, KEYS)
+def _make_contract(values: dict[str, Any]) -> ContractRule:
     topics, types = values.pop("topics", ()), values.pop("types", ())
     if not topics and not types:
         raise BadValue("a rule without topics and types", 'topics = ["/**"] makes it one for every topic')
-    if "liveliness_lease_duration" in values and "liveliness" not in values:
-        remedy = (
-            'add liveliness = "automatic" (its link says that a source lives) or "manual_by_topic" (its messages)'
-        )
-        raise BadValue("says nothing without liveliness", remedy, at=("liveliness_lease_duration",))
-    return ContractRule(topics, types, {_FIELDS.get(key, key): value for key, value in values.items()})
+    if _LEASE in values:
+        if "liveliness" not in values:
+            kinds = '"automatic" (its link says that a source lives) or "manual_by_topic" (its messages)'
+            raise BadValue("says nothing without liveliness", f"add liveliness = {kinds}", at=(_LEASE,))
+        values["liveliness_lease"] = values.pop(_LEASE)
+    return ContractRule(topics, types, values)
 
 
-CONTRACT_RULES: Final = tables_of(KEYS, _read_contract)
+CONTRACT_RULES: Final = rules_of(_CONTRACT_KEYS, _make_contract)
 
 
-def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[ConfigWarning]:
-    """Warnings about rules that can be used but are probably mistakes."""
+def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[tuple[Place, str]]:
+    """Rules that can be used but are probably mistakes: where, and what about it."""
     leased = any(rule.values.get("liveliness_lease") is not None for rule in rules)
     reliable = any(rule.values.get("reliability") == Reliability.RELIABLE for rule in rules)
     for index, rule in enumerate(rules):
         values = rule.values
         if not values:
-            yield ConfigWarning((index,), "a rule that sets nothing")
+            yield (index,), "a rule that sets nothing"
         if values.get("history") == History.KEEP_ALL and "depth" in values:
-            yield ConfigWarning((index, "depth"), "has no effect beside history keep_all")
+            yield (index, "depth"), "has no effect beside history keep_all"
         if values.get("liveliness") == Liveliness.MANUAL_BY_TOPIC and not leased:
-            yield ConfigWarning((index, "liveliness"), "has no effect without a liveliness_lease_duration")
+            yield (index, "liveliness"), f"has no effect without a {_LEASE}"
         if "outage" in values and not reliable:
-            yield ConfigWarning((index, "outage"), 'has no effect without reliability = "reliable"')
+            yield (index, "outage"), 'has no effect without reliability = "reliable"'
         if values.get("transport") == Transport.DIRECT:
             terms = needs_agents(Contract(**values))  # type: ignore[arg-type] # as ContractRule.values promises
             if terms:
                 text = f"direct has no effect: only agents can keep {terms}, so the topic is relayed"
-                yield ConfigWarning((index, "transport"), text)
+                yield (index, "transport"), text
         deadline, rate = values.get("deadline"), values.get("max_rate")
         if isinstance(deadline, float) and isinstance(rate, float) and deadline * rate < 1:
             text = f"{rate:g} messages a second miss the deadline of {deadline:g} s every time"
-            yield ConfigWarning((index, "max_rate"), text)
+            yield (index, "max_rate"), text
 
 
 # The tables ``[[param]]`` of ``rmpa.toml``: which parameters of which peers are followed, and under which name.
@@ -165,26 +143,6 @@ UNTOUCHABLE: Final = {
     SIM_TIME: "time is followed by [time] alone",
 }
 """Parameters that another module never sets or deletes, and why."""
-_OWNER_ALONE: Final = "a parameter has one owner: leave one of the rules out"
-
-
-@dataclass(frozen=True, slots=True)
-class FollowRule:
-    """One ``[[param]]``: a parameter, or a namespace as a whole, of a peer that this module follows.
-
-    Args:
-        key: Its global name at the peer.
-        owner: The peer's name.
-        to: Its global name here.
-    """
-
-    key: str
-    owner: str
-    to: str
-
-    def __str__(self) -> str:
-        """``base:/robot_description as /base/robot_description``."""
-        return f"{self.owner}:{self.key}" + (f" as {self.to}" if self.to != self.key else "")
 
 
 def untouchable(key: str) -> str:
@@ -201,7 +159,7 @@ def overlap(one: str, other: str) -> bool:
     return first.startswith(second) or second.startswith(first)
 
 
-def read_key(raw: object) -> str:
+def _read_key(raw: object) -> str:
     """A parameter's global name; not the root."""
     key = read_text(raw).strip()
     if key.strip("/") == "":
@@ -226,59 +184,53 @@ def _read_owner(raw: object) -> str:
     return NAME.read(raw)
 
 
-_OWNER: Final = ValueType(_read_owner, NAME.json_schema)
-_PARAM: Final = ValueType(read_key, {"type": "string", "examples": ["/robot_description"]})
-_PARAM_KEYS: Final = (
-    RuleKey("key", _PARAM, "The parameter's name at its owner; a namespace is followed as a whole.", required=True),
-    RuleKey("from", _OWNER, "The peer that owns it.", required=True),
-    RuleKey("to", _PARAM, "Its name here; without it: the same."),
-)
+_PARAM: Final = text_type(_read_key, "/robot_description")
 
 
-def _read_param(table: Mapping[str, object]) -> FollowRule:
-    values = read_keys(table, _PARAM_KEYS, 'one has key = "/robot_description" and from = "base"')
+@dataclass(frozen=True, slots=True)
+class FollowRule:
+    """One ``[[param]]``: a parameter, or a namespace as a whole, of a peer that this module follows."""
+
+    key: str = setting(
+        NEEDED, _PARAM, "The parameter's name at its owner; a namespace is followed as a whole.", key="key"
+    )
+    owner: str = setting(NEEDED, ValueType(_read_owner, NAME.json_schema), "The peer that owns it.", key="from")
+    to: str = setting("", _PARAM, "Its name here; without it: the same.")
+
+    def __str__(self) -> str:
+        """``base:/robot_description as /base/robot_description``."""
+        return f"{self.owner}:{self.key}" + (f" as {self.to}" if self.to != self.key else "")
+
+
+def _make_follow(values: dict[str, Any]) -> FollowRule:
     rule = FollowRule(values["key"], values["from"], values.get("to", values["key"]))
     if why := untouchable(rule.to):
-        raise BadValue(f"{rule.to} cannot be followed: {why}", at=("to",) if "to" in table else ("key",))
+        raise BadValue(f"{rule.to} cannot be followed: {why}", at=("to",) if "to" in values else ("key",))
     return rule
 
 
-def _read_rules(raw: object) -> tuple[FollowRule, ...]:
+_FOLLOW: Final = rules_of(
+    keys_of(FollowRule),
+    _make_follow,
+    'one has key = "/robot_description" and from = "base"',
+    limits.FOLLOW_RULES_MAX,
+    "follow a namespace as a whole",
+)
+
+
+def _read_params(raw: object) -> tuple[FollowRule, ...]:
     """Every ``[[param]]`` of a file; the error about a rule that contradicts an earlier one is at the later one."""
-    rules = _TABLES.read(raw)
+    rules = _FOLLOW.read(raw)
     for index, rule in enumerate(rules):
-        read_at((index,), partial(_check_against, rules[:index]), rule)
+        for other in rules[:index]:
+            if overlap(other.to, rule.to):
+                whose = f"{other.to} comes from {other.owner}'s {other.key} already"
+                problem = f"{rule.to} cannot come from {rule.owner} too: {whose}"
+                raise BadValue(problem, "a parameter has one owner: leave one of the rules out", at=(index,))
     return rules
 
 
-_TABLES: Final = tables_of(_PARAM_KEYS, _read_param, limits.FOLLOW_RULES_MAX, "follow a namespace as a whole")
-PARAM_RULES: Final = ValueType(_read_rules, _TABLES.json_schema)
-
-
-def _check_against(rules: Sequence[FollowRule], rule: FollowRule) -> None:
-    for other in rules:
-        if overlap(other.to, rule.to):
-            whose = f"{other.to} comes from {other.owner}'s {other.key} already"
-            raise BadValue(f"{rule.to} cannot come from {rule.owner} too: {whose}", _OWNER_ALONE)
-
-
-def follow_problems(rules: Sequence[FollowRule], time_owner: str, name: str) -> Iterator[tuple[str, Place, str]]:
-    """Problems that only show when all settings are known: ``(setting, place in it, problem)``.
-
-    Args:
-        rules: Of ``[[param]]``.
-        time_owner: The peer whose time is followed; empty for none.
-        name: This module's own name.
-    """
-    for index, rule in enumerate(rules):
-        if rule.owner == name:
-            yield (
-                "params.follow",
-                (index, "from"),
-                f"{name} is this module itself; its own parameters are here already",
-            )
-    if time_owner and time_owner == name:
-        yield "time.follow", (), f"{name} is this module itself; its own time is here already"
+PARAM_RULES: Final = ValueType(_read_params, _FOLLOW.json_schema)
 
 
 # The table ``[gateway]`` of ``rmpa.toml``: which other sites and which ROS 2 a gateway joins, and what may cross.
@@ -288,50 +240,13 @@ ROS2: Final = "ros2"
 """Stands in the place of a site in names and rules, for a ROS 2 graph; no site may have it."""
 PROTOCOLS: Final = ("tls", "tcp", "quic", "udp", "ws")
 """The protocols of Zenoh's endpoints that are accepted."""
-_COMMAND: Final = "gateway"
-_ENDPOINT: Final = re.compile(
+_ENDPOINT: Final = (
     r"(?P<protocol>[a-z0-9]+)/(?P<host>\[[0-9A-Fa-f:.]+(?:%[A-Za-z0-9]+)?\]|[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,252})|\*)"
     r":(?P<port>[0-9]{1,5})(?P<more>[?#][A-Za-z0-9_=;.:/-]{1,200})?"
 )
 _LOOKS: Final = "one looks like tls/fleet.example:7447"
 _PLACEHOLDERS: Final = {"{site}": "site", "{module}": "module", "{name}": "/name"}
 """What a rule's ``name`` may have in it, each with an example of what it becomes."""
-
-
-class Crossing(StrEnum):
-    """The way in which a rule lets sources cross, seen from this site."""
-
-    BOTH = "both"
-    OUT = "out"
-    IN = "in"
-    NONE = "none"
-
-
-@dataclass(frozen=True, slots=True)
-class CrossingRule:
-    """One ``[[gateway.rule]]``: the first that matches a source holds. Without a rule everything crosses, on demand.
-
-    Args:
-        names: Globs over topics, services and parameters, by the names that they have in their module.
-        sites: Globs over the other site's name; ``ros2`` is a name too.
-        modules: Globs over the module that has the source.
-        crossing: Which way it may cross.
-        name: The name here of what comes in; ``{site}``, ``{module}`` and ``{name}`` are replaced. ``{name}`` begins
-            with a slash.
-        rate: Messages a second of each topic that goes out; ``None``: no limit. Others are dropped, and counted.
-        size: Bytes a second of each topic that goes out; ``None``: no limit.
-    """
-
-    names: tuple[str, ...] = ("/**",)
-    sites: tuple[str, ...] = ("*",)
-    modules: tuple[str, ...] = ("*",)
-    crossing: Crossing = Crossing.BOTH
-    name: str = "{name}"
-    rate: float | None = None
-    size: int | None = None
-
-
-# --- values ---------------------------------------------------------------------------------------------------------
 
 
 def _read_site(raw: object) -> str:
@@ -350,33 +265,27 @@ def _read_site(raw: object) -> str:
 
 def _read_endpoint(raw: object) -> str:
     text = read_text(raw).strip()
-    match = _ENDPOINT.fullmatch(text)
+    match = re.fullmatch(_ENDPOINT, text)
     if match is None:
-        better = f"tls/{text}" if "/" not in text and _ENDPOINT.fullmatch(f"tls/{text}") else None
-        better = better or (f"{text}:7447" if _ENDPOINT.fullmatch(f"{text}:7447") else None)
-        url = re.fullmatch(r"([a-z]+)://(.+?)/?", text)
-        if url and _ENDPOINT.fullmatch(f"{url[1]}/{url[2]}"):
-            better = f"{url[1]}/{url[2]}"
+        guesses = (f"tls/{text}", f"{text}:7447", re.sub(r"^([a-z]+)://(.+?)/?$", r"\1/\2", text))
+        better = next((guess for guess in guesses if re.fullmatch(_ENDPOINT, guess)), None)
         raise BadValue(f"{text!r} is not an endpoint of Zenoh", _LOOKS, better)
-    if match["protocol"] not in PROTOCOLS:
-        near = did_you_mean(match["protocol"], PROTOCOLS)
-        better = f"{near}{text[match.end('protocol') :]}" if near else None
-        raise BadValue(
-            f"{match['protocol']!r} is not a protocol of endpoints", f"there are {', '.join(PROTOCOLS)}", better
-        )
+    protocol = match["protocol"]
+    if protocol not in PROTOCOLS:
+        near = did_you_mean(protocol, PROTOCOLS)
+        better = near and near + text.removeprefix(protocol)
+        raise BadValue(f"{protocol!r} is not a protocol of endpoints", f"there are {', '.join(PROTOCOLS)}", better)
     if not 1 <= int(match["port"]) <= 65535:
         raise BadValue(f"{text!r} has no port between 1 and 65535", _LOOKS)
     return text
 
 
 def _read_template(raw: object) -> str:
-    text = read_text(raw).strip()
-    filled = text
+    text = filled = read_text(raw).strip()
     for placeholder, example in _PLACEHOLDERS.items():
         filled = filled.replace(placeholder, example)
     remedy = 'an example: "/{site}{name}"'
-    if "{" in filled or "}" in filled:
-        unknown = re.findall(r"\{[^{}]*\}?|\}", filled)
+    if unknown := re.search(r"\{[^{}]*\}?|\}", filled):
         raise BadValue(f"{unknown[0]!r} stands for nothing", f"there are {', '.join(_PLACEHOLDERS)}; {remedy}")
     if "//" in filled:
         raise BadValue(f"{text!r} has two slashes together", "{name} begins with a slash; " + remedy)
@@ -387,108 +296,101 @@ def _read_template(raw: object) -> str:
     return text
 
 
-_SITE: Final = ValueType(_read_site, {"type": "string", "pattern": "^([A-Za-z][A-Za-z0-9_]*)?$"}, "NAME")
 ENDPOINT: Final = ValueType(
     _read_endpoint,
     {"type": "string", "pattern": f"^({'|'.join(PROTOCOLS)})/", "examples": ["tls/fleet.example:7447"]},
     "ENDPOINT",
 )
-_RANK: Final = whole_number(0, limits.GATEWAY_RANK_MAX, "a rank")
-_DISTRIBUTION: Final = word_of(
-    ("humble", "iron", "jazzy", "kilted", "lyrical"),
-    "a distribution of ROS 2 that rmw_zenoh is made for",
-    "there are humble, iron, jazzy, kilted and lyrical",
-    "NAME",
-)
-_TEMPLATE: Final = ValueType(_read_template, {"type": "string", "examples": ["/{site}{name}"]})
-_CROSSING_KEYS: Final = (
-    RuleKey(
-        "names",
+
+
+class Crossing(StrEnum):
+    """The way in which a rule lets sources cross, seen from this site."""
+
+    BOTH = "both"
+    OUT = "out"
+    IN = "in"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class CrossingRule:
+    """One ``[[gateway.rule]]``; the first that matches a source holds. Without one everything crosses, on demand."""
+
+    names: tuple[str, ...] = setting(
+        ("/**",),
         list_of(TOPIC_GLOB, if_empty="leave names out, or name some"),
         "Globs over topics, services and parameters, by their names in their module; without it all.",
-    ),
-    RuleKey(
-        "sites",
+    )
+    sites: tuple[str, ...] = setting(
+        ("*",),
         list_of(PEER_GLOB, if_empty="leave sites out, or name some"),
         "Globs over the other site's name; ros2 is a name too. Without it all.",
-    ),
-    RuleKey(
-        "modules",
+    )
+    modules: tuple[str, ...] = setting(
+        ("*",),
         list_of(PEER_GLOB, if_empty="leave modules out, or name some"),
         "Globs over the module that has the source; without it all.",
-    ),
-    RuleKey("crossing", member_of(Crossing, "a way to cross"), "Which way it may cross, seen from this site."),
-    RuleKey("name", _TEMPLATE, "The name here of what comes in; {site}, {module} and {name} are replaced."),
-    RuleKey("rate", RATE, "Messages a second of each topic that goes out; others are dropped, and counted."),
-    RuleKey("size", BYTES_A_SECOND, "Bytes a second of each topic that goes out; others are dropped, and counted."),
-)
-_CROSSING_EXAMPLE: Final = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
-_SELECTORS: Final = {"names", "sites", "modules"}
+    )
+    crossing: Crossing = setting(
+        Crossing.BOTH, member_of(Crossing, "a way to cross"), "Which way it may cross, seen from this site."
+    )
+    name: str = setting(
+        "{name}",
+        text_type(_read_template, "/{site}{name}"),
+        "The name here of what comes in; {site}, {module} and {name} are replaced.",
+    )
+    rate: float | None = setting(
+        None, RATE, "Messages a second of each topic that goes out; others are dropped, and counted."
+    )
+    size: int | None = setting(
+        None, BYTES_A_SECOND, "Bytes a second of each topic that goes out; others are dropped, and counted."
+    )
 
 
-def _read_crossing(raw: Mapping[str, object]) -> CrossingRule:
-    values = read_keys(raw, _CROSSING_KEYS)
-    said = set(values) - _SELECTORS
-    if not said:
-        raise BadValue("a rule that says nothing of what it selects", _CROSSING_EXAMPLE)
-    crossing = values.get("crossing", Crossing.BOTH)
+def _make_crossing(values: dict[str, Any]) -> CrossingRule:
+    rule = CrossingRule(**values)
+    if not values.keys() - {"names", "sites", "modules"}:
+        example = 'one has names = ["/camera/**"] and rate = 2, or crossing = "none"'
+        raise BadValue("a rule that says nothing of what it selects", example)
     for key, useful in (("name", Crossing.IN), ("rate", Crossing.OUT), ("size", Crossing.OUT)):
-        if key in said and crossing not in (Crossing.BOTH, useful):
+        if key in values and rule.crossing not in (Crossing.BOTH, useful):
             what = "comes in" if useful is Crossing.IN else "goes out"
             remedy = f"leave {key} out, or write crossing = {useful.value!r}"
             raise BadValue(f"{key} is about what {what}, and nothing does", remedy, at=(key,))
-    names = values.get("names", ("/**",))
-    one_name = len(names) == 1 and not {"*", "?"} & set(names[0])
-    if "name" in values and "{name}" not in values["name"] and not one_name:
-        raise BadValue(
-            "all that the rule selects would get one name", 'put {name} into it, as "/{site}{name}"', at=("name",)
-        )
-    return CrossingRule(**values)
+    one_name = len(rule.names) == 1 and not {"*", "?"} & set(rule.names[0])
+    if "{name}" not in rule.name and not one_name:
+        remedy = 'put {name} into it, as "/{site}{name}"'
+        raise BadValue("all that the rule selects would get one name", remedy, at=("name",))
+    return rule
 
 
-GATEWAY_RULES: Final = tables_of(
-    _CROSSING_KEYS, _read_crossing, limits.GATEWAY_RULES_MAX, "one may have several globs"
+GATEWAY_RULES: Final = rules_of(
+    keys_of(CrossingRule),
+    _make_crossing,
+    most=limits.GATEWAY_RULES_MAX,
+    instead="one may have several globs",
 )
-
-# --- settings -------------------------------------------------------------------------------------------------------
-
-
-_UPLINK: Final = ValueType(
-    lambda raw: None if raw is None else read_bytes_a_second(raw), BYTES_A_SECOND.json_schema, "RATE"
-)
-"""Bytes a second, or ``None`` as the default has it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ros2Settings:
     """The table ``[gateway.ros2]``."""
 
-    enabled: bool = setting(
-        False,
-        BOOL,
-        "Join a ROS 2 graph whose nodes run rmw_zenoh.",
-        env="RMPA_ROS2",
-        option="--ros2/--no-ros2",
-        command=_COMMAND,
-    )
-    domain: int = setting(
-        0, DOMAIN, "ROS_DOMAIN_ID there.", env="RMPA_ROS2_DOMAIN", option="--ros2-domain", command=_COMMAND
-    )
+    enabled: bool = setting(False, BOOL, "Join a ROS 2 graph whose nodes run rmw_zenoh.", option="--ros2/--no-ros2")
+    domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there.", option="--ros2-domain")
     distribution: str = setting(
         "jazzy",
-        _DISTRIBUTION,
+        word_of(
+            ("humble", "iron", "jazzy", "kilted", "lyrical"),
+            "a distribution of ROS 2 that rmw_zenoh is made for",
+            "there are humble, iron, jazzy, kilted and lyrical",
+            "NAME",
+        ),
         "The distribution whose message definitions its nodes have.",
-        env="RMPA_ROS2_DISTRIBUTION",
         option="--ros2-distribution",
-        command=_COMMAND,
     )
     mapping: tuple[str, ...] = setting(
-        (),
-        list_of(TEXT),
-        "Files of rules of ros1_bridge (YAML), for types that differ.",
-        env="RMPA_ROS2_MAPPING",
-        option="--ros2-mapping",
-        command=_COMMAND,
+        (), list_of(TEXT), "Files of rules of ros1_bridge (YAML), for types that differ.", option="--ros2-mapping"
     )
 
 
@@ -498,64 +400,42 @@ class GatewaySettings:
 
     site: str = setting(
         "",
-        _SITE,
+        ValueType(_read_site, {"type": "string", "pattern": "^([A-Za-z][A-Za-z0-9_]*)?$"}, "NAME"),
         "This site's name, a ROS base name; empty: no other sites are joined.",
         env="RMPA_SITE",
         option="--site",
-        command=_COMMAND,
         shown_default="none",
     )
     rank: int = setting(
         100,
-        _RANK,
+        whole_number(0, limits.GATEWAY_RANK_MAX, "a rank"),
         "Of several gateways of one site the one with the lowest rank leads.",
-        env="RMPA_GATEWAY_RANK",
         option="--rank",
-        command=_COMMAND,
     )
     connect: tuple[str, ...] = setting(
-        (),
-        list_of(ENDPOINT),
-        "Zenoh endpoints to connect to, such as tls/fleet.example:7447.",
-        env="RMPA_GATEWAY_CONNECT",
-        option="--connect",
-        command=_COMMAND,
+        (), list_of(ENDPOINT), "Zenoh endpoints to connect to, such as tls/fleet.example:7447.", option="--connect"
     )
     listen: tuple[str, ...] = setting(
-        (),
-        list_of(ENDPOINT),
-        "Zenoh endpoints to listen at, such as tls/0.0.0.0:7447.",
-        env="RMPA_GATEWAY_LISTEN",
-        option="--listen",
-        command=_COMMAND,
+        (), list_of(ENDPOINT), "Zenoh endpoints to listen at, such as tls/0.0.0.0:7447.", option="--listen"
     )
     router: bool = setting(
-        False,
-        BOOL,
-        "Be a Zenoh router, which the gateways of other sites connect to.",
-        env="RMPA_GATEWAY_ROUTER",
-        option="--router/--no-router",
-        command=_COMMAND,
+        False, BOOL, "Be a Zenoh router, which the gateways of other sites connect to.", option="--router/--no-router"
     )
     insecure: bool = setting(
         False,
         BOOL,
         "Connect without certificates; else the module must have joined a secured mesh.",
-        env="RMPA_GATEWAY_INSECURE",
         option="--insecure/--no-insecure",
-        command=_COMMAND,
     )
     uplink: int | None = setting(
         None,
-        _UPLINK,
+        BYTES_A_SECOND,
         "What the line to the other sites carries, bytes a second: a command then does not wait behind seconds of "
         "images in the kernel's buffer.",
-        env="RMPA_GATEWAY_UPLINK",
         option="--uplink",
-        command=_COMMAND,
         shown_default="unlimited",
     )
-    ros2: Ros2Settings = table(Ros2Settings, "gateway.ros2")
+    ros2: Ros2Settings = table(Ros2Settings, "gateway.ros2", "ROS2", command="gateway")
     rules: tuple[CrossingRule, ...] = setting(
         (),
         GATEWAY_RULES,

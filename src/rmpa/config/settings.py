@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config import limits
 from rmpa.config.peer_rules import (
     MODULE_GROUPS,
-    PEER,
     PEER_RULES,
     PERMISSION_DEFAULT,
     PERMISSION_RULES,
@@ -24,7 +23,7 @@ from rmpa.config.peer_rules import (
     ServiceRule,
 )
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, CrossingRule, FollowRule, GatewaySettings, Ros2Settings
-from rmpa.config.schema import TIMEOUT, setting, settings_of, table
+from rmpa.config.schema import setting, settings_of, table
 from rmpa.config.values import (
     BOOL,
     BOUND,
@@ -45,11 +44,13 @@ from rmpa.config.values import (
     NODE_GLOB,
     PACKET_PRIORITY,
     PARAM_GLOB,
+    PEER,
     PEER_GLOB,
     PORT,
     PORT_OR_ANY,
     SERVICE_GLOB,
     TEXT,
+    TIMEOUT,
     TRANSPORT,
     HostPort,
     Multicast,
@@ -96,24 +97,18 @@ class ServiceSettings:
     Of ``rules`` the first that fits a service and says a time-out gives its time-out; its transport likewise.
     """
 
-    allow: tuple[str, ...] = setting(
-        ("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.", env="RMPA_SERVICE_ALLOW"
-    )
-    deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that stay home.", env="RMPA_SERVICE_DENY")
-    loggers: bool = setting(
-        False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.", env="RMPA_SERVICE_LOGGERS"
-    )
+    allow: tuple[str, ...] = setting(("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.")
+    deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that stay home.")
+    loggers: bool = setting(False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.")
     timeout: float = setting(
         limits.SERVICE_TIMEOUT,
         TIMEOUT,
         "How long a call may take, in seconds or as a text such as 500 ms; then the caller gets an error.",
-        env="RMPA_SERVICE_TIMEOUT",
     )
     transport: Transport = setting(
         DEFAULT_TRANSPORT,
         TRANSPORT,
         "The path of calls, unless a [[service]] says another; the words are those of bridge.transport.",
-        env="RMPA_SERVICE_TRANSPORT",
     )
     rules: tuple[ServiceRule, ...] = setting(
         (),
@@ -128,7 +123,7 @@ class NodeSettings:
     """Rights of peers over this module's nodes."""
 
     kill: tuple[str, ...] = setting(
-        ("/**",), list_of(NODE_GLOB), "Nodes that peers may end (rosnode kill, rmpa node kill).", env="RMPA_NODE_KILL"
+        ("/**",), list_of(NODE_GLOB), "Nodes that peers may end (rosnode kill, rmpa node kill)."
     )
 
 
@@ -136,12 +131,8 @@ class NodeSettings:
 class ParamSettings:
     """Rights of peers over this module's parameters; the peers' parameters that it follows (none within another)."""
 
-    remote_get: tuple[str, ...] = setting(
-        ("/**",), list_of(PARAM_GLOB), "Parameters that peers may read and follow.", env="RMPA_REMOTE_GET"
-    )
-    remote_set: tuple[str, ...] = setting(
-        ("/**",), list_of(PARAM_GLOB), "Parameters that peers may set and delete.", env="RMPA_REMOTE_SET"
-    )
+    remote_get: tuple[str, ...] = setting(("/**",), list_of(PARAM_GLOB), "Parameters that peers may read and follow.")
+    remote_set: tuple[str, ...] = setting(("/**",), list_of(PARAM_GLOB), "Parameters that peers may set and delete.")
     follow: tuple[FollowRule, ...] = setting(
         (), PARAM_RULES, "Parameters of peers that this module follows.", key="param"
     )
@@ -151,36 +142,23 @@ class ParamSettings:
 class TimeSettings:
     """Simulated time (``/use_sim_time`` and ``/clock``) across modules."""
 
-    follow: str = setting(
-        "", NAME_OR_EMPTY, "The peer whose simulated time holds here; empty for none.", env="RMPA_TIME_FOLLOW"
-    )
-    share: bool = setting(False, BOOL, "Whether peers may follow this module's time.", env="RMPA_TIME_SHARE")
+    follow: str = setting("", NAME_OR_EMPTY, "The peer whose simulated time holds here; empty for none.")
+    share: bool = setting(False, BOOL, "Whether peers may follow this module's time.")
 
 
 @dataclass(frozen=True, slots=True)
 class LimitSettings:
     """Bounds of what is accepted from one peer and offered to peers; the rest stays hidden and is reported."""
 
-    nodes: int = setting(
-        limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that stand in the local graph.", env="RMPA_LIMIT_NODES"
-    )
+    nodes: int = setting(limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that stand in the local graph.")
     topics: int = setting(
-        limits.TOPICS_PER_PEER_MAX,
-        BOUND,
-        "Pairs of topic and node of one peer, and those that this module offers.",
-        env="RMPA_LIMIT_TOPICS",
+        limits.TOPICS_PER_PEER_MAX, BOUND, "Pairs of topic and node of one peer, and those that this module offers."
     )
     services: int = setting(
-        limits.SERVICES_PER_PEER_MAX,
-        BOUND,
-        "Services of one peer, and those that this module offers.",
-        env="RMPA_LIMIT_SERVICES",
+        limits.SERVICES_PER_PEER_MAX, BOUND, "Services of one peer, and those that this module offers."
     )
     params: int = setting(
-        limits.FOLLOWED_MAX,
-        BOUND,
-        "Parameters that this module follows, and that one peer may follow here.",
-        env="RMPA_LIMIT_PARAMS",
+        limits.FOLLOWED_MAX, BOUND, "Parameters that this module follows, and that one peer may follow here."
     )
 
 
@@ -189,41 +167,24 @@ class LaneSettings:
     """The marks of each lane's packets: DSCP (RFC 2474) for the network, SO_PRIORITY for this machine."""
 
     express_dscp: int = setting(
-        48,
-        DSCP,
-        "DSCP of the express lane. 48 is CS6: Wi-Fi's voice queue, where EF would be video.",
-        env="RMPA_EXPRESS_DSCP",
+        48, DSCP, "DSCP of the express lane. 48 is CS6: Wi-Fi's voice queue, where EF would be video."
     )
     express_priority: int = setting(
-        6,
-        PACKET_PRIORITY,
-        "SO_PRIORITY of the express lane; 6 is the first band of pfifo_fast.",
-        env="RMPA_EXPRESS_PRIORITY",
+        6, PACKET_PRIORITY, "SO_PRIORITY of the express lane; 6 is the first band of pfifo_fast."
     )
-    bulk_dscp: int = setting(0, DSCP, "DSCP of the bulk lane.", env="RMPA_BULK_DSCP")
-    bulk_priority: int = setting(0, PACKET_PRIORITY, "SO_PRIORITY of the bulk lane.", env="RMPA_BULK_PRIORITY")
+    bulk_dscp: int = setting(0, DSCP, "DSCP of the bulk lane.")
+    bulk_priority: int = setting(0, PACKET_PRIORITY, "SO_PRIORITY of the bulk lane.")
 
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
     """Requests to the kernel for real-time behaviour; refusals are logged."""
 
-    enabled: bool = setting(
-        False,
-        BOOL,
-        "Ask for SCHED_FIFO and locked memory.",
-        env="RMPA_REALTIME",
-        option="--realtime/--no-realtime",
-    )
+    enabled: bool = setting(False, BOOL, "Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
     priority: int = setting(
-        50,
-        FIFO_PRIORITY,
-        "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
-        env="RMPA_REALTIME_PRIORITY",
+        50, FIFO_PRIORITY, "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first."
     )
-    lock_memory: bool = setting(
-        True, BOOL, "Keep the agent's memory in RAM (mlockall).", env="RMPA_REALTIME_LOCK_MEMORY"
-    )
+    lock_memory: bool = setting(True, BOOL, "Keep the agent's memory in RAM (mlockall).")
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,76 +192,44 @@ class WebSettings:
     """Where ``rmpa web`` serves, and whether the agent starts it."""
 
     enabled: bool = setting(
-        False,
-        BOOL,
-        "Start rmpa web with the agent, and again whenever it ends.",
-        env="RMPA_WEB",
-        option="--web/--no-web",
+        False, BOOL, "Start rmpa web with the agent, and again whenever it ends.", option="--web/--no-web"
     )
-    port: int = setting(8480, PORT, "The port of rmpa web.", env="RMPA_WEB_PORT")
+    port: int = setting(8480, PORT, "The port of rmpa web.")
     listen: str = setting(
-        "127.0.0.1",
-        HOST,
-        "The address that rmpa web listens at; beyond this machine clients need a token.",
-        env="RMPA_WEB_LISTEN",
+        "127.0.0.1", HOST, "The address that rmpa web listens at; beyond this machine clients need a token."
     )
     token_file: str = setting(
         "",
         TEXT,
         "The file of the token, made if it is not there; with it clients on this machine need the token too.",
-        env="RMPA_WEB_TOKEN_FILE",
         shown_default="in the state directory",
     )
     hosts: tuple[str, ...] = setting(
-        (),
-        list_of(HOST),
-        "Names of this server in URLs, besides its addresses, localhost and the host's name.",
-        env="RMPA_WEB_HOSTS",
+        (), list_of(HOST), "Names of this server in URLs, besides its addresses, localhost and the host's name."
     )
     ports: tuple[int, ...] = setting(
-        (),
-        list_of(PORT),
-        "Further ports, for clients that expect 9090 (rosbridge) or 8765 (Foxglove).",
-        env="RMPA_WEB_PORTS",
+        (), list_of(PORT), "Further ports, for clients that expect 9090 (rosbridge) or 8765 (Foxglove)."
     )
     origins: tuple[str, ...] = setting(
-        (),
-        list_of(TEXT),
-        "Pages of other sites that may connect, such as https://app.foxglove.dev.",
-        env="RMPA_WEB_ORIGINS",
-        live=True,
+        (), list_of(TEXT), "Pages of other sites that may connect, such as https://app.foxglove.dev.", live=True
     )
     control: bool = setting(
         False,
         BOOL,
         "Let clients publish, call and offer services, and set parameters; they then need the token.",
-        env="RMPA_WEB_CONTROL",
         live=True,
     )
     cert: str = setting(
-        "",
-        TEXT,
-        "Serve HTTPS with this certificate: a PEM file, the intermediate certificates behind it.",
-        env="RMPA_WEB_CERT",
+        "", TEXT, "Serve HTTPS with this certificate: a PEM file, the intermediate certificates behind it."
     )
-    key: str = setting(
-        "",
-        TEXT,
-        "The certificate's private key: a PEM file; empty: it is in the certificate's file.",
-        env="RMPA_WEB_KEY",
-    )
+    key: str = setting("", TEXT, "The certificate's private key: a PEM file; empty: it is in the certificate's file.")
     drive: bool = setting(
-        False,
-        BOOL,
-        "Let the monitor's joystick command a robot; clients then need the token.",
-        env="RMPA_WEB_DRIVE",
-        live=True,
+        False, BOOL, "Let the monitor's joystick command a robot; clients then need the token.", live=True
     )
     command_age_ms: int = setting(
         0,
         COMMAND_AGE,
         "Drop what rosbridge and Foxglove clients publish, call and set if it may be older than this; 0: take all.",
-        env="RMPA_WEB_COMMAND_AGE_MS",
         live=True,
     )
 
@@ -313,7 +242,6 @@ class TrustSettings:
         "deny",
         PERMISSION_DEFAULT,
         "What holds where no [[permission]] fits: deny; or allow, and every member of the mesh may do everything.",
-        env="RMPA_TRUST_DEFAULT",
         live=True,
     )
     groups: tuple[ModuleGroup, ...] = setting(
@@ -327,24 +255,19 @@ class TrustSettings:
         (),
         list_of(PEER_GLOB),
         "Modules that may pass on what others offer; the origin that they name cannot be proved.",
-        env="RMPA_TRUST_RELAYS",
         live=True,
     )
     direct: bool = setting(
         False,
         BOOL,
         "Let nodes connect directly to those of other machines although nothing protects these connections.",
-        env="RMPA_TRUST_DIRECT",
         live=True,
     )
-    require: bool = setting(
-        False, BOOL, "Refuse to start while this module has not joined a secured mesh.", env="RMPA_TRUST_REQUIRE"
-    )
+    require: bool = setting(False, BOOL, "Refuse to start while this module has not joined a secured mesh.")
     insecure: bool = setting(
         False,
         BOOL,
         "Start without trust beside keys of other modules; a module with keys of its own is secured all the same.",
-        env="RMPA_TRUST_INSECURE",
         option="--insecure",
     )
     rules: tuple[PermissionRule, ...] = setting(
@@ -367,13 +290,10 @@ class Settings:
         "",
         NAME,
         "The module's name among its peers, a ROS base name.",
-        env="RMPA_NAME",
         option="--name",
         shown_default="the name of the first start, else from the host's name",
     )
-    domain: int = setting(
-        0, DOMAIN, "Only agents of one domain join, 0 to 232.", env="RMPA_DOMAIN", option="--domain"
-    )
+    domain: int = setting(0, DOMAIN, "Only agents of one domain join, 0 to 232.", option="--domain")
     core_mode: str = setting(
         "embedded",
         CORE_MODE,
@@ -404,21 +324,15 @@ class Settings:
         HOST,
         "The address that the ROS core listens at; 127.0.0.1 is this machine only.",
         key="core.host",
-        env="RMPA_CORE_HOST",
         option="--core-host",
     )
-    core_port: int = setting(
-        11311, PORT, "The ROS core's port.", key="core.port", env="RMPA_CORE_PORT", option="--core-port"
-    )
-    port: int = setting(
-        0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any.", key="mesh.port", env="RMPA_PORT", option="--port"
-    )
+    core_port: int = setting(11311, PORT, "The ROS core's port.", key="core.port", option="--core-port")
+    port: int = setting(0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any.", key="mesh.port", option="--port")
     interfaces: tuple[str, ...] = setting(
         (),
         list_of(INTERFACE),
         "Use only these network interfaces.",
         key="discovery.interfaces",
-        env="RMPA_INTERFACES",
         option="--interface",
         shown_default="every usable one",
     )
@@ -427,7 +341,6 @@ class Settings:
         list_of(HOST_PORT),
         "Agents to greet by unicast, where multicast does not reach; without a port: the domain's discovery port.",
         key="discovery.seeds",
-        env="RMPA_SEEDS",
         option="--seed",
     )
     multicast: Multicast = setting(
@@ -435,7 +348,6 @@ class Settings:
         MULTICAST,
         "Where beacons go, the domain is added to the port; off (false in the file) for none.",
         key="discovery.multicast",
-        env="RMPA_MULTICAST",
         option="--multicast",
     )
     policy: PolicySettings = table(PolicySettings, "bridge", live=True)
@@ -445,7 +357,6 @@ class Settings:
         "The path of topics' messages, unless a [[contract]] says another. relay: through the agents; "
         "auto: from node to node where it can be; direct: likewise, with a warning where it cannot.",
         key="bridge.transport",
-        env="RMPA_TRANSPORT",
         live=True,
     )
     prefix_peers: bool = setting(
@@ -453,7 +364,6 @@ class Settings:
         BOOL,
         "Whether every peer's names are below its own here (/arm/odom of arm): for modules that have the same names.",
         key="bridge.prefix_peers",
-        env="RMPA_PREFIX_PEERS",
         option="--prefix-peers",
         live=True,
     )
@@ -467,57 +377,35 @@ class Settings:
         key="contract",
         live=True,
     )
-    services: ServiceSettings = table(ServiceSettings, "services", live=True)
-    nodes: NodeSettings = table(NodeSettings, "nodes", live=True)
+    services: ServiceSettings = table(ServiceSettings, "services", "SERVICE", live=True)
+    nodes: NodeSettings = table(NodeSettings, "nodes", "NODE", live=True)
     params: ParamSettings = table(ParamSettings, "params", live=True)
-    time: TimeSettings = table(TimeSettings, "time", live=True)
-    limits: LimitSettings = table(LimitSettings, "limits", live=True)
+    time: TimeSettings = table(TimeSettings, "time", "TIME", live=True)
+    limits: LimitSettings = table(LimitSettings, "limits", "LIMIT", live=True)
     lanes: LaneSettings = table(LaneSettings, "lanes")
-    realtime: RealtimeSettings = table(RealtimeSettings, "realtime")
-    web: WebSettings = table(WebSettings, "web")
-    trust: TrustSettings = table(TrustSettings, "trust")
-    gateway: GatewaySettings = table(GatewaySettings, "gateway")
+    realtime: RealtimeSettings = table(RealtimeSettings, "realtime", "REALTIME")
+    web: WebSettings = table(WebSettings, "web", "WEB")
+    trust: TrustSettings = table(TrustSettings, "trust", "TRUST")
+    gateway: GatewaySettings = table(GatewaySettings, "gateway", "GATEWAY", command="gateway")
     relay: bool = setting(
-        False,
-        BOOL,
-        "Offer what comes from one peer to others that do not reach it themselves.",
-        key="relay.enabled",
-        env="RMPA_RELAY",
+        False, BOOL, "Offer what comes from one peer to others that do not reach it themselves.", key="relay.enabled"
     )
     control_group: str = setting(
         "",
         TEXT,
         "A group (its name or number) whose users may use the control socket, besides this user and root.",
         key="control.group",
-        env="RMPA_CONTROL_GROUP",
         shown_default="none",
     )
     log_level: str = setting(
-        "info",
-        LOG_LEVEL,
-        "debug, info, warning or error.",
-        key="log.level",
-        env="RMPA_LOG_LEVEL",
-        option="--log-level",
-        live=True,
+        "info", LOG_LEVEL, "debug, info, warning or error.", key="log.level", option="--log-level", live=True
     )
-    log_json: bool = setting(
-        False, BOOL, "Log one JSON object a line.", key="log.json", env="RMPA_LOG_JSON", option="--log-json"
-    )
+    log_json: bool = setting(False, BOOL, "Log one JSON object a line.", key="log.json", option="--log-json")
     runtime_dir: str = setting(
-        "",
-        TEXT,
-        "The directory of the control sockets.",
-        key="",
-        env="RMPA_RUNTIME_DIR",
-        shown_default="this user's runtime directory",
+        "", TEXT, "The directory of the control sockets.", key="", shown_default="this user's runtime directory"
     )
     state_dir: str = setting(
-        "",
-        TEXT,
-        "The directory of what is kept over a restart.",
-        env="RMPA_STATE_DIR",
-        shown_default="this user's state directory",
+        "", TEXT, "The directory of what is kept over a restart.", shown_default="this user's state directory"
     )
     config_file: Path | None = None
 

@@ -10,7 +10,7 @@ import fcntl
 import os
 import socket
 import stat
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 from urllib.parse import urlsplit
@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from rmpa.bridge.messages import with_text
-from rmpa.config.module_name import NameFacts, running_agent
+from rmpa.config.module_name import NameSource, running_agent
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.core.limits import KIB
 from rmpa.observe import limits
@@ -304,13 +304,13 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
         places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
         raise UnreachableError("agent", places, _START_ONE)
     if not wanted:
-        facts = NameFacts()
+        names: Mapping[NameSource, str] = {}
         if len(agents) > 1:
             from rmpa.config.read import load_settings  # noqa: PLC0415 - most commands need no settings
 
             with contextlib.suppress(ConfigError):  # a broken rmpa.toml is no reason not to ask
-                facts = load_settings({}, environ, host_name=socket.gethostname()).name_facts
-        wanted = running_agent(with_running(facts, agents, environ))
+                names = load_settings({}, environ, host_name=socket.gethostname()).names
+        wanted = running_agent(names, *running_agents(agents, environ))
     for agent in agents:
         if agent.name == wanted:
             return agent
@@ -319,15 +319,19 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
     raise UnreachableError(f"agent {wanted!r}", str(path), remedy)
 
 
-def with_running(facts: NameFacts, agents: Sequence[FoundAgent], environ: Mapping[str, str]) -> NameFacts:
-    """What the choice of a module depends on, with the agents that run; several are asked which of them they are."""
+def running_agents(
+    agents: Sequence[FoundAgent], environ: Mapping[str, str]
+) -> tuple[Sequence[str], Sequence[str], str]:
+    """The agents that run, those that are gateways, and that of ROS_MASTER_URI, for ``config.module_name``.
+
+    Several are asked which of them they are.
+    """
     gateways: tuple[str, ...] = ()
     of_master = ""
     if len(agents) > 1:
         gateways = tuple(agent.name for agent in agents if _is_gateway(agent))
         of_master = _of_master(agents, environ.get("ROS_MASTER_URI", ""))
-    names = tuple(agent.name for agent in agents)
-    return replace(facts, running=names, gateways=gateways, of_master=of_master)
+    return tuple(agent.name for agent in agents), gateways, of_master
 
 
 def _of_master(agents: Sequence[FoundAgent], uri: str) -> str:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect, PermissionRule
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect, PermissionRule
+from rmpa.config.values import PEER
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import matches
 from rmpa.core.limits import UINT32_MAX

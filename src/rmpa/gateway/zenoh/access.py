@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.trust import trust_store
-from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, PEER, Access, Effect
+from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access, Effect
+from rmpa.config.values import PEER
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.core.identity import matches
 from rmpa.gateway.zenoh.config import MeshCertificates, gateway_config, zenohd_entries

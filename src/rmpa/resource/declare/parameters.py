@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config.read import LISTS
-from rmpa.config.rules import CONTRACT_RULES
+from rmpa.config.rules import CONTRACT_RULES, TERMS
 from rmpa.config.values import BadValue, did_you_mean
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
@@ -429,11 +428,10 @@ def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
     Raises:
         ConfigError: A key is unknown or a value is invalid; ``where`` begins the error's text.
     """
-    known = [key for key in LISTS["contract",] if key not in ("topics", "types")]
     for term in terms:
-        if term not in known:
-            near = did_you_mean(term, known)
-            remedy = f"did you mean {near}?" if near else f"known here: {', '.join(known)}"
+        if term not in TERMS:
+            near = did_you_mean(term, TERMS)
+            remedy = f"did you mean {near}?" if near else f"known here: {', '.join(TERMS)}"
             raise ConfigError(where, f"a contract has no {term!r}", remedy)
     if not terms:
         return Contract()
