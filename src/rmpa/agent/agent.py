@@ -202,7 +202,7 @@ class Agent:
             permissions=Permissions(settings.trust) if membership is not None else None,
         )
         self.params, self.services = Params(self.bridge), Services(self.bridge)
-        nodes = Nodes(self.bridge, self.services)
+        nodes = Nodes(self.bridge, self.bridge.topics, self.services)
         twins = TwinWatch(self.bridge)
         for part in (self.params, self.services, nodes, twins):
             self.bridge.add(part)
