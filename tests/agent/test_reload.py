@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.agent import process as reload
-from rmpa.agent.process import Reloader, SighupHandler
+from rmpa.agent.process import Reloader
 from rmpa.config.peer_rules import ModuleGroup, PermissionRule
 from rmpa.config.read import Loaded, load_settings
 from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings, TrustSettings
@@ -115,24 +115,23 @@ async def test_sighup_reloads_and_notifies_the_service_manager(monkeypatch: pyte
     monkeypatch.setattr(reload, "notify_service_manager", told.append)
     monkeypatch.setattr(reload, "_has_terminal", lambda: False)
     applied: list[Settings] = []
-    sighup = SighupHandler(reloader(lambda: Loaded(NEW), applied), lambda: pytest.fail("it must go on"))
-    sighup.start()
+    made = reloader(lambda: Loaded(NEW), applied)
+    following = asyncio.create_task(made.follow_signal(lambda: pytest.fail("it must go on")))
+    await asyncio.sleep(0)
     os.kill(os.getpid(), signal.SIGHUP)
     async with asyncio.timeout(20):
         while "READY=1" not in told:
             await asyncio.sleep(0.005)
     assert applied
     assert told[0].startswith("RELOADING=1\nMONOTONIC_USEC=")
-    await sighup.close()
+    following.cancel()
+    await asyncio.wait([following])
 
 
 async def test_an_ignored_sighup_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        sighup = SighupHandler(reloader(lambda: pytest.fail("nobody asked"), []), lambda: None)
-        sighup.start()
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-        await sighup.close()
+        await reloader(lambda: pytest.fail("no reload was asked for"), []).follow_signal(lambda: None)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

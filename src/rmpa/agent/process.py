@@ -122,52 +122,34 @@ class Reloader:
         for key in reply.restart:
             _log.warning("! %s only holds after a restart", key)
 
+    async def follow_signal(self, stop: Callable[[], object]) -> None:
+        """Read the settings again at each SIGHUP, until cancelled; nothing if the signal is ignored (``nohup``).
 
-class SighupHandler:
-    """Reads the settings again at SIGHUP; ends the agent if its terminal was closed, as that ends any program.
-
-    Args:
-        reloader: Reads them.
-        stop: Ends the agent.
-    """
-
-    def __init__(self, reloader: Reloader, stop: Callable[[], object]) -> None:
-        self._reloader = reloader
-        self._stop = stop
-        self._had_terminal = _has_terminal()
-        self._running: set[asyncio.Task[None]] = set()
-
-    def start(self) -> None:
-        """Handle the signal from now on, unless it is ignored (``nohup``)."""
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_signal)
-
-    async def close(self) -> None:
-        """Stop handling the signal."""
-        asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
-        for task in self._running:
-            task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
-
-    def _on_signal(self) -> None:
-        if self._had_terminal and not _has_terminal():
-            _log.info("= the terminal is gone")
-            self._stop()
+        Args:
+            stop: Called if the terminal was closed, which sends the signal to end its programs.
+        """
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
             return
-        task = asyncio.create_task(self._reload(), name="read the settings again")
-        self._running.add(task)
-        task.add_done_callback(self._running.discard)
-
-    async def _reload(self) -> None:
-        notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        had_terminal, came, loop = _has_terminal(), asyncio.Event(), asyncio.get_running_loop()
+        loop.add_signal_handler(signal.SIGHUP, came.set)
         try:
-            await self._reloader.reload()
-        except ConfigError as error:
-            _log.error("! the settings stay as they are: %s", error)
-        except Exception:  # noqa: BLE001 - the task's top
-            _log.exception("! the settings could not be read again")
+            while await came.wait():
+                came.clear()
+                if had_terminal and not _has_terminal():
+                    _log.info("= the terminal is gone")
+                    stop()
+                    return
+                notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+                try:
+                    await self.reload()
+                except ConfigError as error:
+                    _log.error("! the settings stay as they are: %s", error)
+                except Exception:  # noqa: BLE001 - a fault of one reload must not stop the next one
+                    _log.exception("! the settings could not be read again")
+                finally:
+                    notify_service_manager("READY=1")
         finally:
-            notify_service_manager("READY=1")
+            loop.remove_signal_handler(signal.SIGHUP)
 
 
 def _has_terminal() -> bool:
@@ -354,24 +336,23 @@ async def serve(
     loop.set_default_executor(realtime.worker_pool())
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    sighup = SighupHandler(reloader, stop.set)
     await start()
-    sighup.start()
-    watching = asyncio.create_task(watch(), name="watch") if watch is not None else None
-    if watching is not None:
-        watching.add_done_callback(lambda _: stop.set())
+    tasks = [asyncio.create_task(reloader.follow_signal(stop.set), name="read the settings again")]
+    if watch is not None:
+        tasks.append(asyncio.create_task(watch(), name="watch"))
+        tasks[1].add_done_callback(lambda _: stop.set())
     try:
+        await asyncio.sleep(0)  # the signal is handled from here on, before readiness is told
         notify_service_manager("READY=1")
         await stop.wait()
         notify_service_manager("STOPPING=1")
         _log.info("= ending")
-        if watching is not None and watching.done():
-            watching.result()
+        if watch is not None and tasks[1].done():
+            tasks[1].result()
     finally:
-        if watching is not None:
-            watching.cancel()
-            await asyncio.wait([watching])
-        await sighup.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
         await close()
 
 
