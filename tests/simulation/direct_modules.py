@@ -13,11 +13,13 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rmpa.bridge.direct.nodes import Condition, Grant, Unmet
+from rmpa.bridge.direct import grants
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet
+from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer
-from rmpa.bridge.topics.direct import DirectImporter
-from rmpa.bridge.topics.local import DirectExporter
+from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import UnreachableError
@@ -147,7 +149,8 @@ class Listener:
     leaves: bool
     """Whether it hangs up on publishers that the master does not name, as roscpp does."""
     paths: dict[Source, list[str | int]] = field(default_factory=dict)
-    asking: set[Source] = field(default_factory=set)
+    asking: set[tuple[Source, int]] = field(default_factory=set)
+    """Sources whose proxy is asked, each with the proxy's number: a new proxy is asked anew."""
 
 
 class Proxies:
@@ -173,6 +176,19 @@ def sessions(of: dict[int, Any]) -> Any:
     return SimpleNamespace(get=of.get, linked=lambda: [one for one in of.values() if one.linked])
 
 
+class Rules:
+    """The double of the rules of a module, whose owner changes whether it allows direct transport."""
+
+    gate = OPEN_GATE
+
+    def __init__(self, owner: PublisherModule | SubscriberModule) -> None:
+        self._owner = owner
+
+    @property
+    def contracts(self) -> Contracts:
+        return Contracts((), Transport.AUTO if self._owner.allowed else Transport.RELAY)
+
+
 class PublisherModule:
     """The module of the talkers: what it grants, its local subscribers and its rules."""
 
@@ -196,29 +212,20 @@ class PublisherModule:
             subscribers=lambda _: dict.fromkeys(self.local, "http://local/"),
             suspect=lambda _: None,
             call=lambda *_: None,
+            state=lambda: SimpleNamespace(services={}),
         )
         exports = SimpleNamespace(
             offered=self.offered, local=lambda _, source: source if source in self.offered else None
         )
-        self.exporter = DirectExporter(
-            cast("Any", core),
-            cast("Any", exports),
-            self.contracts,
-            cast("Any", SimpleNamespace(of_topic=self._port, forget=lambda _: None)),
-            sessions(self.peers),
-            cast("Any", self.rpc),
-            Counters(),
+        shared = SimpleNamespace(
+            core=core, sessions=sessions(self.peers), rpc=self.rpc, counters=Counters(), context=Rules(self)
         )
+        self.exporter = TopicGrants(cast("Any", shared), cast("Any", exports))
+        self.exporter.ports = cast("Any", SimpleNamespace(find=self._port, forget=lambda _: None))
 
-    @property
-    def contracts(self) -> Contracts:
-        return Contracts((), Transport.AUTO if self.allowed else Transport.RELAY)
-
-    async def _port(self, _session: object, node: str, _uri: str, topic: str) -> Grant | Unmet:
+    async def _port(self, node: str, _uri: str, topic: str) -> int | Unmet:
         talker = self.talkers[Source(topic, node)]
-        found: Grant | Unmet = Grant(talker.port, node)
-        if not talker.network:
-            found = Unmet(Condition.LISTENING, "loopback")
+        found: int | Unmet = talker.port if talker.network else Unmet(Condition.LISTENING, "loopback")
         await self.world.pause(0.02)
         return found
 
@@ -270,20 +277,12 @@ class SubscriberModule:
             suspect=lambda _: None,
             node_host="127.0.0.1",
         )
-        self.importer = DirectImporter(
-            cast("Any", core),
-            cast("Any", _Imports(imports)),
-            cast("Any", _Topics(self)),
-            self.contracts,
-            sessions(self.peers),
-            cast("Any", self.rpc),
-            on_warning=lambda *_: None,
-            counters=Counters(),
+        shared = SimpleNamespace(
+            core=core, sessions=sessions(self.peers), rpc=self.rpc, counters=Counters(), context=Rules(self)
         )
-
-    @property
-    def contracts(self) -> Contracts:
-        return Contracts((), Transport.AUTO if self.allowed else Transport.RELAY)
+        self.importer = TopicPaths(
+            cast("Any", shared), lambda *_: None, cast("Any", _Imports(imports)), cast("Any", _Topics(self))
+        )
 
     def _at(self, topic: str) -> list[tuple[int, Source]]:
         return [(self.here, source) for source in sorted(self.shown) if source.topic == topic]
@@ -322,7 +321,7 @@ class SubscriberModule:
 
     def reload(self) -> None:
         """Other rules."""
-        self.importer.reload(self.contracts)
+        self.importer.reload()
 
     def advertised(self, source: Source, *, shown: bool) -> None:
         """A source appears in the graph here, or leaves it."""
@@ -347,10 +346,11 @@ class SubscriberModule:
 
     def ask(self, source: Source, name: str, *, anew: bool = False) -> None:
         """The node calls ``requestTopic`` at a new proxy, or at one to which it has no connection."""
-        listener = self.listeners.get(name)
-        if listener is not None and (anew or not (self.paths(source, name) or source in listener.asking)):
-            listener.asking.add(source)
-            self.world.spawn(self._ask(source, listener, self.shown.get(source)))
+        listener, entry = self.listeners.get(name), self.shown.get(source)
+        key = source, id(entry)
+        if listener is not None and (anew or not (self.paths(source, name) or key in listener.asking)):
+            listener.asking.add(key)
+            self.world.spawn(self._ask(source, listener, entry))
 
     async def _ask(self, source: Source, listener: Listener, entry: object) -> None:
         await self.world.pause(0.005)
@@ -358,7 +358,7 @@ class SubscriberModule:
         if entry is not None and self.shown.get(source) is entry and self.listeners.get(listener.name) is listener:
             answer = self.importer.request(self.here, source, listener.name)
         reply = await answer if answer is not None else None
-        listener.asking.discard(source)
+        listener.asking.discard((source, id(entry)))
         await self.world.pause(0.005)
         if entry is None or self.shown.get(source) is not entry or self.listeners.get(listener.name) is not listener:
             return
@@ -403,8 +403,8 @@ class SubscriberModule:
         for one in (mine, theirs):
             one.linked = False
             one.link.crashed = crashed
-        self.importer.link_down(mine, crashed=crashed)
-        self.there.exporter.link_down(theirs, crashed=crashed)
+        self.importer.link_down(mine)
+        self.there.exporter.link_down(theirs)
 
     def gone(self) -> None:
         """The session of the last link ends."""
@@ -461,11 +461,14 @@ class Network:
 
     def patches(self, patch: Any) -> list[_patch[Any]]:
         """What stands in place of the driver's functions."""
-        names = ("bus_links", "direct_links", "end_links", "publisher_update", "forgotten", "standing", "standing_at")
+        names = ("bus_links", "end_links", "publisher_update", "forgotten", "standing")
         more = {"kernel_tells": lambda: True, "probe": self._probe}
         return [
-            patch.object(direct_importer, name, what)
-            for name, what in ({name: getattr(self, f"_{name}") for name in names} | more).items()
+            patch.object(grants, "grant_at", lambda _, node, port, probe: Grant(port, node, probe)),
+            *(
+                patch.object(direct_importer, name, what)
+                for name, what in ({name: getattr(self, f"_{name}") for name in names} | more).items()
+            ),
         ]
 
     def _at(self, uri: str) -> tuple[SubscriberModule, Listener | None]:
@@ -484,7 +487,7 @@ class Network:
             if isinstance(port, int)
         ]
 
-    async def _bus_links(self, uri: str) -> list[Any]:
+    async def _bus_links(self, uri: str, topic: str) -> list[Any]:
         await self._world.pause(0.01)
         module, listener = self._at(uri)
         return [
@@ -497,11 +500,8 @@ class Network:
                 local_port=self._port(one, source, port),
             )
             for one, source, port in self._rows(module)
-            if one is listener
+            if one is listener and source.topic == topic
         ]
-
-    async def _direct_links(self, uri: str, topic: str, endpoint: tuple[str, int]) -> list[Any]:
-        return [one for one in await self._bus_links(uri) if (one.topic, one.remote) == (topic, endpoint)]
 
     async def _end_links(self, endpoint: tuple[str, int], links: Any) -> str:
         await self._world.pause(0.01)
@@ -538,11 +538,8 @@ class Network:
     def _module_of(self, address: str) -> SubscriberModule:
         return next(module for module in self._modules if module.address == address)
 
-    def _standing_at(self, address: str) -> dict[int, set[int]]:
+    def _standing(self, address: str, _port: int | None = None) -> dict[int, set[int]]:
         found: dict[int, set[int]] = {}
         for listener, source, port in self._rows(self._module_of(address)):
             found.setdefault(port, set()).add(self._port(listener, source, port))
         return found
-
-    def _standing(self, endpoint: tuple[str, int]) -> set[int]:
-        return self._standing_at(endpoint[0]).get(endpoint[1], set())

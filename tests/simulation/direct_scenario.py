@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 from unittest.mock import patch
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.grants import Want
-from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.direct.conditions import Condition, Want
 from rmpa.bridge.messages import Source
 from rmpa.ros.master.parameters import RegistrationKind
 from tests.bridge.io.virtual import VirtualLoop, run
@@ -158,7 +157,7 @@ class DirectScenario:
         there = self.there
         there.allowed = allowed
         self.world.note("a", f"allows it: {allowed}")
-        there.exporter.reload(there.contracts)
+        there.exporter.judge_again()
 
     def _breaks(self, module: SubscriberModule) -> None:
         if module.listeners:

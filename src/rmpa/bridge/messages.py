@@ -24,6 +24,7 @@ from rmpa.mesh import limits as mesh_limits
 Name = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{GLOBAL_NAME}\Z")]
 """A global ROS name. The types below are checked where a message of a peer is decoded, and nowhere else."""
 PeerName = Annotated[str, Meta(max_length=core_limits.PEER_NAME_MAX, pattern=rf"\A{BASE_NAME}\Z")]
+NameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({GLOBAL_NAME})?\Z")]
 TypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{TYPE_NAME}\Z")]
 TypeNameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({TYPE_NAME})?\Z")]
 Md5 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]

@@ -161,11 +161,12 @@ class ServicesSection:
         wanted = self._bridge.context.services.transport(remote.name).value
         if not remote.shown:
             return {"wanted": wanted}
-        direct = self._services.direct_imports.answer(peer, remote.name)
-        if direct is not None:
-            return {"wanted": wanted, "transport": "direct", "address": direct.uri, "lookups": direct.lookups}
+        direct = self._services.direct_imports
+        if address := direct.address(peer, remote.name):
+            lookups = direct.lookups[remote.name]
+            return {"wanted": wanted, "transport": "direct", "address": address, "lookups": lookups}
         found = {"wanted": wanted, "transport": "relay"}
-        unmet = self._services.direct_imports.unmet(peer, remote.name)
+        unmet = direct.unmet(peer, remote.name)
         return found if unmet is None else found | {"condition": unmet.condition.value, "relayed_because": unmet.text}
 
 

@@ -14,8 +14,8 @@ import msgspec
 
 from rmpa.bridge.data.export import ReliableRouteSender
 from rmpa.bridge.data.quality import PeerClockHistory, shown_seconds
-from rmpa.bridge.direct.grants import Want
-from rmpa.bridge.direct.nodes import Condition, unmet_by_contract
+from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
+from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.bridge.topics.routes import RouteState
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
     from rmpa.bridge.data.route import ReceptionHistory
-    from rmpa.bridge.direct.paths import Interruption, Path
+    from rmpa.bridge.direct.conditions import Interruption
+    from rmpa.bridge.direct.paths import Path
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.routes import RemoteTopic
@@ -77,7 +78,7 @@ class DirectSection:
         subscribers = tuple(
             _interrupted(
                 _subscriber(path, now),
-                known.get(session.link.name, path.want) if session is not None else None,
+                known.get((session.link.name, path.want)) if session is not None else None,
                 now,
             )
             for path in topics.direct_imports.of(peer, source.topic, source.node)
@@ -117,7 +118,7 @@ class DirectSection:
         return tuple(
             _interrupted(
                 SubscriberTransport(node=want.user, transport="direct", state="granted", endpoint=str(grant.port)),
-                exports.interruptions.get(session.link.name, want) if session is not None else None,
+                exports.interruptions.get((session.link.name, want)) if session is not None else None,
                 asyncio.get_running_loop().time(),
             )
             for want, grant in wants
@@ -161,10 +162,10 @@ def _subscriber(path: Path, now: float) -> SubscriberTransport:
     unmet = path.unmet
     return SubscriberTransport(
         node=path.want.user,
-        transport="direct" if endpoint is not None else "relay" if path.answered else "",
+        transport="direct" if endpoint is not None else "relay" if path.place == AGENTS else "",
         state=path.state,
-        since_ago=now - (path.answered_at if endpoint is not None else path.since),
-        wanted=path.wanted.value,
+        since_ago=now - (path.placed_at if endpoint is not None else path.since),
+        wanted=path.contract.transport.value,
         endpoint=f"{endpoint[0]}:{endpoint[1]}" if endpoint is not None else "",
         condition=unmet.condition.value if unmet is not None else "",
         text=unmet.text if unmet is not None else "",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, read_reply, read_unmet, reply_of, unmet_by_trust
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, reply_of, unmet_by_trust
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
@@ -59,8 +59,8 @@ def test_a_probe_that_is_no_name_is_not_sent_to_a_node(probe: str) -> None:
 
 
 def test_a_reason_is_safe_to_show_and_one_of_a_later_release_is_known_as_such() -> None:
-    assert read_unmet("caller_id", "two") == Unmet(Condition.CALLER_ID, "two")
-    unmet = read_unmet("quantum", "a\x1b[2Jb\n" + "x" * 1000)
+    unmet = read_reply({"why": "quantum", "text": "a\x1b[2Jb\n" + "x" * 1000}, "/talker")
+    assert isinstance(unmet, Unmet)
     assert unmet.condition is Condition.RELEASE
     assert unmet.text.isprintable()
     assert len(unmet.text) <= 300

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.direct.conditions import Condition
 from rmpa.core.contract import Transport
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "contracts.md"

@@ -5,9 +5,9 @@ import sys
 from typing import Any
 
 from rmpa.bridge.rpc import PeerRpc
-from rmpa.bridge.topics.direct import DirectImporter
+from rmpa.bridge.topics.direct import TopicPaths
 
-DirectImporter.kind = "earlier"  # what nobody asks for is not answered
+TopicPaths.kind = "earlier"  # what nobody asks for is not answered
 _on_request = PeerRpc.on_request
 
 

@@ -12,9 +12,10 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 from hostile_peer import Link, say
 
-from rmpa.bridge.direct.grants import DirectAsk, write
+from rmpa.bridge.direct.conditions import DirectAsk
 from rmpa.bridge.messages import Advertise, TopicOffer, encode
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.identity import Guid
@@ -22,7 +23,7 @@ from rmpa.mesh.frames import Frame, FrameKind
 
 AUTO = Contract(transport=Transport.AUTO)
 EVIL = {"name": "/evil", "node": "/eve", "user": "/gullible"}
-OPEN = write(DirectAsk("/to_b", "/speaker", "/viewer", AUTO))
+OPEN = msgspec.to_builtins(DirectAsk("/to_b", "/speaker", "/viewer", AUTO))
 
 
 def tell(link: Link, what: str, args: dict[str, Any]) -> None:

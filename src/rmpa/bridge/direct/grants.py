@@ -1,176 +1,88 @@
-"""The owner's side of direct transport: grants the nodes of peers a connection to a local node.
+"""The owner's side of direct transport: grants the nodes of peers a connection to a local publisher or server.
 
 A change here is one notification, "ask again": the answer then says whether a grant ended, and why.
+
+A rospy publisher keeps one connection for each caller id: a second subscriber of that name closes the first one's
+connection without a word (docs/design/ros-traps.md, trap 12). Therefore a name is granted once for each source, and
+not at all while a local node of that name subscribes to the topic.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import msgspec
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.nodes import Condition, Grant, Unmet, end_from, reply_of, unmet_by_trust
-from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
-from rmpa.core.contract import Contract  # noqa: TC001 - msgspec reads the annotations
-from rmpa.core.errors import RemoteProtocolError
+from rmpa.bridge.direct.conditions import (
+    Condition,
+    DirectAsk,
+    Grant,
+    Interruptions,
+    Unmet,
+    Want,
+    read_ask,
+    reply_of,
+    unmet_by_contract,
+    unmet_by_trust,
+)
+from rmpa.bridge.direct.nodes import NodePorts, end_all, grant_at
+from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import Needs
+from rmpa.bridge.topics.subscribers import compares_names
+from rmpa.config.peer_rules import Access
+from rmpa.core.contract import Transport, combine
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.identity import is_own
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.wire.tcpros import ANY, parse_service_uri
+from rmpa.runtime.tcp_connections import connections
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.rpc import PeerRpc
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
-    from rmpa.core.counters import Counters
-
-
-# The arguments of the requests and notifications about direct transport, as JSON.
-#
-# Topics and services have the same three messages: ``direct.topic`` or ``direct.service`` asks, ``…_again`` makes
-# the
-# asking side ask again, ``…_release`` gives a grant back. docs/design/protocol.md has examples.
-
-
-class Want(NamedTuple):
-    """What is to be reached directly.
-
-    Args:
-        name: The topic or service, by its name on the wire.
-        node: The node that publishes or provides it.
-        user: The subscribing node; empty: a service, for every node of the asking module.
-    """
-
-    name: str
-    node: str
-    user: str = ""
-
-
-class DirectAsk(msgspec.Struct, frozen=True, omit_defaults=True):
-    """May this be reached directly?
-
-    Args:
-        name: As in ``Want``.
-        node: As in ``Want``.
-        user: As in ``Want``.
-        contract: What the subscriber's module asks for; topics only.
-        broken: Whether an earlier connection ended by itself, so that the publisher may be dead.
-    """
-
-    name: str
-    node: str
-    user: str = ""
-    contract: Contract | None = None
-    broken: bool = False
-
-    @property
-    def want(self) -> Want:
-        """What is asked for."""
-        return Want(self.name, self.node, self.user)
-
-
-def write(asked: DirectAsk) -> dict[str, Any]:
-    """The arguments as values that JSON can represent."""
-    values: dict[str, Any] = msgspec.to_builtins(asked)
-    return values
-
-
-def read_ask(args: dict[str, Any]) -> DirectAsk:
-    """Read and validate a request; it is about a topic if it has a user and a contract.
-
-    Raises:
-        RemoteProtocolError: A name or a value is invalid.
-    """
-    try:
-        found = msgspec.convert(args, DirectAsk)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise RemoteProtocolError(f"direct transport: {error}") from error
-    if bool(found.user) != (found.contract is not None):
-        raise RemoteProtocolError("direct transport: a subscriber has a contract, and a service has neither")
-    for name in found.want if found.user else found.want[:2]:
-        if not is_crossing_name(name):
-            raise RemoteProtocolError(f"direct transport: {name[:200]!r} is not a global ROS name")
-    return found
-
-
-def read_want(args: dict[str, Any]) -> Want:
-    """Read and validate a notification; errors as ``read_ask``."""
-    names = args.get("name"), args.get("node"), args.get("user", "")
-    for name in names if names[2] else names[:2]:
-        if not isinstance(name, str) or not is_crossing_name(name):
-            raise RemoteProtocolError(f"direct transport: {str(name)[:200]!r} is not a global ROS name")
-    return Want(*map(str, names))
-
+    from rmpa.bridge.context import Shared
+    from rmpa.bridge.services.bodies import LocalService
+    from rmpa.bridge.services.exports import ServiceExports
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
-_GIVEN_UP = Unmet(Condition.AGENT, "it was given up meanwhile")
-
-
-@dataclass(slots=True, eq=False)
-class Asked:
-    """What a peer asked for.
-
-    Args:
-        asked: Its request.
-        found: The answer; ``None`` while it is looked for.
-    """
-
-    asked: DirectAsk
-    found: Grant | Unmet | None = None
+_GIVEN_UP: Final = Unmet(Condition.AGENT, "it was given up meanwhile")
+_RELEASED: Final = Needs((), "what was granted to the peer itself")
 
 
 class Grants:
     """What peers asked for, and what they were answered. Subclasses know the conditions, and where nodes listen.
 
     Args:
-        sessions: The peers.
-        rpc: Carries the requests.
-        counters: Count ``direct.granted`` and ``direct.ended``.
-        gate: Whether the mesh is secured.
+        shared: The core, the peers and the rules.
     """
 
     kind = ""
     """The middle of the names of the messages."""
 
-    def __init__(
-        self, sessions: PeerSessions, rpc: PeerRpc, counters: Counters, gate: PermissionGate = OPEN_GATE
-    ) -> None:
-        self._sessions = sessions
-        self._rpc = rpc
-        self._counters = counters
-        self._gate = gate
-        self._asked: dict[tuple[str, str], dict[tuple[int, str], Asked]] = {}
-        """By name and node; then by peer and user."""
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        self._asked: dict[tuple[int, Want], tuple[DirectAsk, Grant | Unmet | None]] = {}
+        """By peer and what it wants: its question, and the answer; ``None`` while that is looked for."""
+        self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
+        """What ``of`` returns; ``None``: grants have changed since it was made."""
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
-        for peer, want, asked in self._all():
-            if isinstance(asked.found, Grant):
-                yield peer, want, asked.found
+        for (peer, want), (_, found) in list(self._asked.items()):
+            if isinstance(found, Grant):
+                yield peer, want, found
 
     def of(self, name: str, node: str) -> list[tuple[int, str, Grant]]:
         """The grants for one node's topic or service: peer, user, and where."""
-        found = self._asked.get((name, node), {}).items()
-        return sorted((*key, asked.found) for key, asked in found if isinstance(asked.found, Grant))
-
-    def _all(self, peer: int | None = None) -> list[tuple[int, Want, Asked]]:
-        return [
-            (owner, Want(*place, user), asked)
-            for place, users in self._asked.items()
-            for (owner, user), asked in users.items()
-            if peer in {None, owner}
-        ]
-
-    def _of_peer(self, peer: int, kind: type[Grant | Unmet]) -> list[tuple[str, str, str]]:
-        """What a peer was granted, or refused."""
-        return [
-            (*place, user)
-            for place, users in self._asked.items()
-            for (owner, user), asked in users.items()
-            if owner == peer and isinstance(asked.found, kind)
-        ]
+        if self._by_node is None:
+            self._by_node = {}
+            for peer, want, grant in self:
+                self._by_node.setdefault((want.name, want.node), []).append((peer, want.user, grant))
+        return sorted(self._by_node.get((name, node), ()))
 
     # --- what subclasses know ---------------------------------------------------------------------------------------
 
@@ -192,90 +104,74 @@ class Grants:
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asked = read_ask(args)
-        want, peer = asked.want, session.peer
-        users = self._asked.setdefault(want[:2], {})
-        before = users.get((peer, want.user))
-        if asked.broken and before is not None and isinstance(before.found, Grant):
-            self._broke(want)
-        entry = users[peer, want.user] = Asked(asked, before.found if before is not None else None)
-        found: Grant | Unmet | None = self._judged(session, asked)
+        key = session.peer, asked.want
+        _, before = self._asked.get(key, (None, None))
+        found: Grant | Unmet | None = self._judge(session, asked)
+        if asked.broken and isinstance(before, Grant):
+            self._broke(asked.want)
         if found is None:
-            found = await self._find(session, want)
-            found = self._judged(session, asked) or found  # the graph may have changed meanwhile
-            if self._asked.get(want[:2], {}).get((peer, want.user)) is not entry:
+            self._asked[key] = asked, before
+            found = await self._find(session, asked.want)
+            found = self._judge(session, asked) or found  # the graph may have changed meanwhile
+            if self._asked.get(key, (None, None))[0] is not asked:
                 return reply_of(_GIVEN_UP)  # released, or asked again
-        self._set(session, want, entry, found)
+        self._set(session, asked, found)
         if isinstance(found, Grant):
-            self._counters.add("direct.granted")
-        _log.debug("< %s: %s: %s", session.link.name, want, found)
+            self._shared.counters.add("direct.granted")
+        _log.debug("< %s: %s: %s", session.link.name, asked.want, found)
         return reply_of(found)
 
-    def _judged(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
+    def _judge(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         """The condition that does not hold for a peer; the name of a user is granted once for each node."""
         unmet = self._unmet(session, asked)
-        if unmet is not None:
+        _, before = self._asked.get((session.peer, asked.want), (None, None))
+        if unmet is not None or isinstance(before, Grant):
             return unmet
-        granted = self.of(asked.name, asked.node)
-        if asked.user and any(user == asked.user and peer != session.peer for peer, user, _ in granted):
+        granted = [(peer, want) for peer, want, _ in self]
+        if asked.user and asked.want in (want for _, want in granted):
             return Unmet(Condition.CALLER_ID, f"a node {asked.user} of another module is connected already")
-        mine = self._of_peer(session.peer, Grant)
-        if len(mine) >= limits.DIRECT_MAX and asked.want not in mine:
+        if sum(peer == session.peer for peer, _ in granted) >= limits.DIRECT_MAX:
             return Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} direct connections to this module")
         return None
 
     def _unmet_by_trust(self, session: PeerSession, where: str) -> Unmet | None:
-        return unmet_by_trust(self._gate, where, same_machine=session.same_machine)
+        return unmet_by_trust(self._shared.context.gate, where, same_machine=session.same_machine)
 
-    def _hidden(self, found: Grant | Unmet) -> bool:
+    def _is_hidden(self, found: Grant | Unmet) -> bool:
         """Whether a peer must not learn of changes: it may not have this topic or service."""
-        return self._gate.on and isinstance(found, Unmet) and found.condition is Condition.OFFERED
+        return self._shared.context.gate.on and isinstance(found, Unmet) and found.condition is Condition.OFFERED
 
-    def _set(self, session: PeerSession, want: Want, entry: Asked, found: Grant | Unmet) -> None:
-        before, entry.found = entry.found, found
-        if isinstance(before, Grant) != isinstance(found, Grant):
-            self._changed(session, want, granted=isinstance(found, Grant))
-        if self._hidden(found):
-            self._forget(session.peer, want)
+    def _set(self, session: PeerSession, asked: DirectAsk, found: Grant | Unmet | None) -> None:
+        """Note what a peer is answered; ``None``: it does not ask any more."""
+        want, peer, self._by_node = asked.want, session.peer, None
+        _, before = self._asked.pop((peer, want), (None, None))
+        if found is not None and not self._is_hidden(found):
+            self._asked[peer, want] = asked, found
         if isinstance(found, Unmet):
-            mine = self._of_peer(session.peer, Unmet)
-            if len(mine) > limits.DIRECT_MAX:
-                self._forget(session.peer, Want(*mine[0]))
-        if isinstance(before, Grant) and isinstance(found, Unmet):
-            self._freed(session, want)
-
-    def _forget(self, peer: int, want: Want) -> Asked | None:
-        users = self._asked.get(want[:2], {})
-        found = users.pop((peer, want.user), None)
-        if not users:
-            self._asked.pop(want[:2], None)
-        return found
-
-    def _drop(self, session: PeerSession, want: Want) -> None:
-        found = self._forget(session.peer, want)
-        if found is not None and isinstance(found.found, Grant):
-            self._changed(session, want, granted=False)
-            self._freed(session, want)
-
-    def _freed(self, session: PeerSession, want: Want) -> None:
-        """Lets other peers ask again that were refused because of a user's name."""
-        for (peer, user), asked in list(self._asked.get(want[:2], {}).items()):
-            other = self._sessions.get(peer)
-            refused = user == want.user and isinstance(asked.found, Unmet)
-            if refused and other is not None and other is not session and other.linked:
-                self._tell(other, want)
+            refused = [key for key, (_, one) in self._asked.items() if key[0] == peer and isinstance(one, Unmet)]
+            if len(refused) > limits.DIRECT_MAX:
+                del self._asked[refused[0]]
+        if isinstance(before, Grant) == isinstance(found, Grant):
+            return
+        self._changed(session, want, granted=isinstance(found, Grant))
+        if isinstance(before, Grant):
+            for (other, one), (_, answer) in list(self._asked.items()):
+                if one == want and other != peer and isinstance(answer, Unmet):
+                    self._tell(other, want)  # perhaps it was refused because of the user's name
 
     def _again(self, which: Callable[[Want], bool]) -> None:
-        """Lets peers ask again: something has changed."""
-        for peer, want, asked in self._all():
-            session = self._sessions.get(peer)
-            if session is not None and session.linked and asked.found is not None and which(want):
-                self._tell(session, want)
+        """Let peers ask again: something has changed."""
+        for (peer, want), (_, found) in list(self._asked.items()):
+            if found is not None and which(want):
+                self._tell(peer, want)
 
-    def _tell(self, session: PeerSession, want: Want) -> None:
-        self._rpc.notify(session, f"direct.{self.kind}_again", want._asdict())
+    def _tell(self, peer: int, want: Want) -> None:
+        session = self._shared.sessions.get(peer)
+        if session is not None and session.linked:
+            self._shared.rpc.notify(session, f"direct.{self.kind}_again", want._asdict())
 
     def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
-        self._drop(session, read_want(args))
+        self._set(session, read_ask(args), None)
 
     # --- the bridge's part ------------------------------------------------------------------------------------------
 
@@ -287,41 +183,41 @@ class Grants:
         Args:
             refused: Have the peers ask again for what they were refused, too.
         """
-        for peer, want, asked in self._all():
-            session, before = self._sessions.get(peer), asked.found
-            if session is None or before is None or not (refused or isinstance(before, Grant)):
+        for (peer, want), (asked, before) in list(self._asked.items()):
+            session, granted = self._shared.sessions.get(peer), isinstance(before, Grant)
+            if session is None or before is None or not (refused or granted):
                 continue
-            unmet = self._judged(session, asked.asked)
-            changed = isinstance(before, Grant) is (unmet is not None)
+            unmet = self._judge(session, asked)
             if unmet is not None:
-                if self._gate.on and isinstance(before, Grant):
+                if self._shared.context.gate.on and isinstance(before, Grant):
                     self._end(session, before.port)
-                if changed or self._hidden(unmet):
-                    self._set(session, want, asked, unmet)
-                changed = changed and not self._hidden(unmet)
-            if changed and session.linked:
-                self._tell(session, want)
+                if granted or self._is_hidden(unmet):
+                    self._set(session, asked, unmet)
+            if granted is (unmet is not None) and not (unmet is not None and self._is_hidden(unmet)):
+                self._tell(peer, want)
 
     def link_up(self, session: PeerSession) -> None:
         """Let a peer ask again for what it uses; what it was granted over an earlier link ends a little later."""
-        before = [(want, asked) for _, want, asked in self._all(session.peer)]
+        before = [asked for (peer, _), (asked, _) in self._asked.items() if peer == session.peer]
         if before:
             asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, session, before)
 
-    def _expire(self, session: PeerSession, before: list[tuple[Want, Asked]]) -> None:
-        for want, asked in before:
-            if self._asked.get(want[:2], {}).get((session.peer, want.user)) is asked:
-                self._drop(session, want)
+    def _expire(self, session: PeerSession, before: list[DirectAsk]) -> None:
+        for asked in before:
+            if self._asked.get((session.peer, asked.want), (None, None))[0] is asked:
+                self._set(session, asked, None)
 
-    def link_down(self, session: PeerSession, *, crashed: bool) -> None:
+    def link_down(self, session: PeerSession) -> None:
         """Forget what a peer asked for, and end its connections if it is silent; unless only its agent has died.
 
         The nodes of a peer that left in order go on. So do those of another module on its host.
         On this machine no connection outlives its process, and the nodes of all modules have the same address.
         """
-        if crashed:
+        if session.link.crashed:
             return
-        shared = any(other.address == session.address for other in self._sessions.linked() if other is not session)
+        shared = any(
+            other.address == session.address for other in self._shared.sessions.linked() if other is not session
+        )
         if session.link.silent and not shared:
             for port in {grant.port for peer, _, grant in self if peer == session.peer}:
                 self._end(session, port)
@@ -329,13 +225,186 @@ class Grants:
 
     def gone(self, session: PeerSession) -> None:
         """Forget what a peer asked for."""
-        for _, want, _ in self._all(session.peer):
-            self._drop(session, want)
+        for (peer, _), (asked, _) in list(self._asked.items()):
+            if peer == session.peer:
+                self._set(session, asked, None)
 
     def _end(self, session: PeerSession, port: int) -> None:
         if session.same_machine:
             return
-        self._counters.add("direct.ended")
-        if problem := end_from(port, session.address):
+        self._shared.counters.add("direct.ended")
+        if problem := end_all(connections(local_port=port, remote=(session.address, None))):
             text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
             _log.info(text, session.link.name, problem)
+
+
+class TopicGrants(Grants):
+    """The direct connections of peers' subscribers to local publishers.
+
+    Args:
+        shared: As of ``Grants``.
+        exports: Knows what is offered to each peer.
+    """
+
+    kind = "topic"
+
+    def __init__(self, shared: Shared, exports: Exports) -> None:
+        super().__init__(shared)
+        rpc = shared.rpc
+        rpc.on_request("direct.topic", self._ask, Needs((Access.SUBSCRIBE,), "the topic: only what is offered"))
+        rpc.on_notification("direct.topic_release", self._released, _RELEASED)
+        self._exports = exports
+        self.ports = NodePorts()
+        self.interruptions = Interruptions()
+        """When peers' subscribers were without a grant because their link was lost."""
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Have peers ask again for what a registration that came or went touches."""
+        if change.kind is RegistrationKind.SUBSCRIBER and not is_own(change.node):
+            self._again(lambda want: (want.name, want.user) == (change.name, change.node))
+        elif change.kind is RegistrationKind.PUBLISHER:
+            self.ports.forget(change.api)
+            self._again(lambda want: (want.name, want.node) == (change.name, change.node))
+
+    def link_down(self, session: PeerSession) -> None:
+        """As of ``Grants``."""
+        for peer, want, _ in self if not session.link.crashed else ():
+            if peer == session.peer:
+                self.interruptions.begin(session.link.name, want, asyncio.get_running_loop().time())
+        super().link_down(session)
+
+    # --- the local graph --------------------------------------------------------------------------------------------
+
+    def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
+        """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
+        if granted:
+            self.interruptions.end(session.link.name, want, asyncio.get_running_loop().time())
+        nodes = sum((peer, one.name, one.user) == (session.peer, want.name, want.user) for peer, one, _ in self)
+        held, topic = f"subscriber of {want.name}", want.name
+        if granted and nodes == 1:
+            session.proxies.hold(
+                want.user, held, lambda proxy: self._register(topic, proxy), lambda proxy: self._leave(topic, proxy)
+            )
+        elif not nodes:
+            session.proxies.release(want.user, held)
+
+    def _register(self, topic: str, proxy: SlaveNode) -> None:
+        self._shared.core.call("registerSubscriber", proxy.name, topic, ANY, proxy.uri)
+
+    def _leave(self, topic: str, proxy: SlaveNode) -> None:
+        self._shared.core.call("unregisterSubscriber", proxy.name, topic, proxy.uri)
+
+    def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
+        """Register missing subscribers again: the core has been restarted."""
+        for peer, subscriber, topic in {(peer, want.user, want.name) for peer, want, _ in self}:
+            session = self._shared.sessions.get(peer)
+            proxy = session.proxies.get(subscriber) if session is not None else None
+            if proxy is not None and proxy.name not in subscribers.get(topic, {}):
+                self._register(topic, proxy)
+
+    # --- conditions -------------------------------------------------------------------------------------------------
+
+    def _uri(self, want: Want) -> str:
+        """The slave API of a publisher now; the exports learn a new one a little later."""
+        return self._shared.core.publishers(want.name).get(want.node, "")
+
+    async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
+        uri = self._uri(want)
+        port = await self.ports.find(want.node, uri, want.name)
+        if self._uri(want) not in {uri, ""}:
+            return Unmet(Condition.NODE, f"{want.node} has restarted just now")
+        if isinstance(port, Unmet):
+            return port
+        service = f"{want.node}/get_loggers"  # rospy and roscpp nodes have it
+        known = want.node in self._shared.core.state().services.get(service, ())
+        return grant_at(session, want.node, port, service if known else "")
+
+    def _broke(self, want: Want) -> None:
+        self.ports.forget(self._uri(want))
+        self._shared.core.suspect(want.node)
+
+    def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
+        if asked.contract is None or not asked.user:
+            raise RemoteProtocolError("direct transport: a topic is asked for without a subscriber or its contract")
+        source, where = Source(asked.name, asked.node), "the publisher's module"
+        local = self._exports.local(session.peer, source)
+        if local is None:
+            return Unmet(Condition.OFFERED, f"{source} is not offered")
+        if local != source:
+            return Unmet(Condition.NAME, f"it is {local.topic} in the publisher's module")
+        offered = self._exports.offered[source]
+        if offered.origin is not None:
+            return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
+        if compares_names(offered.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
+        contract = combine(self._shared.context.contracts.of(source.topic, offered.type), asked.contract)
+        unmet = unmet_by_contract(contract, where) or self._unmet_by_trust(session, where)
+        if unmet is not None:
+            return unmet
+        if not self._uri(asked.want):
+            return Unmet(Condition.NODE, f"{source.node} has just left")
+        if asked.user in self._shared.core.subscribers(source.topic):
+            return Unmet(Condition.CALLER_ID, f"a node {asked.user} of the publisher's module subscribes too")
+        return None
+
+
+class ServiceGrants(Grants):
+    """The direct calls of peers' nodes to local servers.
+
+    Args:
+        shared: As of ``Grants``.
+        exports: Knows what is offered to each peer.
+        on_warning: ``(kind, subject, text)``: logs and counts a warning.
+    """
+
+    kind = "service"
+
+    def __init__(self, shared: Shared, exports: ServiceExports, on_warning: Callable[[str, str, str], None]) -> None:
+        super().__init__(shared)
+        rpc = shared.rpc
+        offered = Needs((Access.CALL,), "the service: only what is offered to the peer")
+        rpc.on_request("direct.service", self._ask, offered)
+        rpc.on_notification("direct.service_release", self._released, _RELEASED)
+        self._exports = exports
+        self._on_warning = on_warning
+        self._servers: dict[str, LocalService] = {}
+        """The servers of services that were asked for, as they were last seen."""
+
+    def server(self, service: str, server: LocalService | None) -> None:
+        """Have peers ask again for a service that has another server now."""
+        if self._servers.get(service, server) != server:
+            del self._servers[service]
+            self._again(lambda want: want.name == service)
+
+    async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        reply = await super()._ask(session, args)
+        if "why" in reply and self._shared.context.services.transport(args["name"]) is Transport.DIRECT:
+            name, service = session.link.name, args["name"]
+            text = f'{service}: calls from {name} are relayed although transport is "direct": {reply["text"]}'
+            self._on_warning("direct.relayed", f"{name} {service} {reply['why']}", text)
+        return reply
+
+    async def _find(self, session: PeerSession, want: Want) -> Grant | Unmet:
+        uri = self._exports.offered[want.name].uri
+        try:
+            _, port = parse_service_uri(uri)
+        except RmpaError:
+            return Unmet(Condition.NODE, f"{want.node} registered {uri[:100]!r} for {want.name}")
+        return grant_at(session, want.node, port, want.name)
+
+    def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
+        service = asked.name
+        local, server = self._exports.local(session.peer, service), self._exports.offered.get(service)
+        if server is not None:
+            self._servers[service] = server
+        if local is None or server is None:
+            return Unmet(Condition.OFFERED, f"{service} is not offered")
+        if local != service:
+            return Unmet(Condition.NAME, f"it is {local} in the server's module")
+        if server.origin is not None:
+            return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
+        if server.node != asked.node:
+            return Unmet(Condition.OFFERED, f"{server.node} provides {service} now")
+        if self._shared.context.services.transport(service) is Transport.RELAY:
+            return Unmet(Condition.TRANSPORT, 'transport is "relay" in the server\'s module')
+        return self._unmet_by_trust(session, "the server's module")

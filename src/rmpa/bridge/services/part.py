@@ -16,6 +16,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import AdvertiseServices, CloseService, OpenService, ServiceClosed, ServiceOpened, Source
 from rmpa.bridge.policy import Needs, service_place
@@ -30,7 +31,7 @@ from rmpa.bridge.services.bodies import (
     Withdraw,
 )
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving, description_of
-from rmpa.bridge.services.direct import DirectServiceExporter, DirectServiceImporter
+from rmpa.bridge.services.direct import ServicePaths
 from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState
 from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.sessions import Part, PeerState, UnchangedGraph
@@ -125,21 +126,9 @@ class Services(Part):
         )
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
-        self.direct_exports = DirectServiceExporter(
-            core, self.exports, rules, sessions, rpc, on_warning=self._driver.warn, counters=counters, gate=gate
-        )
+        self.direct_exports = ServiceGrants(shared, self.exports, self._driver.warn)
         """Direct calls of peers' nodes to local servers."""
-        self.direct_imports = DirectServiceImporter(
-            core,
-            self.imports,
-            rules,
-            sessions,
-            rpc,
-            proxy_uri=self._proxy_uri,
-            on_warning=self._driver.warn,
-            counters=counters,
-            gate=gate,
-        )
+        self.direct_imports = ServicePaths(shared, self._driver.warn, self.imports, self._proxy_uri)
         """Direct calls of local nodes to peers' servers."""
         rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
@@ -171,8 +160,7 @@ class Services(Part):
         self._driver.rejudge(
             chain(self.exports.apply_rules(rules, limit_settings), self.imports.apply_rules(rules, limit_settings))
         )
-        self.direct_exports.reload(rules)
-        self.direct_imports.reload(rules)
+        self.direct_exports.judge_again()
         for shown in yielding_to_data(list(self._shown.values()), every=16):
             self.direct_imports.shown(shown.peer, shown.service)
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint
@@ -211,8 +199,8 @@ class Services(Part):
 
     def link_down(self, session: PeerSession) -> None:
         """Fail the calls under way; the peer's services stay in the graph until ``grace_over`` or ``gone``."""
-        self.direct_imports.link_down(session, crashed=session.link.crashed)
-        self.direct_exports.link_down(session, crashed=session.link.crashed)
+        self.direct_imports.link_down(session)
+        self.direct_exports.link_down(session)
         self._driver.link_down(session)
         self._act(self.imports.link_down(session.peer))
         self._act(self.exports.link_down(session.peer))

@@ -12,27 +12,21 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.grants import Want
-from rmpa.bridge.direct.nodes import (
+from rmpa.bridge.direct.conditions import (
     Condition,
     Grant,
+    Interruptions,
     Unmet,
-    bus_links,
-    direct_links,
-    end_links,
-    forgotten,
-    kernel_tells,
-    publisher_update,
-    standing,
-    standing_at,
+    Want,
     unmet_by_contract,
     unmet_by_trust,
 )
-from rmpa.bridge.direct.paths import Interruptions, Path, Paths
+from rmpa.bridge.direct.nodes import bus_links, end_links, forgotten, kernel_tells, publisher_update, standing
+from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
 from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.subscribers import compares_names
-from rmpa.core.contract import Transport
+from rmpa.core.contract import Contract, Transport
 from rmpa.core.identity import is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.http.rpc import is_own_name
@@ -45,14 +39,11 @@ from rmpa.ros.wire.xmlrpc import RosReply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.rpc import PeerRpc
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.context import Shared
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.bridge.topics.routes import RemoteTopic
-    from rmpa.core.contract import Contracts
-    from rmpa.core.counters import Counters
-    from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
 
 MEASURING: Final = "/rmpa_topic_"
@@ -62,43 +53,30 @@ _TWICE: Final = Unmet(
 )
 
 
-class DirectImporter(Paths):
+class TopicPaths(Paths):
     """Direct connections of local subscribers to nodes of peers.
 
     Args:
-        core: The local core.
+        shared: As of ``Paths``.
+        on_warning: As of ``Paths``.
         imports: The remote sources.
         topics: The peers' topics in the local graph, by the numbers of their sessions.
-        contracts: The contracts of this module; replaced by ``reload``.
-        sessions: The peers.
-        rpc: Carries the requests.
-        on_warning: ``(kind, subject, text)``: logs and counts a warning.
-        counters: Count ``direct.moved`` and others.
-        gate: Whether the mesh is secured.
     """
 
     kind = "topic"
 
     def __init__(
         self,
-        core: Core,
+        shared: Shared,
+        on_warning: Callable[[str, str, str], None],
         imports: Imports,
         topics: Mapping[int, PeerTopics],
-        contracts: Contracts,
-        sessions: PeerSessions,
-        rpc: PeerRpc,
-        *,
-        on_warning: Callable[[str, str, str], None],
-        counters: Counters,
-        gate: PermissionGate = OPEN_GATE,
     ) -> None:
-        super().__init__(sessions, rpc, on_warning, counters, gate)
+        super().__init__(shared, on_warning)
         own = Needs((), "the peer's own topics that come directly")
-        rpc.on_notification("direct.topic_again", self._asked_again, own)
-        self._core = core
+        shared.rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._imports = imports
         self._topics = topics
-        self._contracts = contracts
         self.interruptions = Interruptions()
         """When subscribers were without their path."""
         self._checking: asyncio.TimerHandle | None = None
@@ -110,12 +88,10 @@ class DirectImporter(Paths):
 
     # --- the local graph --------------------------------------------------------------------------------------------
 
-    def reload(self, contracts: Contracts) -> None:
-        """Take new contracts, and judge every subscriber again."""
-        self._contracts = contracts
-        for topic in {entry.topic for _, _, entry in self._imports}:
-            for peer, source in list(self._imports.at(topic)):
-                self.shown(peer, source)
+    def reload(self) -> None:
+        """Judge every subscriber by the new contracts."""
+        for peer, source, _ in list(self._imports):
+            self.shown(peer, source)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Judge a local subscriber that came, or forget one that went."""
@@ -131,7 +107,7 @@ class DirectImporter(Paths):
         """Judge the subscribers of a source that appears in the local graph, or to which other rules apply."""
         entry = self._imports.get(peer, source)
         if entry is not None:
-            for node, uri in self._core.subscribers(entry.topic).items():
+            for node, uri in self._shared.core.subscribers(entry.topic).items():
                 self._consider(peer, source, node, uri)
 
     def hidden(self, peer: int, source: Source) -> None:
@@ -141,21 +117,25 @@ class DirectImporter(Paths):
             self._hang_up(path)
 
     def _consider(self, peer: int, source: Source, node: str, uri: str) -> None:
-        session, entry = self._sessions.get(peer), self._imports.get(peer, source)
+        session, entry = self._shared.sessions.get(peer), self._imports.get(peer, source)
         if session is None or entry is None or not entry.shown or is_own(node):
             return
-        want, contract = Want(source.topic, source.node, node), self._contracts.of(entry.topic, entry.type)
-        before = self.get(peer, want)
-        if contract.transport is Transport.RELAY and before is None:
+        want, contract = (
+            Want(source.topic, source.node, node),
+            self._shared.context.contracts.of(entry.topic, entry.type),
+        )
+        is_known = self.get(peer, want) is not None
+        if contract.transport is Transport.RELAY and not is_known:
             return  # nothing is kept of topics that are relayed by rule
-        unmet = self._unmet(session, source, entry, node, uri)
-        self.judge(peer, want, contract.transport, unmet, contract)
-        if before is None and (path := self.get(peer, want)) is not None:
-            path.answered = self._is_relayed(path)  # until now it was relayed by rule
+        path = self.judge(peer, want, contract, self._unmet_here(session, source, entry, node, uri))
+        if not is_known and self._is_relayed(path):
+            path.place = AGENTS  # until now it was relayed by rule
 
-    def _unmet(self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str) -> Unmet | None:
-        unmet = unmet_by_contract(self._contracts.of(entry.topic, entry.type), "this module")
-        unmet = unmet or unmet_by_trust(self._gate, "this module", same_machine=session.same_machine)
+    def _unmet_here(
+        self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str
+    ) -> Unmet | None:
+        unmet = unmet_by_contract(self._shared.context.contracts.of(entry.topic, entry.type), "this module")
+        unmet = unmet or unmet_by_trust(self._shared.context.gate, "this module", same_machine=session.same_machine)
         if unmet is not None:
             return unmet
         if entry.origin is not None:
@@ -167,24 +147,22 @@ class DirectImporter(Paths):
         if node.startswith(MEASURING):
             return Unmet(Condition.MEASURES, "rmpa's own tools measure by the agents")
         host = host_of(uri)
-        if not is_loopback(self._core.node_host) and not (is_own_name(host) or host in local_addresses()):
+        if not is_loopback(self._shared.core.node_host) and not (is_own_name(host) or host in local_addresses()):
             return Unmet(Condition.SUBSCRIBER, f"{node} runs at {host}, not on its agent's machine")
         if not self._kernel_tells:
             return Unmet(Condition.SUBSCRIBER, "the kernel does not list the connections of this machine (sock_diag)")
         if is_loopback(host) and not session.same_machine:
-            text = f"{node} connects within its machine only (ROS_IP or ROS_HOSTNAME is {host_of(uri)})"
+            text = f"{node} connects within its machine only (ROS_IP or ROS_HOSTNAME is {host})"
             return Unmet(Condition.SUBSCRIBER, text)
         return None
 
-    def _unmet_now(self, path: Path) -> Unmet | None:
-        """A latched source that is relayed to a subscriber stays so until it subscribes again."""
-        entry = self._imports.get(path.peer, self._source(path))
-        latched = entry is not None and entry.description is not None and entry.description.latching
-        return _TWICE if latched and self._is_relayed(path) else None
-
-    @staticmethod
-    def _source(path: Path) -> Source:
-        return Source(path.want.name, path.want.node)
+    def _unmet(self, path: Path) -> Unmet | None:
+        """As of ``Paths``. A latched source that is relayed to a subscriber stays so until it subscribes again."""
+        unmet = super()._unmet(path)
+        if unmet is not None or not self._is_relayed(path):
+            return unmet
+        entry = self._imports.get(path.peer, _source(path))
+        return _TWICE if entry is not None and entry.description and entry.description.latching else None
 
     def _is_relayed(self, path: Path) -> bool:
         publication = self._publication(path)
@@ -192,104 +170,91 @@ class DirectImporter(Paths):
 
     def _publication(self, path: Path) -> Publication | None:
         topics = self._topics.get(path.peer)
-        return topics.publication(self._source(path)) if topics is not None else None
+        return topics.publication(_source(path)) if topics is not None else None
 
     def _uri(self, path: Path) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
-        return self._core.subscribers(path.want.name).get(path.want.user, "")
-
-    def _proxy_uri(self, path: Path) -> str:
-        session = self._sessions.get(path.peer)
-        proxy = session.proxies.get(path.want.node) if session is not None else None
-        return proxy.uri if proxy is not None else ""
+        return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
 
     # --- what subscribers ask ---------------------------------------------------------------------------------------
 
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         want = Want(source.topic, source.node, subscriber)
-        path, session = self.get(peer, want), self._sessions.get(peer)
+        path, session = self.get(peer, want), self._shared.sessions.get(peer)
         if path is None:
             left = session is not None and session.link.name in self._left
             if not left and self._now() >= self._started + limits.DIRECT_ADOPT:
                 return None
-            path = Path(peer, want, Transport.RELAY, found=Unmet(Condition.TRANSPORT, ""))
-            path.decided.set()
+            path = Path(peer, want, Contract())
         return self._answer(path)
 
     async def _answer(self, path: Path) -> RosReply | None:
         await self.decision(path)
-        direct = self.target(path) if path.decided.is_set() else None
-        stays, problem = await self._end_earlier(path, direct)
+        direct = self.target(path) if path.task is None else None
+        stays = await self._end_earlier(path, direct)
         if stays is not None:
-            path.stuck = problem
-            self._answered(path, stays)
+            self._put(path, stays)
             return RosReply(0, "connected to the publisher already", [])
         if direct is None or self.target(path) != direct:
             direct = None  # it is moved if it is direct by now
-        self._answered(path, direct)
+        self._put(path, direct or AGENTS)
         return RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, *direct]) if direct is not None else None
 
-    def _answered(self, path: Path, endpoint: tuple[str, int] | None) -> None:
-        path.answered, path.answered_at, path.endpoint, path.stranded = True, self._now(), endpoint, None
-        self._has_path(path)
-        self._place(path)
-        self._watch()
-
-    async def _end_earlier(self, path: Path, direct: tuple[str, int] | None) -> tuple[tuple[str, int] | None, str]:
-        """Ends connections of a subscriber to a peer's nodes from an earlier answer, or an earlier run of an agent.
+    async def _end_earlier(self, path: Path, direct: tuple[str, int] | None) -> tuple[str, int] | None:
+        """End connections of a subscriber to a peer's nodes from an earlier answer, or an earlier run of an agent.
 
         A second connection would double messages.
 
         Returns:
-            The other end of one that stays; and why, if it cannot be ended.
+            The other end of one that stays: it is the decided one, or cannot be ended; then ``stuck`` says why.
         """
-        session, uri, topic = self._sessions.get(path.peer), self._uri(path), path.want.name
-        if session is None or not uri or not standing_at(session.address):
-            return None, ""
-        own = self._proxy_uri(path)
-        others = {one for one in self._core.publishers(topic).values() if one != own}
-        known = {one.endpoint for one in self if one is not path and one.want.user == path.want.user}
-        for link in await bus_links(uri) or ():
+        session, uri, topic = self._shared.sessions.get(path.peer), self._uri(path), path.want.name
+        if session is None or not uri or not standing(session.address):
+            return None
+        proxy = session.proxies.get(path.want.node)
+        own = proxy.address_of(topic) if proxy is not None else None
+        others = {one for one in self._shared.core.publishers(topic).values() if proxy is None or one != proxy.uri}
+        known = {one.place for one in self if one is not path and one.want.user == path.want.user}
+        for link in await bus_links(uri, topic) or ():
             end = link.remote
-            if not (link.inbound and link.topic == topic and link.connected) or link.other in others or end is None:
+            if not link.connected or end is None or end[0] != session.address or link.other in others or end in known:
                 continue
-            if end[0] != session.address or end in known or self._is_own_port(path, end):
-                continue
-            if link.local_port not in standing(end):
+            if own is not None and own[1] == end[1]:
+                continue  # the proxy itself, on this machine
+            if link.local_port not in standing(*end).get(end[1], ()):
                 continue
             if end == direct:
-                return end, ""
+                return end
             if problem := await end_links(end, [link]):
                 self._warn_stuck(path, end, problem)
-                return end, problem
-        return None, ""
+                return end
+        return None
 
-    def _is_own_port(self, path: Path, end: tuple[str, int]) -> bool:
-        """Whether a connection leads to the proxy, on this machine."""
-        session = self._sessions.get(path.peer)
-        proxy = session.proxies.get(path.want.node) if session is not None else None
-        address = proxy.address_of(path.want.name) if proxy is not None else None
-        return address is not None and address[1] == end[1]
+    def _put(self, path: Path, place: tuple[str, int], at: float | None = None) -> None:
+        """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
+        path.place, path.placed_at = place, self._now() if at is None else at
+        if place in {LOST, AGENTS, self.target(path)}:
+            path.stuck = ""
+        self._interrupted(path, lasts=place is LOST)
+        self._place(path)
+        self._watch()
+
+    def _interrupted(self, path: Path, *, lasts: bool) -> None:
+        if (session := self._shared.sessions.get(path.peer)) is not None:
+            note = self.interruptions.begin if lasts else self.interruptions.end
+            note(session.link.name, path.want, self._now())
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
         for path in self.of(peer, source.topic, source.node):
             if self._is_relayed(path):
-                if not path.answered:
-                    self._answered(path, None)
-            elif path.answered and path.endpoint is None:
-                path.answered = False
+                if path.place in {None, LOST}:
+                    self._put(path, AGENTS)
+            elif path.place == AGENTS:
+                path.place = None
                 if path.unmet is _TWICE:
-                    self._start(path)
-
-    def _interrupted(self, path: Path) -> None:
-        if (session := self._sessions.get(path.peer)) is not None:
-            self.interruptions.begin(session.link.name, path.want, self._now())
-
-    def _has_path(self, path: Path) -> None:
-        if (session := self._sessions.get(path.peer)) is not None:
-            self.interruptions.end(session.link.name, path.want, self._now())
+                    self.update(path)
 
     # --- links ------------------------------------------------------------------------------------------------------
 
@@ -300,32 +265,31 @@ class DirectImporter(Paths):
                 entry.direct = False
         super().link_up(session)
 
-    def link_down(self, session: PeerSession, *, crashed: bool) -> None:
+    def link_down(self, session: PeerSession) -> None:
         """As of ``Paths``; sources with direct subscribers stay in the graph if only the peer's agent has died."""
-        for path in self._direct(session):
-            entry = self._imports.get(path.peer, self._source(path))
-            if crashed and entry is not None:
+        for path in self._of_peer(session):
+            entry = self._imports.get(path.peer, _source(path))
+            if path.endpoint is None:
+                continue
+            if not session.link.crashed:
+                self._interrupted(path, lasts=True)
+            elif entry is not None:
                 entry.direct = True
-            elif not crashed:
-                self._interrupted(path)
-        super().link_down(session, crashed=crashed)
+        super().link_down(session)
 
     def gone(self, session: PeerSession) -> None:
         """As of ``Paths``; what is direct goes on if only the peer's agent has died."""
-        direct = self._direct(session)
+        direct = [path for path in self._of_peer(session) if path.endpoint is not None]
         if direct and session.link.crashed:
             self._left.add(session.link.name)
         super().gone(session)
         for path in direct if not session.link.crashed else ():
             self._hang_up(path)
 
-    def _direct(self, session: PeerSession) -> list[Path]:
-        return [path for path in self if path.peer == session.peer and path.endpoint is not None]
-
     def _hang_up(self, path: Path) -> None:
-        """Makes a subscriber leave its direct connection; it is not called back."""
+        """Make a subscriber leave its direct connection; it is not called back."""
         if path.endpoint is not None and not self._closed:
-            self._counters.add("direct.hung_up")
+            self._shared.counters.add("direct.hung_up")
             self._spawn(self._leave(path, path.endpoint), f"hang up {path.want.user}")
 
     # --- carrying out -----------------------------------------------------------------------------------------------
@@ -336,88 +300,87 @@ class DirectImporter(Paths):
         return f"no connection to {session.address}:{grant.port}: {problem}" if problem else ""
 
     def _subject(self, path: Path) -> str:
-        return f"{self._source(path)} to {path.want.user}"
+        return f"{_source(path)} to {path.want.user}"
 
     def _decided(self, path: Path) -> None:
         if path.endpoint == self.target(path):
             path.stuck = ""
             if path.endpoint is not None:
-                self._has_path(path)
+                self._interrupted(path, lasts=False)
         self._place(path)
         self._watch()
 
     def _is_misplaced(self, path: Path) -> bool:
         """Whether a subscriber has another connection than was decided, or waits for being called back."""
-        if not path.decided.is_set() or self.get(path.peer, path.want) is not path:
+        if path.task is not None or path.place is None or self.get(path.peer, path.want) is not path:
             return False
-        if path.stranded is not None:
-            return self._now() - path.stranded > limits.DIRECT_SETTLE
-        return path.answered and path.endpoint != self.target(path)
+        if path.place is LOST:
+            return self._now() - path.placed_at > limits.DIRECT_SETTLE
+        return path.endpoint != self.target(path)
 
     def _place(self, path: Path) -> None:
         if path.mover is None and not self._closed and self._is_misplaced(path):
             path.mover = self._spawn(self._move(path), f"move {path.want.user}")
 
     async def _move(self, path: Path) -> None:
-        """Makes a subscriber leave its connection, and calls it back to get the answer that was decided."""
+        """Make a subscriber leave its connection, and call it back to get the answer that was decided."""
         try:
             while self._is_misplaced(path) and await self._renew(path):
-                self._counters.add("direct.moved")
+                self._shared.counters.add("direct.moved")
         finally:
             path.mover = None
 
     async def _renew(self, path: Path) -> bool:
-        """Ends the present connection of a subscriber, and calls it back; return whether that was done."""
-        uri, proxy, publication = self._uri(path), self._proxy_uri(path), self._publication(path)
-        if not uri or not proxy or publication is None:
+        """List without the proxy, end the connection, list with it; return whether that was done."""
+        uri, publication, session = self._uri(path), self._publication(path), self._shared.sessions.get(path.peer)
+        proxy = session.proxies.get(path.want.node) if session is not None else None
+        if not uri or proxy is None or publication is None:
             return False
         if path.endpoint is not None:
             if not await self._leave(path, path.endpoint):
                 return False
+        elif (stays := await self._end_earlier(path, self.target(path))) is not None:
+            self._put(path, stays)
+            return False
         else:
-            stays, problem = await self._end_earlier(path, self.target(path))
-            if stays is not None:
-                path.stuck = problem
-                self._answered(path, stays)
-                return False
-            await self._list(path, without=proxy)
+            await self._list(path, without=proxy.uri)
             publication.hang_up(path.want.user)
-        await forgotten(uri, path.want.name, proxy)
-        path.answered, path.endpoint, path.stranded, path.stuck = False, None, self._now(), ""
-        self._interrupted(path)
+        await forgotten(uri, path.want.name, proxy.uri)
+        self._put(path, LOST)
         await self._list(path)
         asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
         return True
 
     async def _leave(self, path: Path, endpoint: tuple[str, int]) -> bool:
-        """Ends the direct connection of a subscriber; return whether it has none any more."""
-        uri, topic = self._uri(path), path.want.name
-        links = await direct_links(uri, topic, endpoint) if uri else None
-        if links is None and standing(endpoint):
+        """End the direct connection of a subscriber; return whether it has none any more."""
+        uri, session = self._uri(path), self._shared.sessions.get(path.peer)
+        links = await bus_links(uri, path.want.name) if uri else None
+        if links is None and standing(*endpoint):
             return False  # the node is stopped: ``_check`` tries again
-        await self._list(path, without=self._proxy_uri(path))
-        if problem := await end_links(endpoint, links or ()):
+        proxy = session.proxies.get(path.want.node) if session is not None else None
+        await self._list(path, without=proxy.uri if proxy is not None else "")
+        if problem := await end_links(endpoint, [one for one in links or () if one.remote == endpoint]):
             if endpoint != self.target(path):  # it may be allowed again meanwhile
-                path.stuck = problem
                 self._warn_stuck(path, endpoint, problem)
             return False
         return True
 
     async def _list(self, path: Path, *, without: str = "") -> None:
-        """Tells a subscriber the publishers of its topic, as its master does."""
+        """Tell a subscriber the publishers of its topic, as its master does."""
         uri, topic = self._uri(path), path.want.name
         if uri:
             await publisher_update(
-                uri, topic, [one for one in self._core.publishers(topic).values() if one != without]
+                uri, topic, [one for one in self._shared.core.publishers(topic).values() if one != without]
             )
 
     def _list_again(self, path: Path) -> None:
-        """Repeats the list of publishers: a roscore's graph is known here with a delay, and calls may be lost."""
+        """Repeat the list of publishers: a roscore's graph is known here with a delay, and calls may be lost."""
         if not self._closed and path.mover is None:
             self._spawn(self._list(path), f"call back {path.want.user}")
 
     def _warn_stuck(self, path: Path, endpoint: tuple[str, int], problem: str) -> None:
-        source, user = self._source(path), path.want.user
+        source, user = _source(path), path.want.user
+        path.stuck = problem
         text = (
             f"{source}: {user} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves only when "
             f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
@@ -427,39 +390,37 @@ class DirectImporter(Paths):
     # --- watching direct connections --------------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """Begins to watch direct connections."""
-        watched = any(path.endpoint is not None or path.stranded is not None for path in self)
-        if self._checking is None and not self._closed and watched:
+        """Begin to watch direct connections."""
+        if self._checking is None and not self._closed and any(path.place not in {None, AGENTS} for path in self):
             self._checking = asyncio.get_running_loop().call_later(limits.DIRECT_CHECK, self._check)
 
     def _check(self) -> None:
-        """Compares the direct connections with the kernel's table; asks the nodes only where some are missing."""
+        """Compare the direct connections with the kernel's table; ask the nodes only where some are missing."""
         self._checking = None
         self._watch()
         settled: list[tuple[Path, tuple[str, int]]] = []
         for path in self:
             if not path.stuck:
                 self._place(path)
-            is_settled = path.mover is None and self._now() - path.answered_at > limits.DIRECT_SETTLE
+            is_settled = path.mover is None and self._now() - path.placed_at > limits.DIRECT_SETTLE
             if path.endpoint is not None and is_settled:
                 settled.append((path, path.endpoint))
         wanted = Counter(endpoint for _, endpoint in settled)
-        there = {address: standing_at(address) for address in {endpoint[0] for endpoint in wanted}}
-        short = {end for end, count in wanted.items() if len(there[end[0]].get(end[1], ())) < count}
+        there = {address: standing(address) for address in {endpoint[0] for endpoint in wanted}}
         for path, endpoint in settled:
-            if endpoint in short:
+            if len(there[endpoint[0]].get(endpoint[1], ())) < wanted[endpoint]:
                 self._spawn(self._check_one(path, endpoint), f"check {path.want.user}")
 
     async def _check_one(self, path: Path, endpoint: tuple[str, int]) -> None:
         uri = self._uri(path)
-        links = await direct_links(uri, path.want.name, endpoint) if uri else []
-        if not uri or links or path.endpoint != endpoint or self.get(path.peer, path.want) is not path:
+        links = await bus_links(uri, path.want.name) if uri else None
+        stands = any(one.connected and one.remote == endpoint for one in links or ())
+        if not uri or stands or path.endpoint != endpoint or self.get(path.peer, path.want) is not path:
             return
         if links is None:
-            self._core.suspect(path.want.user)
-        self._counters.add("direct.broken")
-        self._interrupted(path)
-        path.answered, path.endpoint, path.stranded, path.stuck = False, None, -math.inf, ""
+            self._shared.core.suspect(path.want.user)
+        self._shared.counters.add("direct.broken")
+        self._put(path, LOST, -math.inf)
         self.broke(path)
 
     async def close(self) -> None:
@@ -467,3 +428,7 @@ class DirectImporter(Paths):
         if self._checking is not None:
             self._checking.cancel()
         await super().close()
+
+
+def _source(path: Path) -> Source:
+    return Source(path.want.name, path.want.node)

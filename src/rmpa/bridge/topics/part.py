@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import actions as act
 from rmpa.bridge.data.quality import shown_seconds
-from rmpa.bridge.direct.nodes import LocalEndpoints
+from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.driver import GraphDriver
 from rmpa.bridge.messages import Advertise, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
 from rmpa.bridge.sessions import Part, UnchangedGraph
-from rmpa.bridge.topics.direct import DirectImporter
+from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.local import DirectExporter, LocalSources, LocalSubscriptions
+from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
 from rmpa.bridge.topics.subscribers import MismatchReports, RemoteSubscribers
 from rmpa.core.contract import Priority
@@ -107,21 +107,9 @@ class Topics(Part):
         self.losses = LossReports(self.exports, sessions, self._peers, rpc, counters, refusals)
         """Reports messages that do not reach their listeners."""
         self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals, gate)
-        self.direct_exports = DirectExporter(
-            core, self.exports, contracts, LocalEndpoints(core), sessions, rpc, counters, gate
-        )
+        self.direct_exports = TopicGrants(shared, self.exports)
         """Direct connections of peers' nodes to local publishers."""
-        self.direct_imports = DirectImporter(
-            core,
-            self.imports,
-            self._peers,
-            contracts,
-            sessions,
-            rpc,
-            on_warning=self._driver.warn,
-            counters=counters,
-            gate=gate,
-        )
+        self.direct_imports = TopicPaths(shared, self._driver.warn, self.imports, self._peers)
         """Direct connections of local nodes to peers' publishers."""
         self._local = LocalSources(core, shared.relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None
@@ -153,7 +141,7 @@ class Topics(Part):
             self._ticker.cancel()
         self._driver.close()
         await self.direct_imports.close()
-        await self.direct_exports.close()
+        await self.direct_exports.ports.close()
         self._subscribers.close()
         self.outbound.close()
 
@@ -167,8 +155,8 @@ class Topics(Part):
         policy, contracts, names, limits = context.policy, context.contracts, context.names, context.settings.limits
         self._act(self.exports.apply_rules(policy, contracts, names, limits))
         self._driver.rejudge(self.imports.apply_rules(policy, contracts, names, now, limits))
-        self.direct_exports.reload(contracts)
-        self.direct_imports.reload(contracts)
+        self.direct_exports.judge_again()
+        self.direct_imports.reload()
         self._look_at_all()
 
     def link_up(self, session: PeerSession) -> None:
@@ -206,9 +194,9 @@ class Topics(Part):
 
     def link_down(self, session: PeerSession) -> None:
         """Suspends the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
-        peer, crashed = session.peer, session.link.crashed
-        self.direct_imports.link_down(session, crashed=crashed)
-        self.direct_exports.link_down(session, crashed=crashed)
+        peer = session.peer
+        self.direct_imports.link_down(session)
+        self.direct_exports.link_down(session)
         interrupted = self._peers[peer].link_down()
         if interrupted:
             # Best-effort messages published until the next link get no sequence: their loss cannot be counted.

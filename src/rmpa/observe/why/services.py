@@ -508,13 +508,13 @@ class ServiceEvidence:
 
     def _transport(self, peer: int, service: str) -> ServiceTransport:
         direct = self._services.direct_imports
-        wanted, answer, unmet = (
+        wanted, address, unmet = (
             self._bridge.context.services.transport(service),
-            direct.answer(peer, service),
+            direct.address(peer, service),
             direct.unmet(peer, service),
         )
-        if answer is not None:
-            return ServiceTransport(wanted, answer.uri)
+        if address:
+            return ServiceTransport(wanted, address)
         if unmet is None:
             return ServiceTransport(wanted)
         return ServiceTransport(wanted, condition=unmet.condition, problem=unmet.text)

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.nodes import Condition, Grant, LocalEndpoints, Unmet
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want
+from rmpa.bridge.direct.grants import ServiceGrants
+from rmpa.bridge.direct.nodes import NodePorts, grant_at
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply
@@ -17,6 +19,11 @@ from tests.ros.node.peers import STRING
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
+
+
+def seen_at(own_address: str) -> Any:
+    """A peer that reaches this module at an address."""
+    return SimpleNamespace(peer=1, own_address=own_address)
 
 
 class Talker(PublicationEvents):
@@ -27,9 +34,7 @@ class Talker(PublicationEvents):
         self.asked: list[str] = []
         self.answer: RosReply | None = None
         self.node.add_publication(Publication("/t", "/talker", STRING, events=self))
-        self.services: dict[str, dict[str, str]] = {}
-        core = SimpleNamespace(state=lambda: SimpleNamespace(services=self.services))
-        self.endpoints = LocalEndpoints(cast("Any", core))
+        self.ports = NodePorts()
 
     def request(self, caller: str) -> Awaitable[RosReply | None]:
         self.asked.append(caller)
@@ -46,8 +51,8 @@ class Talker(PublicationEvents):
         return address[1]
 
     async def find(self, own_address: str = "127.0.0.1") -> Grant | Unmet:
-        session = cast("Any", SimpleNamespace(own_address=own_address))
-        return await self.endpoints.of_topic(session, "/talker", self.node.uri, "/t")
+        port = await self.ports.find("/talker", self.node.uri, "/t")
+        return port if isinstance(port, Unmet) else grant_at(seen_at(own_address), "/talker", port, "")
 
 
 @pytest.fixture
@@ -55,21 +60,13 @@ async def talker() -> AsyncIterator[Talker]:
     made = Talker()
     await made.node.start()
     yield made
-    await made.endpoints.close()
+    await made.ports.close()
     await made.node.close()
 
 
 def condition(found: Grant | Unmet) -> Condition:
     assert isinstance(found, Unmet), found
     return found.condition
-
-
-async def test_a_node_on_the_same_machine_is_granted_with_the_service_to_probe_it_by(talker: Talker) -> None:
-    assert await talker.find() == Grant(talker.port, "/talker", "")
-    talker.services["/talker/get_loggers"] = {"/talker": "rosrpc://127.0.0.1:1"}
-    assert await talker.find() == Grant(talker.port, "/talker", "/talker/get_loggers")
-    talker.services["/talker/get_loggers"] = {"/other": "rosrpc://127.0.0.1:1"}
-    assert await talker.find() == Grant(talker.port, "/talker", ""), "of another node"
 
 
 async def test_a_node_on_loopback_is_not_granted_to_another_machine(talker: Talker) -> None:
@@ -83,7 +80,7 @@ async def test_a_node_at_every_address_is_granted_to_all() -> None:
     await made.node.start()
     made.node.uri = made.node.uri.replace("0.0.0.0", "127.0.0.1")
     assert await made.find("10.88.0.1") == Grant(made.port, "/talker", "")
-    await made.endpoints.close()
+    await made.ports.close()
     await made.node.close()
 
 
@@ -93,7 +90,7 @@ async def test_several_questions_at_a_time_become_one_and_the_answer_is_known_fo
     assert talker.asked == ["/rmpa"]
     await talker.find()
     assert len(talker.asked) == 1
-    talker.endpoints.forget(talker.node.uri)
+    talker.ports.forget(talker.node.uri)
     await talker.find()
     assert len(talker.asked) == 2
 
@@ -127,22 +124,19 @@ async def test_a_port_at_which_nothing_listens_any_more_is_not_granted(talker: T
 async def test_a_dead_node_is_a_passing_reason(talker: Talker) -> None:
     uri = talker.node.uri
     await talker.node.close()
-    session = cast("Any", SimpleNamespace(own_address="127.0.0.1"))
-    found = await talker.endpoints.of_topic(session, "/talker", uri, "/t")
-    assert condition(found) is Condition.NODE
+    found = await talker.ports.find("/talker", uri, "/t")
     assert isinstance(found, Unmet)
-    assert not found.lasting
+    assert (found.condition, found.lasting) == (Condition.NODE, False)
 
 
 async def test_the_answers_of_many_nodes_are_remembered_within_a_bound(
     talker: Talker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "DIRECT_MAX", 3)
-    uri, session = talker.node.uri, cast("Any", SimpleNamespace(own_address="127.0.0.1"))
     for number in range(20):
         # The same node by other texts of its URI.
-        await talker.endpoints.of_topic(session, "/talker", uri + "x" * number, "/t")
-    assert len(talker.endpoints._ports) <= 3
+        await talker.ports.find("/talker", talker.node.uri + "x" * number, "/t")
+    assert len(talker.ports._ports) <= 3
 
 
 @pytest.mark.parametrize(
@@ -160,8 +154,11 @@ async def test_the_answers_of_many_nodes_are_remembered_within_a_bound(
     ],
 )
 async def test_the_port_of_a_service_is_that_of_its_uri(talker: Talker, uri: str, wanted: Condition | None) -> None:
-    session = cast("Any", SimpleNamespace(own_address="127.0.0.1"))
-    found = talker.endpoints.of_service(session, "/talker", uri.format(port=talker.port), "/talker/add")
+    offered = {"/talker/add": SimpleNamespace(uri=uri.format(port=talker.port))}
+    rpc = SimpleNamespace(on_request=lambda *_: None, on_notification=lambda *_: None)
+    shared, exports = SimpleNamespace(rpc=rpc), SimpleNamespace(offered=offered)
+    grants = ServiceGrants(cast("Any", shared), cast("Any", exports), lambda *_: None)
+    found = await grants._find(seen_at("127.0.0.1"), Want("/talker/add", "/talker"))
     if wanted is None:
         assert found == Grant(talker.port, "/talker", "/talker/add")
     else:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.direct.nodes import direct_links, end_from, end_links, end_to, publisher_update, standing
+from rmpa.bridge.direct.nodes import bus_links, end_all, end_links, publisher_update, standing
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.runtime import tcp_connections
-from rmpa.runtime.tcp_connections import may_end_connections
+from rmpa.runtime.tcp_connections import connections, may_end_connections
 from tests.ros.node.peers import STRING, until
 from tests.runtime.capabilities import NET_ADMIN, without
 
@@ -37,6 +37,10 @@ class Pair:
         assert found is not None
         return found
 
+    @property
+    def ports(self) -> set[int]:
+        return standing(*self.endpoint).get(self.endpoint[1], set())
+
 
 @pytest.fixture
 async def pair() -> AsyncIterator[Pair]:
@@ -53,49 +57,49 @@ async def pair() -> AsyncIterator[Pair]:
 
 
 async def test_a_subscriber_says_its_connection_and_the_kernel_too(pair: Pair) -> None:
-    links = await direct_links(pair.viewer.uri, "/t", pair.endpoint)
+    links = await bus_links(pair.viewer.uri, "/t")
     assert links is not None
     (link,) = links
-    assert standing(pair.endpoint) == {link.local_port}
-    assert await direct_links(pair.viewer.uri, "/other", pair.endpoint) == []
-    assert await direct_links(pair.viewer.uri, "/t", (pair.endpoint[0], pair.endpoint[1] + 1)) == []
-    assert await direct_links(pair.talker.uri, "/t", pair.endpoint) == [], "its own connections are outbound"
+    assert (link.connected, link.remote) == (True, pair.endpoint)
+    assert pair.ports == {link.local_port}
+    assert await bus_links(pair.viewer.uri, "/other") == []
+    assert await bus_links(pair.talker.uri, "/t") == [], "its own connections are outbound"
 
 
 async def test_a_node_that_does_not_answer_is_told_from_one_without_connections(pair: Pair) -> None:
     uri = pair.viewer.uri
     await pair.viewer.close()
-    assert await direct_links(uri, "/t", pair.endpoint) is None
+    assert await bus_links(uri, "/t") is None
     assert not await publisher_update(uri, "/t", [])
 
 
 @needs_right
 async def test_the_connection_of_one_subscriber_ends_and_those_of_others_stay(pair: Pair) -> None:
     with socket.create_connection(pair.endpoint) as other:
-        links = await direct_links(pair.viewer.uri, "/t", pair.endpoint)
+        links = await bus_links(pair.viewer.uri, "/t")
         (mine,) = {link.local_port for link in links or ()}
         assert await end_links(pair.endpoint, links or ()) == ""
-        assert mine not in standing(pair.endpoint)
-        assert other.getsockname()[1] in standing(pair.endpoint), "of another program"
+        assert mine not in pair.ports
+        assert other.getsockname()[1] in pair.ports, "of another program"
         assert await end_links(pair.endpoint, links or ()) == "", "there is none any more"
 
 
 @needs_right
 async def test_a_publishers_connections_to_one_address_end(pair: Pair) -> None:
-    assert end_from(pair.endpoint[1], "127.0.0.2") == ""
+    assert end_all(connections(local_port=pair.endpoint[1], remote=("127.0.0.2", None))) == ""
     assert pair.publication.listeners == ("/viewer",)
-    assert end_from(pair.endpoint[1], "127.0.0.1") == ""
-    await until(lambda: "/viewer" not in pair.publication.listeners or not standing(pair.endpoint))
+    assert end_all(connections(local_port=pair.endpoint[1], remote=("127.0.0.1", None))) == ""
+    await until(lambda: "/viewer" not in pair.publication.listeners or not pair.ports)
 
 
 async def test_without_the_right_the_reason_is_told(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     # As where the kernel (Yama) lets no process copy another one's descriptors.
     monkeypatch.setattr(tcp_connections, "_disconnect", lambda _: False)
-    ports = standing(pair.endpoint)
+    ports = pair.ports
     assert ports
     if may_end_connections():
-        problem = end_to(pair.endpoint, ports)
+        problem = end_all(connections(remote=pair.endpoint))
     else:
-        problem = await asyncio.to_thread(without, NET_ADMIN, lambda: end_to(pair.endpoint, ports))
+        problem = await asyncio.to_thread(without, NET_ADMIN, lambda: end_all(connections(remote=pair.endpoint)))
     assert "not permitted" in problem
-    assert standing(pair.endpoint) == ports
+    assert pair.ports == ports

@@ -5,12 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 
-from rmpa.bridge.direct.grants import DirectAsk, write
-from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.direct.conditions import Condition, DirectAsk
+from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.policy import PermissionGate
-from rmpa.bridge.services.direct import DirectServiceExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
@@ -40,15 +40,20 @@ class Module:
             on_notification=self._on,
             notify=lambda _, what, __: self.told.append(what),
         )
-        self.sut = DirectServiceExporter(
-            cast("Any", SimpleNamespace()),
+        self.sut = ServiceGrants(
+            cast(
+                "Any",
+                SimpleNamespace(
+                    sessions=SimpleNamespace(get={1: self.session}.get),
+                    rpc=rpc,
+                    counters=Counters(),
+                    context=SimpleNamespace(
+                        gate=PermissionGate(trust), services=SimpleNamespace(transport=lambda _: Transport.AUTO)
+                    ),
+                ),
+            ),
             cast("Any", SimpleNamespace(offered=self.offered, local=local)),
-            cast("Any", SimpleNamespace(transport=lambda _: Transport.AUTO)),
-            cast("Any", SimpleNamespace(get={1: self.session}.get)),
-            cast("Any", rpc),
-            on_warning=lambda *_: None,
-            counters=Counters(),
-            gate=PermissionGate(trust),
+            lambda *_: None,
         )
 
     def _on(self, what: str, handler: object, _needs: object) -> None:
@@ -56,7 +61,7 @@ class Module:
 
     async def ask(self) -> str:
         """Peer 1 asks for a direct call; returns the condition that is not met."""
-        reply = await self.handlers["direct.service"](self.session, write(DirectAsk("/add", "/adder")))
+        reply = await self.handlers["direct.service"](self.session, msgspec.to_builtins(DirectAsk("/add", "/adder")))
         return str(reply["why"])
 
     def restart(self) -> None:
@@ -85,6 +90,6 @@ async def test_what_a_reload_forbids_is_forgotten() -> None:
     module.permitted = True
     assert await module.ask() == Condition.TRUST
     module.permitted = False
-    module.sut.reload(module.sut._rules)
+    module.sut.judge_again()
     module.restart()
     assert module.told == []

@@ -6,16 +6,16 @@ import asyncio
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct import grants
-from rmpa.bridge.direct import grants as requests
-from rmpa.bridge.direct.grants import DirectAsk, Want
-from rmpa.bridge.direct.nodes import Condition, Grant, Unmet
+from rmpa.bridge.direct.conditions import Condition, DirectAsk, Grant, Unmet, Want
+from rmpa.bridge.direct.grants import TopicGrants
+from rmpa.bridge.direct.nodes import NodePorts
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
-from rmpa.bridge.topics.local import DirectExporter
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract, Contracts, Transport
 from rmpa.core.counters import Counters
@@ -71,36 +71,41 @@ class Module:
         self.handlers: dict[str, Any] = {}
         self.sessions = {number: self._session(number) for number in (1, 2)}
         self.permissions = PermissionGate()
-        state = SimpleNamespace(publishers=self.publishers, subscribers=self.subscribers)
-        monkeypatch.setattr(grants, "end_from", self._end_from)
-        self.sut = DirectExporter(
+        self.services: dict[str, dict[str, str]] = {}
+        monkeypatch.setattr(grants, "connections", lambda local_port, remote: [(local_port, remote[0])])
+        monkeypatch.setattr(grants, "end_all", self._end_all)
+        monkeypatch.setattr(grants, "grant_at", lambda _, node, port, probe: Grant(port, node, probe))
+        monkeypatch.setattr(NodePorts, "find", self._port)
+        monkeypatch.setattr(NodePorts, "forget", lambda _, uri: self.forgotten.append(uri))
+        self.context = SimpleNamespace(contracts=Contracts((), AUTO.transport), gate=self.permissions)
+        self.sut = TopicGrants(
             cast(
                 "Any",
                 SimpleNamespace(
-                    subscribers=lambda topic: state.subscribers.get(topic, {}),
-                    publishers=lambda topic: state.publishers.get(topic, {}),
-                    suspect=self.suspected.append,
-                    call=lambda method, *params: self.registered.append((method, *params)),
+                    core=SimpleNamespace(
+                        subscribers=lambda topic: self.subscribers.get(topic, {}),
+                        publishers=lambda topic: self.publishers.get(topic, {}),
+                        state=lambda: SimpleNamespace(services=self.services),
+                        suspect=self.suspected.append,
+                        call=lambda method, *params: self.registered.append((method, *params)),
+                    ),
+                    sessions=SimpleNamespace(get=self.sessions.get, linked=self.sessions.values),
+                    rpc=SimpleNamespace(
+                        on_request=self._on,
+                        on_notification=self._on,
+                        notify=lambda session, what, args: self.told.append((session.peer, what, args)),
+                    ),
+                    counters=Counters(),
+                    context=self.context,
                 ),
             ),
             cast("Any", SimpleNamespace(offered=self.offered, local=self._local)),
-            Contracts((), AUTO.transport),
-            cast("Any", SimpleNamespace(of_topic=self._of_topic, forget=self.forgotten.append)),
-            cast(
-                "Any",
-                SimpleNamespace(get=self.sessions.get, linked=self.sessions.values),
-            ),
-            cast(
-                "Any",
-                SimpleNamespace(
-                    on_request=self._on,
-                    on_notification=self._on,
-                    notify=lambda session, what, args: self.told.append((session.peer, what, args)),
-                ),
-            ),
-            Counters(),
-            self.permissions,
         )
+
+    def reload(self, transport: Transport) -> None:
+        """Other rules."""
+        self.context.contracts = Contracts((), transport)
+        self.sut.judge_again()
 
     def _on(self, what: str, handler: object, _needs: object) -> None:
         self.handlers[what] = handler
@@ -111,7 +116,7 @@ class Module:
 
     @staticmethod
     def _session(number: int) -> Any:
-        link = SimpleNamespace(name=f"peer{number}", silent=True)
+        link = SimpleNamespace(name=f"peer{number}", silent=True, crashed=False)
         return SimpleNamespace(
             peer=number,
             link=link,
@@ -124,14 +129,14 @@ class Module:
     def _local(self, _peer: int, source: Source) -> Source | None:
         return source if source in self.offered else None
 
-    def _end_from(self, port: int, address: str) -> str:
-        self.ended.append((port, address))
+    def _end_all(self, found: list[tuple[int, str]]) -> str:
+        self.ended += found
         return ""
 
-    async def _of_topic(self, _session: object, _node: str, uri: str, _topic: str) -> Grant | Unmet:
+    async def _port(self, _node: str, uri: str, _topic: str) -> int | Unmet:
         self.asked.append(uri)
         await self.gate.wait()
-        return self.found
+        return self.found.port if isinstance(self.found, Grant) else self.found
 
     async def open(
         self,
@@ -142,7 +147,7 @@ class Module:
         node: str = "/talker",
         broken: bool = False,
     ) -> dict[str, Any]:
-        args = requests.write(DirectAsk("/chatter", node, subscriber, contract, broken))
+        args = msgspec.to_builtins(DirectAsk("/chatter", node, subscriber, contract, broken))
         reply: dict[str, Any] = await self.handlers["direct.topic"](self.sessions[peer], args)
         return reply
 
@@ -170,6 +175,13 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Module:
     return Module(monkeypatch)
 
 
+async def test_a_grant_names_the_service_by_which_the_node_is_probed(module: Module) -> None:
+    module.services["/talker/get_loggers"] = {"/talker": "rosrpc://127.0.0.1:1"}
+    assert await module.open() == {"port": 45225, "probe": "/talker/get_loggers"}
+    module.services["/talker/get_loggers"] = {"/other": "rosrpc://127.0.0.1:1"}
+    assert await module.open() == {"port": 45225, "probe": ""}, "of another node"
+
+
 @pytest.mark.trap(12)
 async def test_a_subscriber_is_granted_the_publishers_port(module: Module) -> None:
     assert await module.open() == {"port": 45225, "probe": ""}
@@ -186,8 +198,10 @@ async def test_what_is_not_offered_or_not_allowed_is_refused(module: Module) -> 
     module.offered.clear()
     assert (await module.open())["why"] == Condition.OFFERED
     assert module.asked == []
-    with pytest.raises(RemoteProtocolError):
-        await module.handlers["direct.topic"](module.sessions[1], {"name": "x"})
+    for args in ({"name": "x"}, WANT._asdict(), {"name": "/chatter", "node": "/talker", "contract": {}}):
+        with pytest.raises(RemoteProtocolError):
+            await module.handlers["direct.topic"](module.sessions[1], args)
+    assert list(module.sut._asked) == [(1, WANT)], "of malformed questions nothing is kept"
 
 
 async def test_a_refusal_ends_the_earlier_grant(module: Module) -> None:
@@ -256,18 +270,21 @@ async def test_connections_end_where_a_host_may_have_vanished(
     module.sessions[1].link.silent = silent
     if shared:
         module.sessions[2].address = module.sessions[1].address
-    module.sut.link_down(module.sessions[1], crashed=crashed)
+    module.sessions[1].link.crashed = crashed
+    module.sut.link_down(module.sessions[1])
     assert module.ended == ([(45225, "10.0.0.1")] if ends else [])
 
 
 async def test_only_the_crash_of_a_peers_agent_leaves_its_grants_until_it_is_gone(module: Module) -> None:
     await module.open()
-    module.sut.link_down(module.sessions[1], crashed=True)
+    module.sessions[1].link.crashed = True
+    module.sut.link_down(module.sessions[1])
     assert module.granted == [(1, "/viewer")]
     module.sut.gone(module.sessions[1])
     assert module.granted == []
     await module.open()
-    module.sut.link_down(module.sessions[1], crashed=False)
+    module.sessions[1].link.crashed = False
+    module.sut.link_down(module.sessions[1])
     assert module.granted == []
 
 
@@ -277,7 +294,8 @@ async def test_what_a_peer_does_not_ask_for_after_a_new_link_ends(
     monkeypatch.setattr(limits, "DIRECT_ADOPT", 0.02)
     await module.open()
     await module.open(subscriber="/logger")
-    module.sut.link_down(module.sessions[1], crashed=True)
+    module.sessions[1].link.crashed = True
+    module.sut.link_down(module.sessions[1])
     module.sut.link_up(module.sessions[1])
     await module.open(subscriber="/logger")
     await until(lambda: module.granted == [(1, "/logger")])
@@ -300,14 +318,14 @@ async def test_the_grants_and_the_remembered_refusals_of_a_peer_are_bounded(
     replies = [await module.open(subscriber=f"/s{number}") for number in range(10)]
     assert [reply.get("why") for reply in replies] == [None] * 3 + [Condition.LIMIT] * 7
     assert await module.open(2) == {"port": 45225, "probe": ""}, "each peer has its own bound"
-    assert len(module.sut._all(1)) == 6
+    assert sum(peer == 1 for peer, _ in module.sut._asked) == 6
 
 
 async def test_new_rules_withdraw_and_let_others_try_again(module: Module) -> None:
     await module.open()
-    module.sut.reload(Contracts((), Transport.RELAY))
+    module.reload(Transport.RELAY)
     assert module.granted == []
-    module.sut.reload(Contracts((), Transport.AUTO))
+    module.reload(Transport.AUTO)
     assert [told[:2] for told in module.told] == [(1, AGAIN), (1, AGAIN)]
     assert await module.open() == {"port": 45225, "probe": ""}
 
@@ -330,7 +348,7 @@ async def test_a_reload_of_a_secured_mesh_withdraws_grants_and_ends_their_connec
     module.sessions[2].same_machine = True
     module.told.clear()
     module.permit(TrustSettings(direct=False))
-    module.sut.reload(Contracts((), AUTO.transport))
+    module.reload(Transport.AUTO)
     assert module.granted == [(2, "/other")], "the other one is on this machine"
     assert [told[:2] for told in module.told] == [(1, AGAIN)]
     assert module.ended == [(45225, "10.0.0.1")]
@@ -353,7 +371,7 @@ async def test_a_secured_peer_does_not_learn_when_a_topic_that_it_may_not_have_i
     assert (await module.open())["why"] == Condition.OFFERED
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=False)
     module.change(RegistrationKind.PUBLISHER, "/talker", URI, added=True)
-    module.sut.reload(Contracts((), AUTO.transport))
+    module.reload(Transport.AUTO)
     assert module.told == []
 
 
@@ -385,10 +403,12 @@ async def test_without_trust_a_peer_tries_again_when_a_topic_is_published(module
 
 async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
     await module.open()
-    module.sut.link_down(module.sessions[1], crashed=True)
-    assert module.sut.interruptions.get("peer1", WANT) is None, "the nodes go on"
-    module.sut.link_down(module.sessions[1], crashed=False)
-    lasting = module.sut.interruptions.get("peer1", WANT)
+    module.sessions[1].link.crashed = True
+    module.sut.link_down(module.sessions[1])
+    assert module.sut.interruptions.get(("peer1", WANT)) is None, "the nodes go on"
+    module.sessions[1].link.crashed = False
+    module.sut.link_down(module.sessions[1])
+    lasting = module.sut.interruptions.get(("peer1", WANT))
     assert lasting is not None
     assert lasting.ended is None
     module.sut.gone(module.sessions[1])

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.grants import Want
-from rmpa.bridge.direct.nodes import Condition
+from rmpa.bridge.direct.conditions import Condition, Want
 from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.topics import direct as direct_importer
-from rmpa.bridge.topics.direct import DirectImporter
+from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.core.contract import Contracts, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
@@ -81,38 +81,31 @@ class Module:
         self.callers: frozenset[str] = frozenset()
         publication = SimpleNamespace(callers=self.callers, listeners=())
         monkeypatch.setattr(direct_importer, "probe", self._probe)
-        monkeypatch.setattr(direct_importer, "standing", lambda _: {40_000} if self.connected else set())
-        monkeypatch.setattr(direct_importer, "standing_at", lambda _: {45225: {40_000}} if self.connected else {})
+        monkeypatch.setattr(direct_importer, "standing", lambda *_: {45225: {40_000}} if self.connected else {})
         monkeypatch.setattr(direct_importer, "bus_links", self._bus_links)
-        monkeypatch.setattr(direct_importer, "direct_links", self._bus_links)
         monkeypatch.setattr(direct_importer, "end_links", self._end_links)
         self.imports = Imports(self)
-        state = SimpleNamespace(subscribers=self.subscribers, publishers={}, nodes={})
-        self.sut = DirectImporter(
-            cast(
-                "Any",
-                SimpleNamespace(
-                    state=lambda: state,
-                    subscribers=lambda topic: state.subscribers.get(topic, {}),
-                    publishers=lambda _: {},
-                    suspect=lambda _: None,
-                    node_host="127.0.0.1",
-                ),
+        shared = SimpleNamespace(
+            core=SimpleNamespace(
+                subscribers=lambda topic: self.subscribers.get(topic, {}),
+                publishers=lambda _: {},
+                suspect=lambda _: None,
+                node_host="127.0.0.1",
             ),
+            sessions=SimpleNamespace(get={1: self.session}.get),
+            rpc=SimpleNamespace(
+                on_notification=lambda *_: None,
+                request=self._request,
+                notify=lambda _session, what, _args: self.told.append(what),
+            ),
+            counters=Counters(),
+            context=SimpleNamespace(contracts=Contracts((), Transport.AUTO), gate=OPEN_GATE),
+        )
+        self.sut = TopicPaths(
+            cast("Any", shared),
+            lambda _kind, _subject, text: self.warned.append(text),
             cast("Any", self.imports),
             cast("Any", {1: SimpleNamespace(publication=lambda _: publication)}),
-            Contracts((), Transport.AUTO),
-            cast("Any", SimpleNamespace(get={1: self.session}.get)),
-            cast(
-                "Any",
-                SimpleNamespace(
-                    on_notification=lambda *_: None,
-                    request=self._request,
-                    notify=lambda _session, what, _args: self.told.append(what),
-                ),
-            ),
-            on_warning=lambda _kind, _subject, text: self.warned.append(text),
-            counters=Counters(),
         )
         monkeypatch.setattr(self.sut, "_renew", self._renew)
 
@@ -258,7 +251,7 @@ async def test_why_a_peer_grants_nothing_decides_whether_it_is_asked_again(
 async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
-    module.sut.link_down(module.session, crashed=True)
+    module.sut.link_down(module.session)
     assert module.entry.direct
     other = SimpleNamespace(**{**vars(module.session), "peer": 2})
     module.sut.link_up(cast("Any", other))
@@ -272,10 +265,11 @@ async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module)
 async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
-    assert module.sut.interruptions.get("a", WANT) is None
-    module.sut.link_down(module.session, crashed=False)
+    assert module.sut.interruptions.get(("a", WANT)) is None
+    module.session.link.crashed = False
+    module.sut.link_down(module.session)
     module.sut.hidden(1, SOURCE)
-    lasting = module.sut.interruptions.get("a", WANT)
+    lasting = module.sut.interruptions.get(("a", WANT))
     assert lasting is not None
     assert (lasting.count, lasting.ended) == (1, None)
     module.sut.shown(1, SOURCE)
@@ -290,8 +284,9 @@ async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(modu
     await until(lambda: module.probed)
     early = module.reachable
     module.reachable = asyncio.Event()
-    module.sut.link_down(module.session, crashed=False)
-    module.session.link = SimpleNamespace(name="a", reachable=False)
+    module.session.link.crashed = False
+    module.sut.link_down(module.session)
+    module.session.link = SimpleNamespace(name="a", reachable=False, crashed=True)
     module.sut.link_up(module.session)
     await until(lambda: len(module.probed) == 2)
     early.set()  # it has reached the port, before the link was lost
@@ -312,7 +307,7 @@ async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_conne
     module.sut.shown(1, SOURCE)
     assert await module.ask() == DIRECT
     module.connected = [LINK]
-    module.sut.link_down(module.session, crashed=True)
+    module.sut.link_down(module.session)
     module.sut.gone(module.session)
     module.value = {"why": "listening", "text": "loopback"}
     module.sut.shown(1, SOURCE)

@@ -1,0 +1,258 @@
+"""What two agents say of one direct connection: the question, the grant, and each condition that fails as a reason.
+
+docs/contracts.md lists the conditions for users, docs/design/protocol.md has examples of the messages. Topics and
+services have the same three: ``direct.topic`` or ``direct.service`` asks, ``…_again`` makes the asking side ask
+again, ``…_release`` gives a grant back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, TypeVar
+
+import msgspec
+
+from rmpa.bridge import limits
+from rmpa.bridge.messages import Name, NameOrNone, is_crossing_name
+from rmpa.core.contract import Contract, Transport, needs_agents
+from rmpa.core.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from rmpa.bridge.policy import PermissionGate
+
+StructT = TypeVar("StructT", bound=msgspec.Struct)
+_TEXT_MAX: Final = 300
+"""Characters of a peer's text that are kept."""
+
+
+class Condition(StrEnum):
+    """A condition of direct transport; its value is the word in ``--json`` and between agents."""
+
+    TRANSPORT = "transport"
+    """The transport of the contract, or of the service's rule, is not ``relay``."""
+    CONTRACT = "contract"
+    """The contract asks for nothing that only agents do."""
+    NAME = "name"
+    """The topic or service has the same name in both modules: TCPROS headers carry it."""
+    OWN_SOURCE = "own_source"
+    """The source is the peer's own, and does not come by a relay."""
+    ACTION = "action"
+    """It is no topic whose publisher compares the names of its subscribers."""
+    RELEASE = "release"
+    """The peer's agent knows direct transport."""
+    AGENT = "agent"
+    """The peer's agent answers in time."""
+    OFFERED = "offered"
+    """The peer offers the topic or service now."""
+    NODE = "node"
+    """The publisher's node answers its agent."""
+    LISTENING = "listening"
+    """The publisher's node listens where the subscriber's module can reach it, not only on loopback."""
+    REACHABLE = "reachable"
+    """A connection from the subscriber's module to the publisher's node works."""
+    CALLER_ID = "caller_id"
+    """No other subscriber of the same name is connected to the publisher."""
+    SUBSCRIBER = "subscriber"
+    """The subscriber's node connects to other machines (ROS_IP and ROS_HOSTNAME do not bind it to loopback)."""
+    MEASURES = "measures"
+    """The subscriber is no tool that measures by the agents."""
+    LATCHED = "latched"
+    """No latched message would be delivered twice by the move."""
+    STABLE = "stable"
+    """Direct connections of this subscriber have not broken repeatedly."""
+    LIMIT = "limit"
+    """The peer's direct connections are within ``limits.DIRECT_MAX``."""
+    TRUST = "trust"
+    """The mesh is not secured, or both modules let plain connections cross (``trust.direct``), or share a machine."""
+    CORE = "core"
+    """The local core can answer each node by itself: services only."""
+
+
+_PASSING: Final = frozenset({Condition.AGENT, Condition.NODE, Condition.REACHABLE, Condition.STABLE, Condition.LIMIT})
+
+
+@dataclass(frozen=True, slots=True)
+class Unmet:
+    """A condition that does not hold, and the fact as text for the user."""
+
+    condition: Condition
+    text: str
+
+    @property
+    def lasting(self) -> bool:
+        """Whether only a change that is noticed can make it hold, so that trying again by time is of no use."""
+        return self.condition not in _PASSING
+
+
+NO_LINK: Final = Unmet(Condition.OFFERED, "its module has no link")
+"""What holds while there is no link."""
+
+
+class Grant(NamedTuple):
+    """A peer's permission to connect to one of its nodes.
+
+    Args:
+        port: The node's TCPROS port; the address is that of the link.
+        node: The node's name in the peer's graph.
+        probe: A service of the node, by which it is probed; empty: none is known.
+    """
+
+    port: int
+    node: str
+    probe: str = ""
+
+
+def unmet_by_trust(gate: PermissionGate, where: str, *, same_machine: bool) -> Unmet | None:
+    """The condition that a secured mesh does not meet, if any.
+
+    Args:
+        gate: Whether the mesh is secured, and whether plain connections are let all the same.
+        where: Whose setting that is, as text.
+        same_machine: Whether both modules are on one machine, so that the connection does not leave it.
+    """
+    if gate.plain or same_machine:
+        return None
+    text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
+    return Unmet(Condition.TRUST, text)
+
+
+def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
+    """The condition that a contract does not meet, if any.
+
+    Args:
+        contract: The contract.
+        where: Whose it is, as text.
+    """
+    if contract.transport is Transport.RELAY:
+        return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
+    terms = needs_agents(contract)
+    return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None
+
+
+# --- messages ------------------------------------------------------------------------------------------------------
+
+
+class Want(NamedTuple):
+    """What is to be reached directly.
+
+    Args:
+        name: The topic or service, by its name on the wire.
+        node: The node that publishes or provides it.
+        user: The subscribing node; empty: a service, for every node of the asking module.
+    """
+
+    name: str
+    node: str
+    user: str = ""
+
+
+class DirectAsk(msgspec.Struct, frozen=True, omit_defaults=True):
+    """May this be reached directly? A notification has the fields of ``Want`` alone.
+
+    Args:
+        name: As in ``Want``.
+        node: As in ``Want``.
+        user: As in ``Want``.
+        contract: What the subscriber's module asks for; topics only.
+        broken: Whether an earlier connection ended by itself, so that the publisher may be dead.
+    """
+
+    name: Name
+    node: Name
+    user: NameOrNone = ""
+    contract: Contract | None = None
+    broken: bool = False
+
+    @property
+    def want(self) -> Want:
+        """What is asked for."""
+        return Want(self.name, self.node, self.user)
+
+
+def read_ask(args: dict[str, Any]) -> DirectAsk:
+    """Read and validate a question or a notification.
+
+    Raises:
+        RemoteProtocolError: A name or a value is invalid.
+    """
+    return _read(args, DirectAsk)
+
+
+class _Reply(msgspec.Struct, frozen=True):
+    """The answer of the owner's agent: a port, or a reason."""
+
+    port: Annotated[int, msgspec.Meta(gt=0, lt=1 << 16)] | None = None
+    probe: str = ""
+    why: str | None = None
+    text: str = ""
+
+
+def read_reply(value: object, node: str) -> Grant | Unmet:
+    """Read the answer of a peer. A reason's text is safe to show; one of a later release counts as ``RELEASE``.
+
+    Args:
+        value: What the peer sent.
+        node: The node that was asked for.
+
+    Raises:
+        RemoteProtocolError: It is neither a port nor a reason.
+    """
+    reply = _read(value, _Reply)
+    if reply.port is not None:
+        return Grant(reply.port, node, reply.probe if is_crossing_name(reply.probe) else "")
+    if reply.why is None:
+        raise RemoteProtocolError("direct transport: an answer has neither a port nor a reason")
+    condition = Condition(reply.why) if reply.why in set(Condition) else Condition.RELEASE
+    return Unmet(condition, "".join(one if one.isprintable() else "�" for one in reply.text[:_TEXT_MAX]))
+
+
+def reply_of(found: Grant | Unmet) -> dict[str, object]:
+    """The answer to a peer."""
+    if isinstance(found, Grant):
+        return {"port": found.port, "probe": found.probe}
+    return {"why": found.condition.value, "text": found.text}
+
+
+def _read(value: object, kind: type[StructT]) -> StructT:
+    try:
+        return msgspec.convert(value, kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise RemoteProtocolError(f"direct transport: {error}") from error
+
+
+# --- what was lost -------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Interruption:
+    """That a subscriber was without its direct path: what was published meanwhile is lost to it, and not counted.
+
+    Args:
+        count: How often.
+        began: When the last one began, monotonic seconds.
+        ended: When it ended; ``None`` while it lasts.
+    """
+
+    count: int
+    began: float
+    ended: float | None = None
+
+
+class Interruptions(dict[tuple[str, Want], Interruption]):
+    """The interruptions of direct paths, by the peer's name and what is reached. They outlast links."""
+
+    def begin(self, peer: str, want: Want, now: float) -> None:
+        """Note that a path is gone; does nothing while it was gone already."""
+        found = self.pop((peer, want), None) or Interruption(0, now, now)
+        if found.ended is not None:
+            found = Interruption(found.count + 1, now)
+        self[peer, want] = found
+        if len(self) > limits.DIRECT_MAX:
+            del self[next(iter(self))]
+
+    def end(self, peer: str, want: Want, now: float) -> None:
+        """Note that a subscriber has a path again, direct or relayed."""
+        found = self.get((peer, want))
+        if found is not None and found.ended is None:
+            found.ended = now
