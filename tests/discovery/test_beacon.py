@@ -13,7 +13,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind, BeaconMalformed, BeaconOtherDomain, BeaconOtherVersion
+from rmpa.discovery.beacon import MALFORMED, OTHER_DOMAIN, OTHER_VERSION, Beacon, BeaconKind, BeaconRefused
 from tests.fuzz import target_beacon
 
 GOLDEN = bytes.fromhex(
@@ -51,10 +51,10 @@ def test_where_gossiped_peers_are_heard_follows_if_it_is_said() -> None:
     assert Beacon.parse(wire, 5) == observed
     assert Beacon.parse(wire + b"later", 5) == observed
     for length in range(len(GOLDEN), len(wire)):
-        with pytest.raises(BeaconMalformed):
+        with pytest.raises(BeaconRefused, match="malformed"):
             Beacon.parse(wire[:length], 5)
     for damaged in ("41 c0a807039c43", "01 e0a807039c43", "01 c0a807030000", "01 000000019c43"):
-        with pytest.raises(BeaconMalformed):
+        with pytest.raises(BeaconRefused, match="malformed"):
             Beacon.parse(GOLDEN[:-1] + bytes.fromhex(damaged), 5)
 
 
@@ -64,7 +64,7 @@ def test_bytes_behind_are_left_for_later_versions() -> None:
 
 @pytest.mark.parametrize("length", range(len(GOLDEN)))
 def test_every_shorter_packet_is_malformed(length: int) -> None:
-    with pytest.raises(BeaconMalformed):
+    with pytest.raises(BeaconRefused, match="malformed"):
         Beacon.parse(GOLDEN[:length], 5)
 
 
@@ -85,17 +85,17 @@ def test_too_long_a_packet_is_refused_before_anything_else() -> None:
 
 
 def test_another_domain_is_told_first() -> None:
-    with pytest.raises(BeaconOtherDomain, match="is of domain 5"):
-        Beacon.parse(GOLDEN, 6)
-    with pytest.raises(BeaconOtherDomain):
-        Beacon.parse(GOLDEN[:4] + b"\x03" + GOLDEN[5:8], 6)
+    for data in (GOLDEN, GOLDEN[:4] + b"\x03" + GOLDEN[5:8]):
+        with pytest.raises(BeaconRefused, match="is of domain 5") as refused:
+            Beacon.parse(data, 6)
+        assert refused.value.counter == OTHER_DOMAIN
 
 
 def test_other_version_is_recognised_by_eight_bytes() -> None:
-    with pytest.raises(
-        BeaconOtherVersion, match="speaks version 3 of the protocol, we speak 2: update the older one"
-    ):
+    text = "speaks version 3 of the protocol, we speak 2: update the older one"
+    with pytest.raises(BeaconRefused, match=text) as refused:
         Beacon.parse(GOLDEN[:4] + b"\x03" + GOLDEN[5:8], 5)
+    assert refused.value.counter == OTHER_VERSION
 
 
 @pytest.mark.parametrize(
@@ -113,17 +113,27 @@ def test_other_version_is_recognised_by_eight_bytes() -> None:
         (41, b"b\xffse", "malformed"),
         (41, b"b\nse", "not a ROS base name"),
         (41, b"/ase", "not a ROS base name"),
-        (45, b"\x09", "9 addresses"),
+        (45, b"\x09", "ends inside its addresses"),
         (46, b"\xef\x00\x00\x01", "no peer can be reached at 239.0.0.1"),
-        (50, b"\x41", "65 gossiped peers"),
+        (50, b"\x41", "ends inside its gossip"),
         (50, b"\x03", "ends inside its gossip"),
         (51, b"\xe0", "no gossiped peer"),
         (55, b"\x00\x00", "no gossiped peer"),
     ],
 )
 def test_malformed(offset: int, replacement: bytes, problem: str) -> None:
-    with pytest.raises(BeaconMalformed, match=problem):
+    with pytest.raises(BeaconRefused, match=problem) as refused:
         Beacon.parse(GOLDEN[:offset] + replacement + GOLDEN[offset + len(replacement) :], 5)
+    assert refused.value.counter == MALFORMED
+
+
+@pytest.mark.parametrize(
+    "counted",
+    ["09 " + "c0a80002" * 9 + "00 00", "00 41 " + "0a0000029c420000" * 65 + "00", "00 00 41" + "0a0000029c42" * 65],
+)
+def test_more_than_a_beacon_may_carry_is_malformed(counted: str) -> None:
+    with pytest.raises(BeaconRefused, match="carries at most"):
+        Beacon.parse(GOLDEN[:45] + bytes.fromhex(counted), 5)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.announcing import BeaconSender
-from rmpa.discovery.beacon import BeaconKind, HeardBy, SendMulticast, SendUnicast
+from rmpa.discovery.beacon import BeaconKind
 from rmpa.discovery.endpoints import Endpoint, EndpointTable, PeerInstance
 
 OWN = Identity(Guid.of("10.0.0.1", 40_001, 7), bytes(16), "own")
@@ -23,13 +23,10 @@ class Bench:
     def peer(self, number: int, address: str = "10.0.0.2") -> PeerInstance:
         """A peer that was heard by multicast at 0."""
         guid = Guid.of(address, 40_000 + number, 7)
-        peer = PeerInstance(
-            Identity(guid, bytes([number]) * 16, f"p{number}"), 0.0, 0.0, 3.0, HeardBy.MULTICAST, HeardBy.MULTICAST
-        )
+        peer = PeerInstance(Identity(guid, bytes([number]) * 16, f"p{number}"), 0.0, 0.0, "multicast", 3.0)
         peer.multicast_at = 0.0
-        endpoint = Endpoint(peer)
-        endpoint.present = True
-        self.endpoints.add(guid.place, endpoint)
+        self.endpoints[guid.place] = Endpoint({peer.identity.instance: peer}, peer, member=peer.identity)
+        self.endpoints.index(guid.place)
         return peer
 
 
@@ -46,7 +43,7 @@ def test_nothing_is_sent_behind_a_goodbye() -> None:
     bench = Bench()
     bench.sender.send_goodbye([bench.peer(2)])
     sent = bench.sender.take()
-    assert [type(one) for one in sent] == [SendMulticast, SendUnicast]
+    assert [one.address for one in sent] == [None, ("10.0.0.2", 40_002)]
     assert {one.beacon.kind for one in sent} == {BeaconKind.GOODBYE}
     bench.sender.send(BeaconKind.ANNOUNCE, ("10.0.0.2", 1))
     assert bench.sender.take() == []

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import earliest
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted, RunDoubted, SendMulticast
-from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.membership import RESTARTED, MembershipProtocol
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Hello
 from rmpa.mesh.keepalive import CloseLink, Dial, LinkDown, LinkUp, RestPace
@@ -20,7 +19,9 @@ from rmpa.mesh.peering import Peering
 from tests.simulation.large_network import TCP_BYTES, Link
 
 if TYPE_CHECKING:
-    from rmpa.discovery.beacon import Address, Beacon, Event, LossReason, Output
+    from rmpa.discovery.announcing import OutgoingBeacon
+    from rmpa.discovery.beacon import Address, Beacon
+    from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.keepalive import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 
@@ -142,7 +143,7 @@ class Module:
         self.network.world.after(lease, lambda: self._end(link, "silent", silent=True))
 
     def _present(self) -> set[int]:
-        return {view.identity.guid.place for view in self.membership.peers() if view.present}
+        return {view.run.identity.guid.place for view in self.membership.peers() if view.present}
 
     def change_offers(self) -> None:
         """A node of this module advertises something new."""
@@ -180,7 +181,7 @@ class Module:
         if not self._flushing:
             self._deliver(self.membership.outputs(), self.membership.events())
 
-    def _deliver(self, outputs: list[Output], events: list[Event]) -> None:
+    def _deliver(self, outputs: list[OutgoingBeacon], events: list[PeerEvent]) -> None:
         """Begin with these of the membership protocol."""
         self._flushing = True
         busy = True
@@ -188,7 +189,7 @@ class Module:
             busy = False
             for output in outputs:
                 size = len(output.beacon.serialize())
-                if isinstance(output, SendMulticast):
+                if output.address is None:
                     self.network.multicast(self, output.beacon, size)
                 else:
                     self.network.unicast(self, output.address, output.beacon, size)
@@ -224,27 +225,21 @@ class Module:
         if self.metered:
             self.cpu += time.process_time() - began
 
-    def _on_event(self, event: Event) -> None:
-        now = self.network.now
-        match event:
-            case PeerFound(identity=identity, source=source):
-                self.tally.members += 1
-                self.peering.peer_found(identity, now, source[0] if source else None)
-            case PeerChanged(identity=identity):
-                self.peering.peer_found(identity, now)
-            case PeerRestarted(identity=identity, previous=previous, source=source):
-                self.peering.peer_gone(previous.guid, now)
-                self._forget(previous)
-                self.peering.peer_found(identity, now, source[0] if source else None)
-            case PeerLost(identity=identity, reason=reason):
-                self.tally.members -= 1
-                self._judge_loss(identity, reason)
-                self.peering.peer_gone(identity.guid, now)
-                self._forget(identity)
-            case RunDoubted(identity=identity):
-                self._check_link(identity.guid.place)
-            case _:
-                pass
+    def _on_event(self, event: PeerEvent) -> None:
+        now, identity = self.network.now, event.identity
+        if event.change == "found":
+            self.tally.members += 1
+            self.peering.peer_found(identity, now, event.source[0] if event.source else None)
+        elif event.change == "changed":
+            self.peering.peer_found(identity, now)
+        elif event.change == "lost":
+            self.tally.members -= 1
+            if event.reason != RESTARTED:
+                self._judge_loss(identity, event.reason)
+            self.peering.peer_gone(identity.guid, now)
+            self._forget(identity)
+        elif event.change == "doubted":
+            self._check_link(identity.guid.place)
 
     def _check_link(self, place: int) -> None:
         """Wake a link whose other end may be gone: it ends if that end does not answer."""
@@ -253,11 +248,11 @@ class Module:
                 ended = functools.partial(self.link_ended, number, "silent", self.run, silent=True)
                 self.network.world.after(mesh_limits.WAKE_TIMEOUT, ended)
 
-    def _judge_loss(self, identity: Identity, reason: LossReason) -> None:
+    def _judge_loss(self, identity: Identity, reason: str) -> None:
         module = self.network.modules.get(identity.guid.endpoint)
         if module is not None and module.identity.instance == identity.instance and self._reaches(module):
             self.tally.lost_falsely += 1
-            self.network.world.note(self.name, f"lost {identity.name} falsely: {reason.value}")
+            self.network.world.note(self.name, f"lost {identity.name} falsely: {reason}")
 
     def _reaches(self, module: Module) -> bool:
         return self.network.reaches(self.address[0], module.address[0])

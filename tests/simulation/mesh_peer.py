@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, cast
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters
-from rmpa.discovery.beacon import PeerChanged, PeerFound, PeerLost, PeerRestarted
 from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.discovery.beacon import Event as RosterEvent
+    from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.frames import FrameKind, Lane
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.keepalive import LinkDown
@@ -156,13 +155,13 @@ class MeshPeer(RosterPeer):
 
     # --- events of discovery --------------------------------------------------------------------------------
 
-    def on_event(self, event: RosterEvent) -> None:
+    def on_event(self, event: PeerEvent) -> None:
         """Pass an event of discovery to the mesh."""
         super().on_event(event)
-        if isinstance(event, PeerFound | PeerRestarted):
+        if event.change == "found":
             source = event.source[0] if event.source else None
             self.process.run(self.mesh.peer_found, event.identity, source)
-        elif isinstance(event, PeerChanged):
+        elif event.change == "changed":
             self.process.run(self.mesh.peer_found, event.identity)
-        elif isinstance(event, PeerLost):
-            self.process.run(self.mesh.peer_gone, event.guid)
+        elif event.change == "lost":
+            self.process.run(self.mesh.peer_gone, event.identity.guid)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.beacon import Beacon, Event, SendMulticast
-from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.beacon import Beacon
+from rmpa.discovery.membership import MembershipProtocol, PeerEvent
 
 if TYPE_CHECKING:
     from tests.simulation.network import Address, Network
@@ -77,15 +77,15 @@ class RosterPeer:
 
     def view(self) -> tuple[Identity, ...]:
         """The identities in the roster."""
-        return tuple(v.identity for v in self.roster.peers() if v.present)
+        return tuple(v.run.identity for v in self.roster.peers() if v.present)
 
     def troubles(self) -> list[str]:
         """Conflicts that the roster reports."""
         return [text for v in self.roster.peers() for text in v.conflicts]
 
-    def on_event(self, event: Event) -> None:
+    def on_event(self, event: PeerEvent) -> None:
         """Write an event of the roster into the trace."""
-        self.world.note(self.name, f"= {type(event).__name__} {event.identity}")
+        self.world.note(self.name, f"= {event.change} {event.identity}")
 
     def _datagram(self, data: bytes, source: Address, multicast: bool) -> None:
         try:
@@ -102,7 +102,7 @@ class RosterPeer:
         """Send the roster's datagrams, report its events, set its timer."""
         for output in self.roster.outputs():
             data = output.beacon.serialize()
-            if isinstance(output, SendMulticast):
+            if output.address is None:
                 self.world.note(self.name, f"> group {output.beacon}")
                 self.network.multicast(self.address, data)
             else:

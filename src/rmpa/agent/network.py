@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.beacon import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted, RunDoubted
 from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh import limits as mesh_limits
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.agent.trust import AgentTrust
     from rmpa.bridge.bridge import Bridge
     from rmpa.config.settings import Settings
-    from rmpa.discovery.beacon import Event
+    from rmpa.discovery.membership import PeerEvent
     from rmpa.discovery.network import Interface
     from rmpa.mesh.io.link import PeerLink
 
@@ -101,7 +100,6 @@ class NetworkEndpoint:
             udp,
             on_event=self._event,
             on_interfaces=self._interfaces,
-            clock=clock,
             trust=trust.membership.packets if trust is not None else None,
         )
         self._udp = udp
@@ -123,27 +121,22 @@ class NetworkEndpoint:
         (self._members.add if present else self._members.discard)(guid)
         self.mesh.count_peers(len(self._members))
 
-    def _event(self, event: Event) -> None:
-        match event:
-            case PeerFound(identity=identity, source=source):
+    def _event(self, event: PeerEvent) -> None:
+        identity = event.identity
+        match event.change:
+            case "found":
                 _log.info("+ %s found", identity)
                 self._count(identity.guid, present=True)
-                self.mesh.peer_found(identity, source[0] if source else None)
-            case PeerChanged(identity=identity):
+                self.mesh.peer_found(identity, event.source[0] if event.source else None)
+            case "changed":
                 self.mesh.peer_found(identity)
-            case PeerRestarted(identity=identity, previous=previous, source=source):
-                _log.info("+ %s restarted, it was %s", identity, previous.guid)
-                self._count(previous.guid, present=False)
-                self._count(identity.guid, present=True)
-                self.mesh.peer_gone(previous.guid)
-                self.mesh.peer_found(identity, source[0] if source else None)
-            case PeerLost(identity=identity, reason=reason):
-                _log.info("- %s %s", identity, reason.value)
+            case "lost":
+                _log.info("- %s %s", identity, event.reason)
                 self._count(identity.guid, present=False)
                 self.mesh.peer_gone(identity.guid)
-            case RunDoubted(identity=identity):
+            case "doubted":
                 self._check_link(identity.guid)
-            case PeerConflict():
+            case "conflict":
                 pass  # discovery has logged the error, at a bounded rate
 
     def _check_link(self, guid: Guid) -> None:

@@ -1,7 +1,4 @@
-"""Runs the membership protocol on UDP sockets, and judges packets before they are parsed.
-
-Runs the membership protocol: UDP sockets, timer, interfaces and seeds.
-"""
+"""Runs the membership protocol on UDP sockets, with its timer, interfaces and seeds; judges packets first."""
 
 from __future__ import annotations
 
@@ -9,37 +6,29 @@ import asyncio
 import contextlib
 import logging
 import random
+import time
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
+from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters, RefusalLog, TokenBucket
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.discovery import limits
-from rmpa.discovery import network as sockets
+from rmpa.discovery import limits, network
+from rmpa.discovery.announcing import AddressLimit
 from rmpa.discovery.beacon import (
+    MALFORMED,
+    OTHER_DOMAIN,
+    OTHER_VERSION,
     RUN_AT,
     Beacon,
-    BeaconOtherDomain,
-    BeaconOtherVersion,
-    PeerConflict,
-    SendMulticast,
-    Strangers,
+    BeaconKind,
+    BeaconRefused,
     sender_of,
 )
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.network import (
-    Interface,
-    InterfaceWatcher,
-    SeedResolver,
-    choose,
-    further_addresses,
-    list_interfaces,
-    resolve_ipv4,
-    unknown_names,
-)
-from rmpa.runtime.loop import MachineTimer, SystemClock, yield_to_data
+from rmpa.runtime.loop import MachineTimer, yield_to_data
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import KeyPurpose, Verdict
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
@@ -47,17 +36,14 @@ from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
-    from ipaddress import IPv4Address
 
     from rmpa.config.settings import Settings
-    from rmpa.core.counters import Clock
     from rmpa.core.identity import Guid, Identity
-    from rmpa.discovery.beacon import Address, Event, Output, PeerView, Stranger
+    from rmpa.discovery.beacon import Address
+    from rmpa.discovery.endpoints import PeerView
+    from rmpa.discovery.membership import PeerEvent
+    from rmpa.discovery.network import Interface
     from rmpa.trust.packets import PacketTrust, Verification
-
-
-# Filters the packets of the discovery sockets: drops repeats, floods and malformed packets, and parses the rest.
-
 
 _log = logging.getLogger(__name__)
 
@@ -70,46 +56,27 @@ _REFUSED: Final = {
 """What is told of the senders of packets that are refused; repeats are only counted."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recognised:
-    """A beacon whose sender has only an older group key: nothing in it is proved.
+@dataclass(slots=True)
+class Stranger:
+    """A module that is heard in the network and is not of this mesh. Nothing that it says is proved.
 
     Args:
-        beacon: What it says.
-        key: The low 16 bits of the key's number.
+        identity: As its last beacon said.
+        problem: Why its beacons are refused, and what to do.
+        since: When it was first heard, monotonic seconds.
+        heard: When it was last heard.
     """
 
-    beacon: Beacon
-    key: int
-
-
-class AddressLimit:
-    """Allows each address so many packets in one second, and forgets the address that was silent for longest.
-
-    Args:
-        rate: Packets a second of one address.
-        addresses: How many are remembered.
-    """
-
-    def __init__(self, rate: int, addresses: int) -> None:
-        self._rate = rate
-        self._addresses = addresses
-        self._counts: OrderedDict[str, tuple[float, int]] = OrderedDict()
-
-    def take(self, host: str, now: float) -> bool:
-        """Count a packet; return whether it is allowed."""
-        since, count = self._counts.get(host, (now, 0))
-        if now - since >= 1.0:
-            since, count = now, 0
-        self._counts[host] = (since, count + 1)
-        self._counts.move_to_end(host)
-        if len(self._counts) > self._addresses:
-            self._counts.popitem(last=False)
-        return count < self._rate
+    identity: Identity
+    problem: str
+    since: float
+    heard: float
 
 
 class PacketFilter:
-    """Parses packets; those that are dropped are counted.
+    """Parses the packets of the discovery sockets; those that are dropped are counted.
+
+    Dropped are repeats, floods, and in a secured mesh packets without a valid proof.
 
     Args:
         domain: This agent's domain id.
@@ -133,21 +100,24 @@ class PacketFilter:
         self._domain = domain
         self._counters = counters
         self._is_verified = is_verified
+        self._refusals = RefusalLog(_log, counters)
+        # The limits, one for each kind of packet and each kind of sender: they are more than twelve fields together.
         self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
-        self.strangers = Strangers()
-        """The modules whose beacons are refused, for the user."""
+        self._recent: OrderedDict[bytes, None] = OrderedDict()
+        self._sources: AddressLimit[str] = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
+        self._old_key_sources: AddressLimit[str] = AddressLimit(
+            trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX
+        )
+        self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
+        self._strangers: dict[tuple[str, int], Stranger] = {}
+        self._stranger_beacons = TokenBucket(limits.STRANGER_BEACONS_PER_SECOND, limits.STRANGER_BEACONS_PER_SECOND)
         self.overrun = False
         """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
-        self._refusals = RefusalLog(_log, counters)
-        self._recent: OrderedDict[bytes, None] = OrderedDict()
-        self._sources = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
-        self._old_key_sources = AddressLimit(trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX)
-        self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
-    ) -> Beacon | Recognised | None:
+    ) -> tuple[Beacon, int | None] | None:
         """What a packet contains; ``None`` if it is dropped, which is counted and, where it helps, logged.
 
         Other domains have other ports, so their multicasts are ignored silently. A unicast of another domain is
@@ -159,21 +129,36 @@ class PacketFilter:
             now: Monotonic seconds.
             multicast: Whether it came to the group.
             interface: The index of the interface it came in by: each has a limit of its own.
+
+        Returns:
+            The beacon; and the low 16 bits of the number of the older group key by which it is signed: then nothing
+            in it is proved. ``None`` in place of them: it is of a member.
         """
         host, _ = source
         # First, where there is a proof: packets with the forged source of a member must not count as its flood.
         if self._trust is not None:
             proof = self._verify(self._trust, data, host, now)
-            if proof is None or proof.verdict is Verdict.OLD_KEY:
-                return self._recognise(data, proof.key) if proof is not None else None
+            if proof is None:
+                return None
+            if proof.verdict is Verdict.OLD_KEY:
+                with contextlib.suppress(RemoteProtocolError):
+                    return Beacon.parse(data, self._domain), proof.key
+                self._counters.add(MALFORMED)
+                return None
         if not self._sources.take(host, now):
-            self._refusals.refuse(
-                now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
-            )
+            text = f"{host} sends too many packets to the discovery port; the rest is ignored"
+            self._refusals.refuse(now, "beacon.flood", host, text)
             return None
         if self._trust is None and not self._is_new(data):
             return None
-        return self._read(data, host, now, multicast=multicast, interface=interface)
+        beacon = self._read(data, host, now, multicast=multicast, interface=interface)
+        return None if beacon is None else (beacon, None)
+
+    def strangers(self, now: float) -> tuple[Stranger, ...]:
+        """The modules whose beacons are refused and were heard lately, in the order in which they were found."""
+        for key in [key for key, one in self._strangers.items() if now - one.heard > limits.STRANGER_KEPT]:
+            del self._strangers[key]
+        return tuple(self._strangers.values())
 
     def _read(self, data: bytes, host: str, now: float, *, multicast: bool, interface: int) -> Beacon | None:
         """Parse a packet within the limits of its sender."""
@@ -183,20 +168,21 @@ class PacketFilter:
                 self._counters.add("beacon.unlinked_limited")
                 return None
             packet = Beacon.parse(data, self._domain)
-        except BeaconOtherDomain as error:
-            if multicast:
-                self._counters.add("beacon.other_domain")
-            else:
-                remedy = f"we are of domain {self._domain}: start both with the same --domain (ROS_DOMAIN_ID)"
-                self._refusals.refuse(now, "beacon.other_domain", host, f"the peer at {host} {error}, {remedy}")
-        except BeaconOtherVersion as error:
-            self._refusals.refuse(now, "beacon.version", host, f"the peer at {host} {error}")
         except RemoteProtocolError as error:
-            self._refusals.refuse(now, "beacon.malformed", host, f"from {host}: {error}; is another program there?")
-        else:
-            self._counters.add("beacon.in")
-            return packet
-        return None
+            counter = error.counter if isinstance(error, BeaconRefused) else MALFORMED
+            if counter == OTHER_DOMAIN and multicast:
+                self._counters.add(counter)
+                return None
+            remedy = f"we are of domain {self._domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+            texts = {
+                OTHER_DOMAIN: f"the peer at {host} {error}, {remedy}",
+                OTHER_VERSION: f"the peer at {host} {error}",
+            }
+            text = texts.get(counter, f"from {host}: {error}; is another program there?")
+            self._refusals.refuse(now, counter, host, text)
+            return None
+        self._counters.add("beacon.in")
+        return packet
 
     def _is_new(self, data: bytes) -> bool:
         """Whether a packet did not come before, by another interface."""
@@ -215,7 +201,7 @@ class PacketFilter:
         Nothing is remembered of other packets, so that forged ones cannot push out what is remembered of real ones.
         """
         if len(data) > limits.BEACON_MAX_BYTES:
-            self._counters.add("beacon.malformed")
+            self._counters.add(MALFORMED)
             return None
         found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
         if found.verdict is Verdict.ACCEPTED:
@@ -229,29 +215,35 @@ class PacketFilter:
             self._counters.add("beacon.limited")
             return None
         problem = _problem(found)
-        beacon = self._stranger(data, now) if problem else None
-        if beacon is not None and self.strangers.hear(beacon, problem, now):
-            identity = beacon.identity
+        identity = self._stranger(data, problem, now) if problem else None
+        if identity is not None:
             at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
             self._refusals.refuse(now, f"beacon.{found.verdict}", at, f"{identity.name} at {host} is {problem}")
         else:
             self._counters.add(f"beacon.{found.verdict}")
         return None
 
-    def _stranger(self, data: bytes, now: float) -> Beacon | None:
-        """The beacon in a refused packet; ``None``: it is none of this domain, or too many came."""
-        if self.strangers.may_read(now):
-            with contextlib.suppress(RemoteProtocolError):
-                return Beacon.parse(data, self._domain)
-        return None
+    def _stranger(self, data: bytes, problem: str, now: float) -> Identity | None:
+        """Take in a refused packet; return its sender if that is shown: few are, so a full table takes no more.
 
-    def _recognise(self, data: bytes, key: int) -> Recognised | None:
-        """The beacon of a module with an older group key."""
-        try:
-            return Recognised(Beacon.parse(data, self._domain), key)
-        except RemoteProtocolError:
-            self._counters.add("beacon.malformed")
+        One of the two modules has not joined a mesh.
+        """
+        if not self._stranger_beacons.take(now):
             return None
+        try:
+            beacon = Beacon.parse(data, self._domain)
+        except RemoteProtocolError:
+            return None
+        identity = beacon.identity
+        key = identity.name, identity.guid.place
+        if beacon.kind is BeaconKind.GOODBYE:
+            self._strangers.pop(key, None)
+            return None
+        if key not in self._strangers and len(self.strangers(now)) >= limits.STRANGERS_SHOWN:
+            return None
+        since = self._strangers[key].since if key in self._strangers else now
+        self._strangers[key] = Stranger(identity, problem, since, now)
+        return identity
 
     def _unlinked_limit(self, interface: int) -> TokenBucket:
         """The limit of packets of unlinked peers on this interface."""
@@ -279,6 +271,8 @@ _ALONE: Final = "no interface that can carry multicast is up: other machines are
 class Discovery:
     """Finds the other agents of the domain, and makes this one known to them.
 
+    It owns the membership protocol and all that this needs of the system, so it has more than twelve fields.
+
     Args:
         identity: This agent's own.
         settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
@@ -286,7 +280,6 @@ class Discovery:
         on_event: Called in the loop with each event of the membership protocol, in order.
         on_interfaces: Called in the loop with all interfaces, used or not, after a change. Returns whether the
             identity still fits them; if not, ``close`` is about to be called, and nothing more is announced.
-        clock: The source of monotonic seconds.
         look: Lists the interfaces.
         resolve: Looks up the host name of a seed; runs in a thread.
         trust: Of a secured mesh: beacons are signed, and only those of members are heard.
@@ -298,41 +291,40 @@ class Discovery:
         settings: Settings,
         udp_socket: socket.socket,
         *,
-        on_event: Callable[[Event], None],
+        on_event: Callable[[PeerEvent], None],
         on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
-        clock: Clock | None = None,
-        look: Callable[[], tuple[Interface, ...]] = list_interfaces,
-        resolve: Callable[[str], list[str]] = resolve_ipv4,
+        look: Callable[[], tuple[Interface, ...]] = network.list_interfaces,
+        resolve: Callable[[str], list[str]] = network.resolve_ipv4,
         trust: PacketTrust | None = None,
     ) -> None:
         self._trust = trust
         self.counters = Counters()
+        self.interfaces: tuple[Interface, ...] = ()
+        """The interfaces in use."""
         self._identity = identity
         self._settings = settings
         self._udp = udp_socket
-        sockets.enlarge_buffer(udp_socket)
+        network.enlarge_buffer(udp_socket)
         self._on_event = on_event
         self._on_interfaces = on_interfaces
-        self._clock: Clock = clock if clock is not None else SystemClock()
+        self._look = look
+        self._resolve = resolve
         self._membership = MembershipProtocol(
-            identity,
-            rng=random.random,
-            multicast=settings.multicast.enabled,
-            counters=self.counters,
+            identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
         self._filter = PacketFilter(
             settings.domain, self.counters, is_verified=self._membership.is_verified, trust=trust
         )
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
-        self._sender = sockets.Sender(udp_socket, self._group, self.counters)
-        self._watcher = InterfaceWatcher(self._interfaces_changed, look=look)
-        self._seeds = SeedResolver(settings.seeds, settings.discovery_port, self._seeds_changed, resolve=resolve)
-        self._interfaces: tuple[Interface, ...] = ()
+        self._sender = network.Sender(udp_socket, self._group, self.counters)
+        self._everything: tuple[Interface, ...] = ()
+        self._seed_hosts: dict[str, list[str]] = {}
+        self._tasks: list[asyncio.Task[None]] = []
         self._receivers: list[socket.socket] = []
-        self._joined: sockets.GroupMembership | None = None
+        self._joined: network.GroupMembership | None = None
         self._warned: set[str] = set()
-        self._timer = MachineTimer(self._membership.next_timer, self._timer_due, now=self._clock.now)
+        self._timer = MachineTimer(self._membership.next_timer, self._timer_due)
         self._started = False
         self._flushing = False
 
@@ -343,26 +335,37 @@ class Discovery:
         self._started = True
         loop = asyncio.get_running_loop()
         loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
-        self._open_seed_port()
+        # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
+        self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
         if self._settings.multicast.enabled:
-            self._open_group()
-        everything = self._watcher.start()
-        self._use(everything)
-        now = self._clock.now()
-        self._membership.interfaces_changed(now, self._other_addresses(everything))
+            group, _ = self._group
+            sock = self._open_receiver(group, multicast=True, lost="no multicast is heard; use --seed")
+            if sock is not None:
+                self._joined = network.GroupMembership(sock, group)
+        self._everything = self._look()
+        self._use_interfaces()
+        now = time.monotonic()
+        self._membership.interfaces_changed(now, self._other_addresses())
         self._membership.start(now)
         self._flush()
-        self._seeds.start()
+        self._tasks = [loop.create_task(network.watch_interfaces(self._look_again), name="interfaces")]
+        for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
+            try:
+                self._seed_hosts[host] = [str(IPv4Address(host))]
+            except AddressValueError:
+                self._tasks.append(loop.create_task(network.follow_seed(host, self._resolve, self._seed_is)))
+        self._set_seeds()
 
     async def close(self) -> None:
         """Send a goodbye and stop."""
         if not self._started:
             return
         self._started = False
-        self._watcher.close()
-        await self._seeds.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         self._timer.close()
-        self._membership.goodbye(self._clock.now())
+        self._membership.goodbye(time.monotonic())
         self._flush()
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._udp.fileno())
@@ -372,7 +375,7 @@ class Discovery:
         self._receivers.clear()
         self._joined = None
 
-    # --- links ------------------------------------------------------------------------------------------------
+    # --- links and views --------------------------------------------------------------------------------------
 
     def link_up(self, identity: Identity, endpoint: Address | None = None) -> None:
         """A link to this peer is up; for as long as it is, the peer is a member.
@@ -382,104 +385,21 @@ class Discovery:
             endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
                 (not the port of a connection that it dialled).
         """
-        self._membership.link_up(identity, self._clock.now(), endpoint)
+        self._membership.link_up(identity, time.monotonic(), endpoint)
         self._flush()
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._membership.link_down(guid, self._clock.now(), instance)
+        self._membership.link_down(guid, time.monotonic(), instance)
         self._flush()
 
-    def peers(self) -> tuple[PeerView, ...]:
+    def peers(self) -> list[PeerView]:
         """All known peers, in GUID order."""
         return self._membership.peers()
 
     def strangers(self) -> tuple[Stranger, ...]:
         """The modules that are heard and are not of this mesh."""
-        return self._filter.strangers.shown(self._clock.now())
-
-    @property
-    def interfaces(self) -> tuple[Interface, ...]:
-        """The interfaces in use."""
-        return self._interfaces
-
-    @property
-    def identity(self) -> Identity:
-        """This agent's own, with its present addresses."""
-        return self._membership.identity
-
-    # --- sockets ----------------------------------------------------------------------------------------------
-
-    def _open_seed_port(self) -> None:
-        """Receive unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them."""
-        self._receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
-
-    def _open_group(self) -> None:
-        sock = self._receiver(self._group[0], multicast=True, lost="no multicast is heard; use --seed")
-        if sock is not None:
-            self._joined = sockets.GroupMembership(sock, self._group[0])
-
-    def _receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
-        port = self._group[1]
-        try:
-            sock = sockets.open_receiver(host, port)
-        except OSError as error:
-            self._warn(
-                f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
-            )
-            return None
-        self._receivers.append(sock)
-        asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
-        return sock
-
-    def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
-        self._take(sock, multicast=multicast)
-        if self._filter.overrun:
-            self._pause(sock, multicast=multicast)
-        self._flush()
-
-    def _take(self, sock: socket.socket, *, multicast: bool) -> None:
-        """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
-        now = self._clock.now()
-        for _ in range(limits.BEACONS_PER_WAKE):
-            yield_to_data()
-            try:
-                data, source, index = sockets.receive(sock)
-            except (BlockingIOError, InterruptedError):
-                return
-            except OSError as error:  # an ICMP error that some earlier packet of ours caused
-                _log.debug("< %s", error)
-                continue
-            packet = self._filter.parse(data, source, now, multicast=multicast, interface=index)
-            if packet is not None:
-                _log.debug("< %s:%d (interface %d): %s", *source, index, packet)
-                if isinstance(packet, Beacon):
-                    self._membership.receive(packet, source, now, multicast=multicast)
-                else:
-                    self._membership.recognise(packet.beacon, source, packet.key)
-            elif self._filter.overrun:
-                return
-
-    def _pause(self, sock: socket.socket, *, multicast: bool) -> None:
-        """Leave what comes to the kernel's buffer for a while: a flood of forged packets must not take the core."""
-        self.counters.add("beacon.paused")
-        self._filter.overrun = False
-        loop = asyncio.get_running_loop()
-        loop.remove_reader(sock.fileno())
-        loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._resume, sock, multicast=multicast))
-
-    def _resume(self, sock: socket.socket, *, multicast: bool) -> None:
-        if self._started:
-            asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
-
-    # --- interfaces and seeds ---------------------------------------------------------------------------------
-
-    def _interfaces_changed(self, everything: tuple[Interface, ...]) -> None:
-        self._use(everything)
-        if not self._on_interfaces(everything):
-            return
-        self._membership.interfaces_changed(self._clock.now(), self._other_addresses(everything))
-        self._flush()
+        return self._filter.strangers(time.monotonic())
 
     def notes(self) -> tuple[str, ...]:
         """Problems of the network, as texts for the user."""
@@ -492,32 +412,109 @@ class Discovery:
         ]
         return (*sorted(self._warned), *silent)
 
-    def _other_addresses(self, everything: tuple[Interface, ...]) -> tuple[IPv4Address, ...]:
-        wanted = self._settings.interfaces
-        mine = [i for i in everything if i.up and (not wanted or i.name in wanted)]
-        return further_addresses(mine, self._identity.guid.address)
+    # --- sockets ----------------------------------------------------------------------------------------------
 
-    def _use(self, everything: tuple[Interface, ...]) -> None:
+    def _open_receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
+        _, port = self._group
+        try:
+            sock = network.open_receiver(host, port)
+        except OSError as error:
+            self._warn(
+                f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
+            )
+            return None
+        self._receivers.append(sock)
+        asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
+        return sock
+
+    def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
+        self._take(sock, multicast=multicast)
+        if self._filter.overrun:
+            # A flood of forged packets must not take the core: for a while they stay in the kernel's buffer.
+            self.counters.add("beacon.paused")
+            self._filter.overrun = False
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(sock.fileno())
+            loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._resume, sock, multicast=multicast))
+        self._flush()
+
+    def _resume(self, sock: socket.socket, *, multicast: bool) -> None:
+        if self._started:
+            asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
+
+    def _take(self, sock: socket.socket, *, multicast: bool) -> None:
+        """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
+        now = time.monotonic()
+        for _ in range(limits.BEACONS_PER_WAKE):
+            yield_to_data()
+            try:
+                data, source, index = network.receive(sock)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:  # an ICMP error that some earlier packet of ours caused
+                _log.debug("< %s", error)
+                continue
+            packet = self._filter.parse(data, source, now, multicast=multicast, interface=index)
+            if packet is not None:
+                beacon, old_key = packet
+                _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
+                if old_key is None:
+                    self._membership.receive(beacon, source, now, multicast=multicast)
+                else:
+                    self._membership.recognise(beacon, source, old_key)
+            elif self._filter.overrun:
+                return
+
+    # --- interfaces and seeds ---------------------------------------------------------------------------------
+
+    def _look_again(self) -> bool:
+        """Act on a change of the interfaces; return whether they could be listed."""
+        try:
+            everything = self._look()
+        except OSError as error:  # no file descriptor is left to ask the kernel
+            _log.debug("! interfaces cannot be listed: %s", error)
+            return False
+        if everything != self._everything:
+            self._everything = everything
+            self._use_interfaces()
+            if self._on_interfaces(everything):
+                self._membership.interfaces_changed(time.monotonic(), self._other_addresses())
+                self._flush()
+        return True
+
+    def _other_addresses(self) -> tuple[IPv4Address, ...]:
+        wanted = self._settings.interfaces
+        mine = [i for i in self._everything if i.up and (not wanted or i.name in wanted)]
+        return network.further_addresses(mine, self._identity.guid.address)
+
+    def _use_interfaces(self) -> None:
         """Choose the usable interfaces, and join the group on them."""
         wanted = self._settings.interfaces
-        before = self._interfaces
-        self._interfaces = choose(everything, wanted)
-        if problem := unknown_names(everything, wanted):
+        before, self.interfaces = self.interfaces, network.choose(self._everything, wanted)
+        if problem := network.unknown_names(self._everything, wanted):
             self._warn(problem)
         if not self._settings.multicast.enabled:
             return
-        if self._interfaces != before:
-            _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self._interfaces)) or "nothing")
-        if any(not i.loopback for i in self._interfaces) or (wanted and self._interfaces):
+        if self.interfaces != before:
+            _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self.interfaces)) or "nothing")
+        if any(not i.loopback for i in self.interfaces) or (wanted and self.interfaces):
             self._warned.discard(_ALONE)
         else:
             self._warn(_ALONE)
         if self._joined is not None:
-            for name, error in self._joined.update(self._interfaces).items():
+            for name, error in self._joined.update(self.interfaces).items():
                 self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
 
-    def _seeds_changed(self, addresses: tuple[Address, ...]) -> None:
-        self._membership.set_seeds(addresses)
+    def _seed_is(self, host: str, addresses: list[str]) -> None:
+        if addresses != self._seed_hosts.get(host):
+            _log.info("= seed %s is %s", host, ", ".join(addresses))
+            self._seed_hosts[host] = addresses
+            self._set_seeds()
+
+    def _set_seeds(self) -> None:
+        default = self._settings.discovery_port
+        seeds = self._settings.seeds
+        self._membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
     def _warn(self, text: str) -> None:
@@ -534,43 +531,34 @@ class Discovery:
         self._flushing = True
         try:
             while True:
-                if beacons := self._membership.outputs():
-                    self._send(beacons)
-                    continue
-                events = self._membership.events()
+                outputs, events = self._membership.outputs(), self._membership.events()
+                if not (outputs or events):
+                    break
+                for beacon, address, key in outputs:
+                    yield_to_data()
+                    self._send(beacon, address, key)
                 for event in events:
                     yield_to_data()
-                    self._deliver(event)
-                if not events:
-                    break
+                    if event.change == "conflict":
+                        host = str(event.identity.guid.address)
+                        self._refusals.refuse(time.monotonic(), f"conflict.{event.reason}", host, event.text)
+                    self._on_event(event)
         finally:
             self._flushing = False
             if self._started:
                 self._timer.arm()
 
-    def _send(self, outputs: list[Output]) -> None:
-        for output in outputs:
-            yield_to_data()
-            if isinstance(output, SendMulticast):
-                _log.debug("> group: %s", output.beacon)
-                self._sender.multicast(self._packet(output.beacon), self._interfaces)
-            else:
-                _log.debug("> %s:%d: %s", *output.address, output.beacon)
-                self._sender.unicast(self._packet(output.beacon, output.key), output.address)
-
-    def _packet(self, beacon: Beacon, key: int = 0) -> bytes:
-        """The bytes of a beacon, signed in a secured mesh; ``key`` as for ``SendUnicast``."""
-        trust = self._trust
-        if trust is None:
-            return beacon.serialize()
-        packet = beacon.serialize()
-        return trust.signer.sign(packet, KeyPurpose.BEACON, self._clock.now(), trust.wall(), key=key)
-
-    def _deliver(self, event: Event) -> None:
-        if isinstance(event, PeerConflict):
-            host = str(event.identity.guid.address)
-            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", host, str(event))
-        self._on_event(event)
+    def _send(self, beacon: Beacon, address: Address | None, key: int) -> None:
+        """Send a beacon, signed in a secured mesh; the arguments as for ``announcing.OutgoingBeacon``."""
+        packet, trust = beacon.serialize(), self._trust
+        if trust is not None:
+            packet = trust.signer.sign(packet, KeyPurpose.BEACON, time.monotonic(), trust.wall(), key=key)
+        if address is None:
+            _log.debug("> group: %s", beacon)
+            self._sender.multicast(packet, self.interfaces)
+        else:
+            _log.debug("> %s:%d: %s", *address, beacon)
+            self._sender.unicast(packet, address)
 
     def _timer_due(self, now: float) -> None:
         self._membership.handle_timer(now)

@@ -1,49 +1,29 @@
-"""The table of (address, port): which run that claims an address is the live one, and which runs have ended.
+"""The runs of agents at each (address, port), and which of them is the live one. Sans-I/O.
 
-One (address, port): decides which run that claims it is the live one (restart, late packet or conflict).
+Two runs may claim one (address, port): a restarted agent and its former run, of which late packets still come, or two
+agents behind one NAT. The facts of a run are what was heard of it; ``Endpoint.settle`` decides by them alone, and is
+called again whenever one has changed.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
-from enum import Enum, auto
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import TimerQueue, earliest
 from rmpa.core.identity import is_later
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import BeaconKind, ConflictKind, HeardBy, PeerConflict, PeerView
+from rmpa.discovery.beacon import BeaconKind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rmpa.core.identity import Guid, Identity
+    from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address, Beacon
 
+HeardBy: TypeAlias = Literal["multicast", "unicast", "gossip", "link"]
+"""How a peer was heard first; ``gossip``: it answered an announcement to an address that another's gossip had."""
 _NEVER: Final = float("-inf")
-
-
-class EndpointChange(Enum):
-    """The change of an endpoint by a beacon, or by a link that came up or fell."""
-
-    NEW = auto()
-    """The endpoint had no current run; it has one now."""
-    KNOWN = auto()
-    """The current run was heard."""
-    CHANGED = auto()
-    """The current run was heard, and its identity has changed."""
-    RESTARTED = auto()
-    """Another run is current now."""
-    LEAVING = auto()
-    """The current run said goodbye."""
-    STALE = auto()
-    """A late or repeated packet; ignored."""
-    WAITING = auto()
-    """Another run was heard: by a late packet, or because it is the next run."""
-    CONFLICT = auto()
-    """Another run is certainly alive, and so is the current one."""
 
 
 @dataclass(slots=True)
@@ -52,36 +32,30 @@ class PeerInstance:
 
     Args:
         identity: As its last beacon or handshake said.
-        since: When it was first heard, or became a member.
+        since: When it began to claim its endpoint, or became the live run there, or a member.
         heard: When it was last heard, or had a link.
-        lease: Seconds of silence after which it counts as gone.
         found_by: How it was first heard.
-        heard_by: How it was last heard.
+        lease: Seconds of silence after which it counts as gone.
         source: The source address of its last packet; ``None`` if only a link has shown it.
-        sequence: The number of its last beacon.
+        sequence: The number of its last beacon that was no goodbye.
         multicast_at: When it was last heard by multicast.
         linked: Whether there is a link with it.
         verified: Whether it had a link: it is no forgery.
-        leaving: Whether it said goodbye. The goodbye may be forged: its number does not count for what comes after.
-        before_goodbye: The number of its last beacon before the goodbye.
-        superseded_at: When another run took its endpoint.
+        goodbye: The number of its goodbye, behind which nothing came. It may be forged.
         doubted: Whether the silence of its beacons, while it is linked, was reported.
     """
 
     identity: Identity
     since: float
     heard: float
-    lease: float
     found_by: HeardBy
-    heard_by: HeardBy
+    lease: float = core_limits.PEER_LEASE
     source: Address | None = None
     sequence: int | None = None
     multicast_at: float = _NEVER
     linked: bool = False
     verified: bool = False
-    leaving: bool = False
-    before_goodbye: int | None = None
-    superseded_at: float = _NEVER
+    goodbye: int | None = None
     doubted: bool = False
 
     @property
@@ -95,31 +69,33 @@ class PeerInstance:
         endpoint = self.identity.guid.endpoint
         return (endpoint,) if self.source is None or self.source == endpoint else (endpoint, self.source)
 
-    def accepts(self, sequence: int, now: float) -> bool:
+    def gone(self, now: float) -> bool:
+        """Whether it said goodbye or its lease is over; never while it is linked."""
+        return not self.linked and (self.goodbye is not None or self.deadline <= now)
+
+    def accepts(self, beacon: Beacon, now: float) -> bool:
         """Whether a beacon is newer than the last one (serial numbers, RFC 1982: they wrap).
 
         A beacon that was late behind a goodbye comes soon after it. One that comes later was sent after it, and shows
-        that the goodbye was forged, whatever number that had.
+        that the goodbye was forged, whatever number that had. A goodbye of an agent is its last beacon.
         """
         last = self.sequence
-        if self.leaving and now - self.heard >= limits.GOODBYE_LATE:
-            last = self.before_goodbye
-        return last is None or is_later(sequence, last)
+        if self.goodbye is not None:
+            if beacon.kind is BeaconKind.GOODBYE:
+                return False
+            if now - self.heard < limits.GOODBYE_LATE:
+                last = self.goodbye
+        return last is None or is_later(beacon.sequence, last)
 
-    def update(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> None:
+    def update(self, beacon: Beacon, source: Address, now: float) -> None:
         """Take over the content of a newer beacon; of a goodbye, which may be forged, only that it was said."""
-        self.leaving = beacon.kind is BeaconKind.GOODBYE
-        if self.leaving:
-            self.before_goodbye, self.sequence = self.sequence, beacon.sequence
-            self.heard = now
-            return
-        self.identity = beacon.identity
-        self.sequence = beacon.sequence
-        self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
         self.heard = now
-        self.doubted = False
-        self.source = source
-        self.heard_by = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
+        if beacon.kind is BeaconKind.GOODBYE:
+            self.goodbye = beacon.sequence
+            return
+        self.goodbye, self.doubted = None, False
+        self.identity, self.sequence, self.source = beacon.identity, beacon.sequence, source
+        self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
 
 
 @dataclass(slots=True)
@@ -127,346 +103,205 @@ class Endpoint:
     """The runs heard under one (address, port).
 
     Args:
-        current: The run that counts as the live one.
-        others: By instance id: runs that were current, that said goodbye, or that claim the endpoint too.
-        conflict: Whether two live runs were seen.
-        present: Whether ``current`` is a member: reported as found and not yet as lost.
-        own: Whether this is this agent's own endpoint, at which no other run becomes current.
+        runs: By instance id, at most ``limits.ENDPOINT_RUNS_MAX``.
+        current: The live one.
+        claimant: The newest other run. It becomes the live one unless a link or a conflict speaks against it.
+        conflict: Whether two live runs claim the endpoint.
+        member: The run that is reported as a member, by the identity that it was reported with.
+        own: Whether this is this agent's own endpoint, at which no other run becomes the live one.
     """
 
+    runs: dict[bytes, PeerInstance] = field(default_factory=dict)
     current: PeerInstance | None = None
-    others: dict[bytes, PeerInstance] = field(default_factory=dict)
+    claimant: PeerInstance | None = None
     conflict: bool = False
-    present: bool = False
+    member: Identity | None = None
     own: bool = False
 
-    def receive(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> EndpointChange:
-        """Take in one beacon; return what it changes."""
-        instance = beacon.identity.instance
-        peer = self._find(instance)
-        if peer is None:
-            if beacon.kind is BeaconKind.GOODBYE:
-                return EndpointChange.STALE
-            return self._new_run(_peer_from(beacon, now, source, multicast=multicast), now)
+    def settle(self, now: float) -> None:
+        """Decide which run is the live one, and whether another one is certainly alive too."""
+        current, claimant = self.current, self.claimant
+        for run in [run for run in self.runs.values() if run.deadline <= now and not run.linked]:
+            del self.runs[run.identity.instance]
+        rivals = [run for run in self.others() if current is not None and self._insists(run, current)]
+        if current is not None and current.gone(now):
+            current = None
+        if claimant is not None and claimant.gone(now):
+            claimant = None
+        if current is None or not (current.linked or self.conflict):
+            # A live run sends heartbeats; a single beacon long ago, perhaps forged, is not enough.
+            if claimant is not None and now - claimant.heard <= limits.HEARTBEAT_LATE:
+                current = claimant
+            elif rivals:
+                rival = max(rivals, key=lambda run: run.heard)
+                # If the live run missed its heartbeat, its packets, and not the rival's, were the late ones.
+                if current is None or rival.heard - current.heard > limits.HEARTBEAT_LATE:
+                    current = rival
+        if current is not self.current:
+            rivals = []
+            if current is not None:
+                current.since = now
+        self.current, self.claimant = current, claimant if claimant is not current else None
+        # A linked run that was not heard since the rival appeared may be without power; its link is checked.
+        self.conflict = current is not None and any(
+            self.own or not current.linked or current.heard > rival.since for rival in rivals
+        )
+
+    def hear(self, beacon: Beacon, source: Address, now: float, *, multicast: bool) -> PeerInstance | None:
+        """Take in one beacon; return the run that sent it, or ``None`` if it is late or repeated."""
+        goodbye = beacon.kind is BeaconKind.GOODBYE
+        run = self.runs.get(beacon.identity.instance)
+        claims = run is None or self.current is None or (run.goodbye is not None and run is not self.current)
+        if run is None:
+            if goodbye:
+                return None
+            run = self._add(PeerInstance(beacon.identity, now, now, "multicast" if multicast else "unicast"))
         if multicast:
-            peer.multicast_at = now
-        again = peer.leaving and beacon.kind is BeaconKind.GOODBYE  # one of an agent is its last beacon
-        if again or not peer.accepts(beacon.sequence, now):
-            return EndpointChange.STALE
-        previous, departed = peer.identity, peer.leaving
-        peer.update(beacon, now, source, multicast=multicast)
-        if peer is not self.current:
-            return self._other_run(peer, now, departed=departed)
-        if peer.leaving:
-            return EndpointChange.LEAVING
-        same = peer.identity is previous or peer.identity == previous
-        return EndpointChange.KNOWN if same else EndpointChange.CHANGED
+            run.multicast_at = now
+        if not run.accepts(beacon, now):
+            return None
+        run.update(beacon, source, now)
+        if claims and not goodbye:
+            run.since, self.claimant = now, run
+        return run
 
-    def link_up(self, identity: Identity, now: float) -> EndpointChange:
-        """Make the run of a link's handshake the current one, because the handshake proves that it is alive."""
-        peer = self._find(identity.instance)
-        if peer is None:
-            peer = PeerInstance(identity, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
-        previous = peer.identity
+    def link_up(self, identity: Identity, now: float) -> PeerInstance:
+        """Make the run of a link's handshake the live one, because the handshake proves that it is alive."""
+        run = self.runs.get(identity.instance) or self._add(PeerInstance(identity, now, now, "link"))
         # A handshake carries no further addresses; those of the beacons stay.
-        peer.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
-        peer.linked = peer.verified = True
-        peer.leaving = peer.doubted = False
-        peer.heard = now
-        if peer is self.current:
-            return EndpointChange.KNOWN if peer.identity == previous else EndpointChange.CHANGED
-        if self.current is None:
-            return self._promote(peer, now, EndpointChange.NEW)
-        return self._promote(peer, now, EndpointChange.RESTARTED)
+        run.identity = identity if identity.addresses else replace(identity, addresses=run.identity.addresses)
+        run.linked = run.verified = True
+        run.goodbye, run.doubted, run.heard = None, False, now
+        if run is not self.current:
+            if self.current is not None:
+                self.current.linked = False
+            self.current, self.claimant, run.since = run, None, now
+        return run
 
-    def link_down(self, now: float) -> EndpointChange:
-        """Handle the end of the current run's link; a newer run that was heard lately becomes current."""
-        current = self.current
-        if current is None or not current.linked:
-            return EndpointChange.STALE
-        current.linked = False
-        current.heard = now
-        if current.leaving:
-            return EndpointChange.LEAVING
-        if self.conflict:
-            return EndpointChange.CONFLICT
-        # A live run sends heartbeats; a single beacon long ago, perhaps forged, is not enough.
-        waiting = [v for v in self.rivals() if v.since > current.since and now - v.heard <= limits.HEARTBEAT_LATE]
-        if not waiting:
-            return EndpointChange.KNOWN
-        return self._promote(max(waiting, key=lambda v: v.heard), now, EndpointChange.RESTARTED)
-
-    def rivals(self) -> list[PeerInstance]:
-        """The other runs that have not said goodbye."""
-        return [v for v in self.others.values() if not v.leaving]
-
-    def remove_current(self) -> None:
-        """Remove the current run; in a conflict the rival that was heard last becomes current."""
-        if self.current is not None and self.current.leaving:
-            self._supersede(self.current, self.current.heard)
-        self.current = None
-        rivals = self.rivals()
-        if self.conflict and rivals:
-            self.current = max(rivals, key=lambda v: v.heard)
-            del self.others[self.current.identity.instance]
-
-    def expire_others(self, now: float) -> None:
-        """Drop the other runs whose lease is over."""
-        for instance in [i for i, v in self.others.items() if v.deadline <= now]:
-            del self.others[instance]
+    def others(self) -> list[PeerInstance]:
+        """The runs beside the live one that have not said goodbye."""
+        return [run for run in self.runs.values() if run is not self.current and run.goodbye is None]
 
     def next_timer(self) -> float | None:
         """When the first lease is over; that of a linked run is only once, which is reported."""
-        current = self.current
-        first = None if current is None or self.own or (current.linked and current.doubted) else current.deadline
-        return earliest(first, *(v.deadline for v in self.others.values())) if self.others else first
+        return earliest(
+            *(run.deadline for run in self.runs.values() if not (run.linked and (run.doubted or self.own)))
+        )
 
-    def _find(self, instance: bytes) -> PeerInstance | None:
-        if self.current is not None and self.current.identity.instance == instance:
-            return self.current
-        return self.others.get(instance)
+    @staticmethod
+    def _insists(run: PeerInstance, current: PeerInstance) -> bool:
+        """Whether a run was heard so long after the other one took its place that the packet was no late one."""
+        return run.heard - max(run.since, current.since) >= limits.CONFLICT_AFTER
 
-    def _new_run(self, peer: PeerInstance, now: float) -> EndpointChange:
-        """Take in a run that was not known, or had said goodbye."""
-        if self.current is None:
-            self.current = peer
-            return EndpointChange.NEW
-        if self.current.linked or self.conflict:
-            self._supersede(peer, now)
-            return EndpointChange.WAITING
-        return self._promote(peer, now, EndpointChange.RESTARTED)
-
-    def _other_run(self, peer: PeerInstance, now: float, *, departed: bool) -> EndpointChange:
-        """Take in a new packet, by its sequence number, of a known run that is not the current one."""
-        if peer.leaving:
-            return EndpointChange.WAITING
-        if departed:
-            del self.others[peer.identity.instance]
-            peer.since = now
-            return self._new_run(peer, now)
-        if self.current is None:
-            return self._promote(peer, now, EndpointChange.NEW)
-        if self.conflict or now - peer.superseded_at < limits.CONFLICT_AFTER:
-            return EndpointChange.WAITING
-        if self.current.linked and not self.own and self.current.heard <= peer.since:
-            # The current run was not heard since. Its link may lead to a machine without power; it is checked.
-            return EndpointChange.WAITING
-        if self.current.linked or now - self.current.heard <= limits.HEARTBEAT_LATE:
-            self.conflict = True
-            return EndpointChange.CONFLICT
-        # The current run missed its heartbeat, so its packets, and not the other run's, were the late ones.
-        return self._promote(peer, now, EndpointChange.RESTARTED)
-
-    def _promote(self, peer: PeerInstance, now: float, change: EndpointChange) -> EndpointChange:
-        self.others.pop(peer.identity.instance, None)
-        if self.current is not None:
-            self.current.linked = False
-            self._supersede(self.current, now)
-        self.current = peer
-        return change
-
-    def _supersede(self, peer: PeerInstance, now: float) -> None:
-        peer.superseded_at = now
-        self.others[peer.identity.instance] = peer
-        while len(self.others) >= limits.ENDPOINT_RUNS_MAX:
-            del self.others[min(self.others, key=lambda i: (self.others[i].heard, i))]
+    def _add(self, run: PeerInstance) -> PeerInstance:
+        if len(self.runs) >= limits.ENDPOINT_RUNS_MAX:
+            oldest = min((r for r in self.runs.values() if r is not self.current), key=lambda r: r.heard)
+            del self.runs[oldest.identity.instance]
+        self.runs[run.identity.instance] = run
+        return run
 
 
-def _peer_from(beacon: Beacon, now: float, source: Address, *, multicast: bool) -> PeerInstance:
-    how = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
-    peer = PeerInstance(beacon.identity, now, now, core_limits.PEER_LEASE, how, how)
-    peer.update(beacon, now, source, multicast=multicast)
-    peer.multicast_at = now if multicast else _NEVER
-    return peer
+class PeerView(NamedTuple):
+    """One peer, for display."""
+
+    run: PeerInstance
+    conflicts: tuple[str, ...]
+    """Texts for the user."""
+    present: bool
+    """Whether it is a member; ``False`` while a conflict prevents it."""
 
 
-# All endpoints of the membership protocol, with indexes: a packet never costs a look at every endpoint.
+class EndpointTable(dict[int, Endpoint]):
+    """The endpoints by place (``Guid.place``), with indexes: a packet never costs a look at every endpoint.
 
-
-class EndpointTable:
-    """The endpoints by place (``Guid.place``), with their timers.
-
-    After an endpoint was changed from outside, ``changed`` must be called; ``heard`` if only its peer was heard.
+    After a change of an endpoint ``index`` must be called.
     """
 
     def __init__(self) -> None:
-        self._all: dict[int, Endpoint] = {}
-        self._order: list[int] = []
-        self._timers: TimerQueue[int] = TimerQueue()
-        self._present: list[PeerInstance] = []
-        self._present_places: list[int] = []
-        self._strangers: set[int] = set()
+        super().__init__()
+        self.members: dict[int, PeerInstance] = {}
+        """The peers that are members, without this agent, by place; only ``index`` changes it."""
+        self.timers: TimerQueue[int] = TimerQueue()
+        """When the first lease at a place is over."""
         self._names: dict[int, str] = {}
-        self._by_name: dict[str, list[int]] = {}
+        self._by_name: defaultdict[str, set[int]] = defaultdict(set)
 
-    def __len__(self) -> int:
-        return len(self._all)
-
-    def __contains__(self, place: int) -> bool:
-        return place in self._all
-
-    def __iter__(self) -> Iterator[Endpoint]:
-        """In the order of their places, which is that of GUIDs."""
-        return iter([self._all[place] for place in self._order])
-
-    @property
-    def is_full(self) -> bool:
-        """Whether there is no room for one more peer that was never linked."""
-        return len(self._all) >= core_limits.PEERS_MAX or len(self._strangers) >= limits.STRANGERS_MAX
-
-    def get(self, place: int) -> Endpoint | None:
-        """The endpoint at a place, or ``None``."""
-        return self._all.get(place)
-
-    def add(self, place: int, endpoint: Endpoint) -> Endpoint:
-        """Add an endpoint at a place that has none; return it."""
-        self._all[place] = endpoint
-        insort(self._order, place)
-        self.changed(place)
-        return endpoint
+    def index(self, place: int) -> None:
+        """Update the indexes at one place; an endpoint without runs is removed."""
+        endpoint = self[place]
+        run = endpoint.current
+        self.timers.set(place, endpoint.next_timer())
+        if not endpoint.runs:
+            del self[place]
+        if run is not None and endpoint.member is not None:
+            self.members[place] = run
+        else:
+            self.members.pop(place, None)
+        name, before = run.identity.name if run is not None else "", self._names.get(place, "")
+        if name != before:
+            self._by_name[before].discard(place)
+            if not self._by_name[before]:
+                del self._by_name[before]
+            if name:
+                self._names[place] = name
+                self._by_name[name].add(place)
+            else:
+                del self._names[place]
 
     def remove(self, place: int) -> None:
-        """Remove the endpoint at a place."""
-        del self._all[place]
-        del self._order[bisect_left(self._order, place)]
-        self._timers.set(place, None)
-        self._index(place, None)
-
-    def heard(self, place: int) -> None:
-        """Update the endpoint's timer, the only part of it that has changed."""
-        endpoint = self._all.get(place)
-        if endpoint is not None:
-            self._timers.set(place, endpoint.next_timer())
-
-    def changed(self, place: int) -> None:
-        """Update all indexes after any change of the endpoint: its peer, its name, whether it is present."""
-        self.heard(place)
-        self._index(place, self._all.get(place))
-
-    def _index(self, place: int, endpoint: Endpoint | None) -> None:
-        """Update the indexes at one place; a thousand peers that appear at once must not cost a million steps."""
-        peer = endpoint.current if endpoint is not None else None
-        if endpoint is None or endpoint.own or (peer is not None and peer.verified):
-            self._strangers.discard(place)
-        else:
-            self._strangers.add(place)
-        name = peer.identity.name if peer is not None else None
-        before = self._names.get(place)
-        if name != before:
-            if before is not None:
-                there = self._by_name[before]
-                there.remove(place)
-                if not there:
-                    del self._by_name[before]
-                del self._names[place]
-            if name is not None:
-                insort(self._by_name.setdefault(name, []), place)
-                self._names[place] = name
-        member = peer if endpoint is not None and endpoint.present else None
-        at = bisect_left(self._present_places, place)
-        listed = at < len(self._present_places) and self._present_places[at] == place
-        if member is None and listed:
-            del self._present_places[at], self._present[at]
-        elif member is not None and listed:
-            self._present[at] = member
-        elif member is not None:
-            self._present_places.insert(at, place)
-            self._present.insert(at, member)
-
-    def next_timer(self) -> float | None:
-        """When the next lease is over, on the clock of ``take_expired``; ``None``: never."""
-        return self._timers.next()
-
-    def take_expired(self, now: float) -> list[int]:
-        """The places at which a lease is over, in order. The caller handles each, and calls ``changed``."""
-        return sorted(self._timers.take(now))
-
-    def present(self) -> list[PeerInstance]:
-        """The peers that are members, without this agent, by GUID; not to be changed or kept by the caller."""
-        return self._present
-
-    def observed_addresses(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
-        """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
-        found = []
-        for guid in gossip:
-            endpoint = self._all.get(guid.place)
-            source = endpoint.current.source if endpoint is not None and endpoint.current is not None else None
-            if source is not None and source != guid.endpoint and not source[0].startswith("127."):
-                found.append(source)
-        return tuple(found)
-
-    def unknown_addresses(self, addresses: tuple[Address, ...], own: Identity) -> list[Address]:
-        """Those of the addresses that belong neither to a member nor to this agent, whose identity is given."""
-        if not addresses:
-            return []
-        met = {*own.endpoints}
-        for peer in self.present():
-            met.update(peer.identity.endpoints, peer.addresses)
-        loopback = own.guid.is_loopback
-        return [a for a in addresses if a not in met and (loopback or not a[0].startswith("127."))]
+        """Remove an endpoint with all its runs."""
+        self[place] = Endpoint()
+        self.index(place)
 
     def with_name(self, name: str) -> list[Endpoint]:
-        """The endpoints whose peer has this name, in order; peers in conflict and this agent itself included."""
-        return [self._all[place] for place in self._by_name.get(name, ())]
-
-    def oldest_unlinked(self, silent_since: float | None = None) -> int | None:
-        """The place of the unlinked peer that has been silent for longest; one that never had a link comes first.
-
-        Args:
-            silent_since: Only one that never had a link, and was not heard since then.
-        """
-        unlinked = [
-            (peer is not None and peer.verified, peer.heard if peer is not None else float("-inf"), place)
-            for place, peer in ((place, endpoint.current) for place, endpoint in self._all.items())
-            if peer is None or not peer.linked
-        ]
-        had_link, heard, place = min(unlinked, default=(True, 0.0, None))
-        return None if silent_since is not None and (had_link or heard > silent_since) else place
+        """The endpoints whose live run has this name, in order; those in conflict and this agent's own included."""
+        return [self[place] for place in sorted(self._by_name.get(name, ()))]
 
     def same_name(self, endpoint: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
         """Pairs of this endpoint's peer and each other live peer with its name, the newer peer first."""
         mine = endpoint.current
-        if mine is None:
-            return []
         pairs = []
-        for other in self.with_name(mine.identity.name):
+        for other in self.with_name(mine.identity.name) if mine is not None else ():
             peer = other.current
-            if peer is None or other is endpoint or not (other.present or other.own):
+            if mine is None or peer is None or other is endpoint or not (other.member is not None or other.own):
                 continue
             newer, older = (mine, peer) if (mine.since, other.own) >= (peer.since, endpoint.own) else (peer, mine)
-            alive = older.linked or older.heard >= newer.since or other.own or endpoint.own
-            if alive:
+            if older.linked or older.heard >= newer.since:  # this agent itself counts as linked
                 pairs.append((newer, older))
         return pairs
 
-    def views(self) -> tuple[PeerView, ...]:
+    def views(self) -> list[PeerView]:
         """All peers in GUID order, those included that a conflict keeps from being members; not this agent itself."""
-        return tuple(
-            self._view(endpoint, peer)
-            for endpoint in self
-            for peer in [endpoint.current, *(endpoint.rivals() if endpoint.conflict else [])]
-            if peer is not None and not (endpoint.own and peer is endpoint.current)
-        )
-
-    def _view(self, endpoint: Endpoint, peer: PeerInstance) -> PeerView:
-        conflicts = []
-        if endpoint.conflict and endpoint.current is not None:
-            rivals = endpoint.rivals()
-            other = endpoint.current if peer is not endpoint.current else rivals[0] if rivals else peer
-            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
-            conflicts.append(str(PeerConflict(kind, peer.identity, other.identity)))
-        conflicts += [
-            str(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
-            for one, other in (self.same_name(endpoint) if peer is endpoint.current else ())
+        return [
+            PeerView(run, self._conflicts(endpoint, run), endpoint.member is not None and run is endpoint.current)
+            for _, endpoint in sorted(self.items())
+            for run in (endpoint.current, *(endpoint.others() if endpoint.conflict else ()))
+            if run is not None and not (endpoint.own and run is endpoint.current)
         ]
-        return PeerView(
-            peer.identity,
-            peer.since,
-            peer.heard,
-            peer.found_by,
-            peer.heard_by if not peer.linked else HeardBy.LINK,
-            peer.source,
-            peer.linked,
-            tuple(conflicts),
-            endpoint.present and peer is endpoint.current,
-        )
+
+    def _conflicts(self, endpoint: Endpoint, run: PeerInstance) -> tuple[str, ...]:
+        texts = []
+        if endpoint.conflict and endpoint.current is not None:
+            other = endpoint.current if run is not endpoint.current else endpoint.others()[0]
+            texts.append(shared_address(run.identity, other.identity, own=endpoint.own))
+        if run is endpoint.current:
+            texts += [shared_name(one.identity, other.identity) for one, other in self.same_name(endpoint)]
+        return tuple(texts)
+
+
+def shared_address(one: Identity, other: Identity, *, own: bool) -> str:
+    """What is said of two live peers with one GUID address; ``own``: the other one is this agent."""
+    host, port = one.guid.endpoint
+    if own:
+        what = f"the live peer {one.name} has our own GUID address {host}:{port}"
+    else:
+        what = f"two live peers share one GUID address {host}:{port}: {one.name} and {other.name}"
+    return f"{what}; give one of them another --port, or fix the NAT between them"
+
+
+def shared_name(one: Identity, other: Identity) -> str:
+    """What is said of two live peers, or this agent and a peer, with one name."""
+    return (
+        f"two modules are named {one.name}: {one.guid} and {other.guid}, so rules "
+        "and commands that name it may mean either; rename one: rmpa up --name"
+    )

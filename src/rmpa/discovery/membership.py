@@ -9,45 +9,61 @@ member by a beacon of its own or a link, never because another peer says so.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Counters, earliest
-from rmpa.core.identity import Identity
 from rmpa.discovery import limits
-from rmpa.discovery.announcing import BeaconSender, GossipCandidates, LateAnswers, dissemination_interval, is_many
-from rmpa.discovery.beacon import (
-    Address,
-    Beacon,
-    BeaconKind,
-    ConflictCleared,
-    ConflictKind,
-    Event,
-    HeardBy,
-    LossReason,
-    Output,
-    PeerChanged,
-    PeerConflict,
-    PeerFound,
-    PeerLost,
-    PeerRestarted,
-    RunDoubted,
-)
-from rmpa.discovery.endpoints import Endpoint, EndpointChange, EndpointTable, PeerInstance
+from rmpa.discovery.announcing import BeaconSender, GossipCandidates
+from rmpa.discovery.beacon import BeaconKind
+from rmpa.discovery.endpoints import Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from ipaddress import IPv4Address
 
-    from rmpa.core.identity import Guid
-    from rmpa.discovery.beacon import PeerView
+    from rmpa.core.identity import Guid, Identity
+    from rmpa.discovery.announcing import OutgoingBeacon
+    from rmpa.discovery.beacon import Address, Beacon
+    from rmpa.discovery.endpoints import PeerView
 
+SILENCE: Final = "silent for its lease"
+GOODBYE: Final = "said goodbye"
+RESTARTED: Final = "started anew"
+MOVED: Final = "started anew at another port"
+CONFLICT: Final = "another live peer has its GUID address"
 _NEVER: Final = float("-inf")
+
+
+@dataclass(frozen=True, slots=True)
+class PeerEvent:
+    """Something that happened to a peer.
+
+    Args:
+        change: ``found``: it has become a member. ``changed``: the same run has other addresses or another name.
+            ``lost``: it is no member any more. ``doubted``: its link is worth a check, as it may have restarted or be
+            gone. ``conflict``: it and another live peer claim one GUID address or name; reported once until that is
+            over.
+        identity: The peer's.
+        source: Of one that is found: where its last packet came from; ``None`` if only a link has shown it.
+        reason: Why it is lost: ``SILENCE`` and so on. Of a conflict: ``guid``, ``own_guid`` or ``name``, which both
+            have.
+        text: Of a conflict: what happened and what to do, for the user.
+    """
+
+    change: Literal["found", "changed", "lost", "doubted", "conflict"]
+    identity: Identity
+    source: Address | None = None
+    reason: str = ""
+    text: str = ""
 
 
 class MembershipProtocol:
     """The peers of one domain, as one agent knows them.
+
+    Its fields are more than twelve: six are the times at which something is due.
 
     Args:
         identity: This agent's own.
@@ -70,9 +86,8 @@ class MembershipProtocol:
         self._rng = rng
         self._endpoints = EndpointTable()
         self._sender = BeaconSender(identity, self._endpoints, lease, self.counters, multicast=multicast)
-        self._reported_names: set[frozenset[bytes]] = set()
-        self._late_answers = LateAnswers(rng)
         self._candidates = GossipCandidates(rng)
+        self._reported_names: set[frozenset[bytes]] = set()
         self._seeds: tuple[Address, ...] = ()
         self._burst: list[float] = []
         self._heartbeat_at: float | None = None
@@ -81,15 +96,19 @@ class MembershipProtocol:
         self._unicasts: dict[int, PeerInstance] = {}
         """The peers that get a heartbeat by unicast now, by place."""
         self._unicast_at = _NEVER
-        self._events: list[Event] = []
+        self._late_answers: dict[int, None] = {}
+        """The places of newcomers of a large mesh that wait for an answer, oldest first."""
+        self._late_answers_at = _NEVER
+        self._events: list[PeerEvent] = []
 
     # --- inputs -----------------------------------------------------------------------------------------------
 
     def start(self, now: float) -> None:
         """Announce this agent: a burst of beacons, then only heartbeats."""
-        own = PeerInstance(self._sender.identity, now, now, core_limits.PEER_LEASE, HeardBy.LINK, HeardBy.LINK)
-        own.linked = own.verified = True
-        self._endpoints.add(self._sender.identity.guid.place, Endpoint(own, own=True))
+        identity = self._sender.identity
+        own = PeerInstance(identity, now, now, "link", linked=True, verified=True)
+        self._endpoints[identity.guid.place] = Endpoint({identity.instance: own}, own, own=True)
+        self._endpoints.index(identity.guid.place)
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -107,35 +126,32 @@ class MembershipProtocol:
         if self._sender.closed or identity.instance == self._sender.identity.instance:
             self.counters.add("beacon.echo")
             return
-        key = identity.guid.place
-        endpoint = self._endpoints.get(key)
+        place = identity.guid.place
+        endpoint = self._endpoints.get(place)
         if endpoint is None:
-            if self._endpoints.is_full and not self._evict(now - limits.HEARTBEAT_LATE):
+            if not self._has_room(now):
                 self.counters.add("roster.full")
                 return
-            endpoint = self._endpoints.add(key, Endpoint())
-        previous = endpoint.current.identity if endpoint.current is not None else None
-        change = endpoint.receive(beacon, now, source, multicast=multicast)
-        if change in {EndpointChange.KNOWN, EndpointChange.STALE}:
-            self._endpoints.heard(key)
-        else:
-            self._endpoints.changed(key)
-        addresses = {identity.guid.endpoint, source} if self._candidates else ()
-        candidates = [self._candidates.answered(address) for address in addresses]
-        self._apply(endpoint, change, now, previous=previous, source=source)
-        if (
-            change in {EndpointChange.NEW, EndpointChange.RESTARTED}
-            and not multicast
-            and endpoint.current is not None
-        ):
-            self._infer_multicast(endpoint.current, beacon, source, now, was_candidate=any(candidates))
-        if change is EndpointChange.STALE:
+            endpoint = self._endpoints[place] = Endpoint()
+        gossiped = [self._candidates.answered(address) for address in {identity.guid.endpoint, source}]
+        run = endpoint.hear(beacon, source, now, multicast=multicast)
+        if run is None:
             self.counters.add("beacon.late")
-        elif change in {EndpointChange.NEW, EndpointChange.RESTARTED, EndpointChange.KNOWN, EndpointChange.CHANGED}:
-            self._answer_if_unknown(endpoint, change, beacon, now, multicast=multicast)
-            if beacon.gossip or beacon.observed:
-                self._apply_gossip(beacon, now)
-        self._remove_if_empty(key)
+            self._endpoints.index(place)
+            return
+        found = self._settle(place, now)
+        current = endpoint.current
+        if run is not current or run.goodbye is not None:
+            if current is not None and current.linked and not endpoint.own:
+                self._events.append(PeerEvent("doubted", current.identity))
+            if found and current is not None:  # it was in conflict with the run that spoke
+                self._sender.send_answer(current, now)
+            return
+        if found and not multicast:
+            self._infer_multicast(run, beacon, source, now, was_candidate=any(gossiped))
+        self._answer_if_unknown(endpoint, beacon, now, found=found, multicast=multicast)
+        if beacon.gossip or beacon.observed:
+            self._apply_gossip(beacon, now)
 
     def recognise(self, beacon: Beacon, source: Address, key: int) -> None:
         """Tell a module that has only an older group key of a secured mesh where this agent is.
@@ -161,26 +177,21 @@ class MembershipProtocol:
             now: Monotonic seconds.
             source: Where beacons can be sent to it, if that is known to differ from its GUID's endpoint.
         """
-        key = identity.guid.place
-        endpoint = self._endpoints.get(key)
+        place = identity.guid.place
+        endpoint = self._endpoints.get(place)
         if endpoint is None:
-            if len(self._endpoints) >= core_limits.PEERS_MAX and not self._evict():
+            if not self._has_room(now, linked=True):
                 self.counters.add("roster.full")
                 return
-            endpoint = self._endpoints.add(key, Endpoint())
+            endpoint = self._endpoints[place] = Endpoint()
         if endpoint.own:
             self.counters.add("roster.own_link")
             return
-        previous = endpoint.current.identity if endpoint.current is not None else None
-        change = endpoint.link_up(identity, now)
-        self._endpoints.changed(key)
-        if source is not None and endpoint.current is not None:
-            endpoint.current.source = source
+        run = endpoint.link_up(identity, now)
+        run.source = source or run.source
         self._candidates.answered(identity.guid.endpoint)
-        self._late_answers.discard(key)
-        self._apply(endpoint, change, now, previous=previous, source=source)
-        if not endpoint.present:
-            self._peer_found(endpoint, now)
+        self._late_answers.pop(place, None)
+        self._settle(place, now)
 
     def link_down(self, guid: Guid, now: float, instance: bytes | None = None) -> None:
         """Handle the end of the link to a peer, whose lease begins now.
@@ -190,48 +201,30 @@ class MembershipProtocol:
             now: Monotonic seconds.
             instance: The run's; the link of a run that was superseded meanwhile changes nothing.
         """
-        key = guid.place
-        endpoint = self._endpoints.get(key)
-        if endpoint is None or endpoint.own or endpoint.current is None:
+        endpoint = self._endpoints.get(guid.place)
+        run = endpoint.current if endpoint is not None and not endpoint.own else None
+        if run is None or not run.linked or (instance is not None and run.identity.instance != instance):
             return
-        previous = endpoint.current.identity
-        if instance is not None and previous.instance != instance:
-            return
-        change = endpoint.link_down(now)
-        self._endpoints.changed(key)
-        if change is EndpointChange.CONFLICT:
-            self._peer_lost(endpoint, LossReason.CONFLICT)
-            return
-        source = endpoint.current.source
-        self._apply(endpoint, change, now, previous=previous, source=source)
-        if change is EndpointChange.RESTARTED:
-            self._sender.send_answer(endpoint.current, now)
-        self._remove_if_empty(key)
+        run.linked, run.heard = False, now
+        self._settle(guid.place, now, answer=True)
 
-    def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
-        """Announce this agent again after a change of interfaces, with its present addresses if they are given."""
-        if self._sender.closed:
-            return
-        if addresses is not None:
-            own = self._sender.identity
-            self._sender.identity = Identity(own.guid, own.instance, own.name, own.domain, addresses)
-        self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
-        self.handle_timer(now)
+    def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...]) -> None:
+        """Announce this agent again after a change of interfaces, with its present addresses."""
+        if not self._sender.closed:
+            self._sender.identity = replace(self._sender.identity, addresses=addresses)
+            self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
+            self.handle_timer(now)
 
     def set_seeds(self, seeds: Iterable[Address]) -> None:
         """Send announcements to these addresses, now and with each heartbeat; they replace the former seeds."""
-        known = self._seeds
-        self._seeds = tuple(dict.fromkeys(seeds))
+        known, self._seeds = self._seeds, tuple(dict.fromkeys(seeds))
         if self._heartbeat_at is not None:
-            for address in self._seeds:
-                if address not in known:
-                    self._sender.send(BeaconKind.ANNOUNCE, address)
+            self._announce(address for address in self._seeds if address not in known)
 
     def goodbye(self, now: float) -> None:
         """Send a goodbye to the peers; afterwards nothing is sent, and beacons are ignored."""
-        if self._sender.closed or self._heartbeat_at is None:
-            return
-        self._sender.send_goodbye(self._sender.unheard_by_multicast(now))
+        if not self._sender.closed and self._heartbeat_at is not None:
+            self._sender.send_goodbye(self._sender.unheard_by_multicast(now))
 
     def next_timer(self) -> float | None:
         """When to call ``handle_timer``, in seconds of the clock; ``None``: never."""
@@ -240,11 +233,11 @@ class MembershipProtocol:
         return earliest(
             self._heartbeat_at,
             self._disseminate_at,
-            self._late_answers.at,
+            self._late_answers_at if self._late_answers else None,
             self._unicast_at if self._unicasts else None,
             self._burst[0] if self._burst else None,
             self._candidates.next_timer(),
-            self._endpoints.next_timer(),
+            self._endpoints.timers.next(),
         )
 
     def handle_timer(self, now: float) -> None:
@@ -255,50 +248,46 @@ class MembershipProtocol:
         if self._burst and self._burst[0] <= now:
             self._burst = [at for at in self._burst if at > now]
             self._send_multicast(BeaconKind.ANNOUNCE, now)
-            for address in self._seeds:
-                self._sender.send(BeaconKind.ANNOUNCE, address)
+            self._announce(self._seeds)
         if self._heartbeat_at <= now:
             self._heartbeat_at = self._next_heartbeat(now)
             self._send_multicast(BeaconKind.HEARTBEAT, now)
             self._plan_unicast_heartbeats(now)
-            met = {address for peer in self._endpoints.present() for address in peer.addresses} if self._seeds else ()
-            for address in self._seeds:
-                if address not in met:
-                    self._sender.send(BeaconKind.ANNOUNCE, address)
+            met = {address for peer in self._members() for address in peer.addresses} if self._seeds else ()
+            self._announce(address for address in self._seeds if address not in met)
         if self._disseminate_at is not None and self._disseminate_at <= now:
-            self._disseminate(now)
-        self._send_late_answers(now)
+            # Heartbeats are sent early, so that their gossip reports newly found peers.
+            self._disseminate_at, self._disseminated_at = None, now
+            self._plan_unicast_heartbeats(now)
+            if self._sender.unheard_by_multicast(now):
+                self._send_multicast(BeaconKind.HEARTBEAT, now)
+        if self._late_answers and self._late_answers_at <= now:
+            self._send_late_answers(now)
         for place in tuple(islice(self._unicasts, limits.UNICAST_HEARTBEATS_AT_ONCE)):
             peer = self._unicasts.pop(place)
-            gossip = self._sender.gossip(self._endpoints.present(), peer, now)
+            gossip = self._sender.gossip(self._members(), peer, now)
             for address in peer.addresses:
                 self._sender.send(BeaconKind.HEARTBEAT, address, gossip)
-        for address in self._candidates.take_due(now):
-            self._sender.send(BeaconKind.ANNOUNCE, address)
+        self._announce(self._candidates.take_due(now))
 
     # --- outputs and views ------------------------------------------------------------------------------------
 
-    def outputs(self) -> list[Output]:
+    def outputs(self) -> list[OutgoingBeacon]:
         """The beacons to send, in order; each is returned once."""
         return self._sender.take()
 
-    def events(self) -> list[Event]:
+    def events(self) -> list[PeerEvent]:
         """What happened, in order; each event is returned once."""
         taken, self._events = self._events, []
         return taken
 
-    def peers(self) -> tuple[PeerView, ...]:
+    def peers(self) -> list[PeerView]:
         """All peers in GUID order, those included that a conflict keeps from being members."""
         return self._endpoints.views()
 
-    @property
-    def members(self) -> int:
-        """The number of peers that are present."""
-        return len(self._endpoints.present())
-
     def silent_seeds(self) -> list[Address]:
         """The seeds at whose address there is no member."""
-        met = {host for peer in self._endpoints.present() for host, _ in peer.addresses}
+        met = {host for peer in self._members() for host, _ in peer.addresses}
         return [seed for seed in self._seeds if seed[0] not in met]
 
     def is_verified(self, guid: Guid, instance: bytes) -> bool:
@@ -307,86 +296,71 @@ class MembershipProtocol:
         peer = endpoint.current if endpoint is not None else None
         return peer is not None and peer.verified and peer.identity.instance == instance
 
-    @property
-    def identity(self) -> Identity:
-        """This agent's own, as the next beacon will carry it."""
-        return self._sender.identity
+    def _members(self) -> Iterable[PeerInstance]:
+        return self._endpoints.members.values()
 
-    # --- changes to events ------------------------------------------------------------------------------------
+    # --- which peers are members ------------------------------------------------------------------------------
 
-    def _apply(
-        self,
-        endpoint: Endpoint,
-        change: EndpointChange,
-        now: float,
-        *,
-        previous: Identity | None,
-        source: Address | None,
-    ) -> None:
-        current = endpoint.current
-        if current is None:
-            return
-        if change is EndpointChange.KNOWN and endpoint.present:
+    def _settle(self, place: int, now: float, *, answer: bool = False) -> bool:
+        """Decide anew about an endpoint, one of whose facts has changed, and report what is different.
+
+        Args:
+            place: The endpoint's.
+            now: Monotonic seconds.
+            answer: Whether a run that is a member from now on is told of this agent.
+
+        Returns:
+            Whether a run is a member that was none.
+        """
+        endpoint = self._endpoints[place]
+        before, conflict = endpoint.member, endpoint.conflict
+        endpoint.settle(now)
+        run = endpoint.current
+        if run is not None and endpoint.conflict and not conflict:
+            rival = max(endpoint.others(), key=lambda other: other.heard).identity
+            text = shared_address(rival, run.identity, own=endpoint.own)
+            kind = "own_guid" if endpoint.own else "guid"
+            self._events.append(PeerEvent("conflict", rival, reason=kind, text=text))
+        if endpoint.own or (endpoint.conflict and run is not None and not run.linked):
+            run = None  # a working link survives a conflict
+        found = run is not None and (before is None or before.instance != run.identity.instance)
+        if before is not None and (run is None or found):
+            self._lost(endpoint, before)
+        endpoint.member = run.identity if run is not None else None
+        if run is not None and found:
+            run.since = now
+            self._events.append(PeerEvent("found", run.identity, run.source))
+            self._remove_predecessors(endpoint, run)
+        elif run is not None and run.identity != before:
+            self._events.append(PeerEvent("changed", run.identity))
+        self._endpoints.index(place)
+        if run is not None:
             self._report_name_conflict(endpoint)
-        elif change is EndpointChange.NEW:
-            self._peer_found(endpoint, now)
-        elif change is EndpointChange.CHANGED and previous is not None and endpoint.present:
-            self._events.append(PeerChanged(current.identity, previous))
-            self._report_name_conflict(endpoint)
-        elif change is EndpointChange.RESTARTED and previous is not None:
-            if endpoint.present:
-                self._events.append(PeerRestarted(current.identity, previous, source))
-                self._report_name_conflict(endpoint)
+            if found:
                 self._schedule_dissemination(now)
-            elif not endpoint.conflict:
-                self._peer_found(endpoint, now)
-        elif change is EndpointChange.LEAVING:
-            self._run_leaves(endpoint, current, now)
-        elif change is EndpointChange.CONFLICT:
-            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
-            rival = max(endpoint.rivals(), key=lambda v: v.heard)
-            self._events.append(PeerConflict(kind, rival.identity, current.identity))
-            if not current.linked:
-                self._peer_lost(endpoint, LossReason.CONFLICT)
-        elif change is EndpointChange.WAITING:
-            self._run_waits(endpoint, current, now)
+                if answer:
+                    self._sender.send_answer(run, now)
+        return found
 
-    def _run_leaves(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
-        """The current run said goodbye; its link, while it stands, is stronger evidence than a packet."""
-        if current.linked:
-            self._events.append(RunDoubted(current.identity))
-            return
-        self._peer_lost(endpoint, LossReason.GOODBYE)
-        endpoint.remove_current()
-        self._clear_conflict(endpoint, now)
-        self._endpoints.changed(current.identity.guid.place)
+    def _lost(self, endpoint: Endpoint, identity: Identity, reason: str = "") -> None:
+        """Report that a run is no member any more, for a reason that its endpoint shows."""
+        if not reason:
+            run = endpoint.runs.get(identity.instance)
+            if run is not None and run.goodbye is not None:
+                reason = GOODBYE
+            elif endpoint.conflict:
+                reason = CONFLICT
+            else:
+                reason = SILENCE if endpoint.current is None else RESTARTED
+        self._events.append(PeerEvent("lost", identity, reason=reason))
+        self._reported_names = {pair for pair in self._reported_names if identity.instance not in pair}
 
-    def _run_waits(self, endpoint: Endpoint, current: PeerInstance, now: float) -> None:
-        if current.linked and not endpoint.own:
-            self._events.append(RunDoubted(current.identity))
-        self._clear_conflict(endpoint, now)
-        self._endpoints.changed(current.identity.guid.place)
-
-    def _peer_found(self, endpoint: Endpoint, now: float) -> None:
-        peer = endpoint.current
-        if peer is None or endpoint.own:
-            return
-        endpoint.present = True
-        peer.since = now
-        self._endpoints.changed(peer.identity.guid.place)
-        self._events.append(PeerFound(peer.identity, peer.source, peer.found_by))
-        self._remove_predecessors(endpoint, peer)
-        self._report_name_conflict(endpoint)
-        self._schedule_dissemination(now)
-
-    def _peer_lost(self, endpoint: Endpoint, reason: LossReason) -> None:
-        if endpoint.present and endpoint.current is not None:
-            endpoint.present = False
-            self._endpoints.changed(endpoint.current.identity.guid.place)
-            self._events.append(PeerLost(endpoint.current.identity, reason))
-            self._reported_names = {
-                pair for pair in self._reported_names if endpoint.current.identity.instance not in pair
-            }
+    def _remove(self, place: int, reason: str) -> None:
+        """Forget an endpoint whatever its facts are."""
+        endpoint = self._endpoints[place]
+        if endpoint.member is not None:
+            self._lost(endpoint, endpoint.member, reason)
+        self._endpoints.remove(place)
 
     def _remove_predecessors(self, endpoint: Endpoint, peer: PeerInstance) -> None:
         """Remove the former run of an agent that was killed and started again at another port.
@@ -398,16 +372,11 @@ class MembershipProtocol:
             if (
                 former is not None
                 and other is not endpoint
-                and not other.own
                 and not former.linked
                 and former.heard < peer.since
                 and former.identity.guid.address == peer.identity.guid.address
             ):
-                key = former.identity.guid.place
-                self._peer_lost(other, LossReason.MOVED)
-                other.remove_current()
-                self._endpoints.changed(key)
-                self._remove_if_empty(key)
+                self._remove(former.identity.guid.place, MOVED)
 
     def _report_name_conflict(self, endpoint: Endpoint) -> None:
         """Report once that two peers share a name, if both are certainly alive."""
@@ -415,60 +384,52 @@ class MembershipProtocol:
             pair = frozenset({one.identity.instance, other.identity.instance})
             if pair not in self._reported_names:
                 self._reported_names.add(pair)
-                self._events.append(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
+                text = shared_name(one.identity, other.identity)
+                self._events.append(PeerEvent("conflict", one.identity, reason="name", text=text))
                 return
 
-    def _clear_conflict(self, endpoint: Endpoint, now: float) -> None:
-        """Report that a conflict is over, after a run of this endpoint fell silent or left."""
-        endpoint.expire_others(now)
-        if endpoint.conflict and endpoint.current is not None and not endpoint.rivals():
-            endpoint.conflict = False
-            kind = ConflictKind.OWN_GUID if endpoint.own else ConflictKind.GUID
-            self._events.append(ConflictCleared(kind, endpoint.current.identity))
-            if not endpoint.present:
-                self._peer_found(endpoint, now)
-                if not endpoint.own:
-                    self._sender.send_answer(endpoint.current, now)
-
     def _expire_leases(self, now: float) -> None:
-        for key in self._endpoints.take_expired(now):
-            endpoint = self._endpoints.get(key)  # handling an earlier one may have removed it
+        for place in sorted(self._endpoints.timers.take(now)):
+            endpoint = self._endpoints.get(place)  # handling an earlier one may have removed it
             if endpoint is None:
                 continue
-            peer = endpoint.current
-            if peer is not None and peer.linked and peer.deadline <= now and not endpoint.own:
-                peer.doubted = True  # a link at rest would notice much later that its peer is gone
-                self._events.append(RunDoubted(peer.identity))
-            elif peer is not None and not peer.linked and peer.deadline <= now:
-                self._peer_lost(endpoint, LossReason.SILENCE)
-                endpoint.remove_current()
-                if peer.multicast_at + limits.MULTICAST_SILENCE < now:
-                    # Multicast does not reach this peer, so after a network failure announcements must find it again.
-                    self._candidates.add(peer.identity.guid.endpoint, now)
-            self._clear_conflict(endpoint, now)
-            self._endpoints.changed(key)
-            self._remove_if_empty(key)
+            run = endpoint.current
+            if run is not None and run.linked and run.deadline <= now and not endpoint.own:
+                run.doubted = True  # a link at rest would notice much later that its peer is gone
+                self._events.append(PeerEvent("doubted", run.identity))
+            self._settle(place, now, answer=True)
+            if run is not endpoint.current and run is not None and run.multicast_at + limits.MULTICAST_SILENCE < now:
+                # Multicast does not reach this peer, so after a network failure announcements must find it again.
+                self._candidates.add(run.identity.guid.endpoint, now)
 
-    def _remove_if_empty(self, key: int) -> None:
-        endpoint = self._endpoints.get(key)
-        if endpoint is not None and endpoint.current is None and not endpoint.others:
-            self._endpoints.remove(key)
+    def _has_room(self, now: float, *, linked: bool = False) -> bool:
+        """Whether there is room for one more peer, made by removing the unlinked one that was silent for longest.
 
-    def _evict(self, silent_since: float | None = None) -> bool:
-        """Make room for a linked peer: the unlinked one that has been silent for longest goes, if there is one.
-
-        Args:
-            silent_since: For a peer that is only heard: one goes that was never linked, and not heard since then.
+        One that never had a link goes first. For a peer that is only heard none goes but one that never had a link
+        and missed a heartbeat.
         """
-        place = self._endpoints.oldest_unlinked(silent_since)
-        endpoint = self._endpoints.get(place) if place is not None else None
-        if place is None or endpoint is None:
+        if len(self._endpoints) < (core_limits.PEERS_MAX if linked else limits.STRANGERS_MAX):
+            return True
+        runs = [(place, endpoint.current) for place, endpoint in self._endpoints.items()]
+        strangers = sum(run is None or not run.verified for _, run in runs)
+        if not linked and strangers < limits.STRANGERS_MAX and len(runs) < core_limits.PEERS_MAX:
+            return True
+        unlinked = [
+            (run is not None and run.verified, run.heard if run is not None else _NEVER, place)
+            for place, run in runs
+            if run is None or not run.linked
+        ]
+        had_link, heard, place = min(unlinked, default=(True, now, 0))
+        if not unlinked or (not linked and (had_link or heard > now - limits.HEARTBEAT_LATE)):
             return False
-        self._peer_lost(endpoint, LossReason.SILENCE)
-        self._endpoints.remove(place)
+        self._remove(place, SILENCE)
         return True
 
     # --- sending ----------------------------------------------------------------------------------------------
+
+    def _announce(self, addresses: Iterable[Address]) -> None:
+        for address in addresses:
+            self._sender.send(BeaconKind.ANNOUNCE, address)
 
     def _send_multicast(self, kind: BeaconKind, now: float) -> None:
         self._sender.send_multicast(kind, now)
@@ -479,50 +440,50 @@ class MembershipProtocol:
         self._unicasts |= {peer.identity.guid.place: peer for peer in self._sender.unheard_by_multicast(now)}
         self._unicast_at = now
 
-    def _disseminate(self, now: float) -> None:
-        """Send heartbeats early, so that their gossip reports newly found peers."""
-        self._disseminate_at = None
-        self._disseminated_at = now
-        self._plan_unicast_heartbeats(now)
-        if self._sender.unheard_by_multicast(now):
-            self._send_multicast(BeaconKind.HEARTBEAT, now)
-
     def _schedule_dissemination(self, now: float) -> None:
         """Schedule gossip about a found peer for the peers that multicast does not reach."""
-        members = len(self._endpoints.present())
+        members = len(self._endpoints.members)
         if self._disseminate_at is None and self._heartbeat_at is not None and members > 1:
-            self._disseminate_at = max(now, self._disseminated_at + dissemination_interval(members))
+            interval = limits.DISSEMINATION_INTERVAL
+            if members > limits.MANY_MEMBERS:
+                interval = max(interval, members / limits.DISSEMINATIONS_PER_SECOND)
+            self._disseminate_at = max(now, self._disseminated_at + interval)
 
     def _answer_if_unknown(
-        self, endpoint: Endpoint, change: EndpointChange, beacon: Beacon, now: float, *, multicast: bool
+        self, endpoint: Endpoint, beacon: Beacon, now: float, *, found: bool, multicast: bool
     ) -> None:
-        """Answer a sender that does not know this agent, or may not."""
+        """Answer a sender that does not know this agent, or may not.
+
+        In a large mesh the answers to multicasts would be a storm. Those to one newcomer are spread over a time that
+        grows with the number of members; those to many newcomers become one multicast.
+        """
         peer = endpoint.current
         if peer is None or peer.linked or endpoint.conflict or beacon.kind is BeaconKind.ANSWER:
             return
-        unknown = change in {EndpointChange.NEW, EndpointChange.RESTARTED}
         # A unicast heartbeat means that its sender receives none of this agent's multicasts. If this agent receives
         # none of the sender's either, its own heartbeats go there by unicast anyway.
         deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
-        if not (unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE):
+        if not (found or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
-        if not (multicast and self._sender.multicast and is_many(self.members)):
+        members = len(self._endpoints.members)
+        if not (multicast and self._sender.multicast and members > limits.MANY_MEMBERS):
             self._sender.send_answer(peer, now)
         elif self._burst:
             self.counters.add("beacon.answer_spared")  # the next beacon of this agent's own burst tells the sender
         else:
-            self._late_answers.add(peer.identity.guid.place, self.members, now)
+            if not self._late_answers:
+                self._late_answers_at = now + self._rng() * members / limits.ANSWERS_PER_SECOND
+            self._late_answers[peer.identity.guid.place] = None
 
     def _send_late_answers(self, now: float) -> None:
         """Answer the newcomers of a large mesh that got no link meanwhile."""
-        places = self._late_answers.take(now)
-        if len(places) >= limits.ANSWERS_TOGETHER:
+        if len(self._late_answers) >= limits.ANSWERS_TOGETHER:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
-            return
-        for place in places:
+        for place in self._late_answers:
             if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
                 gossip = self._sender.gossip(self._sender.unheard_by_multicast(now), peer, now)
                 self._sender.send_answer(peer, now, gossip)
+        self._late_answers.clear()
 
     def _infer_multicast(
         self, peer: PeerInstance, beacon: Beacon, source: Address, now: float, *, was_candidate: bool
@@ -533,24 +494,24 @@ class MembershipProtocol:
         this agent; for a while its own multicasts are expected here too.
         """
         if was_candidate:
-            peer.found_by = HeardBy.GOSSIP
+            peer.found_by = "gossip"
         elif beacon.kind is BeaconKind.ANSWER and self._sender.multicast and source not in self._seeds:
             peer.multicast_at = now - limits.HEARTBEAT_INTERVAL
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender."""
-        for address in self._endpoints.unknown_addresses(beacon.observed, self._sender.identity):
-            if not self._candidates.add(address, now):
+        own = self._sender.identity
+        mentioned = [guid.endpoint for guid in beacon.gossip if guid.place not in self._endpoints]
+        if beacon.observed:
+            met = {*own.endpoints}
+            for peer in self._members():
+                met.update(peer.identity.endpoints, peer.addresses)
+            mentioned = [address for address in beacon.observed if address not in met] + mentioned
+        for address in mentioned:
+            believed = own.guid.is_loopback or not address[0].startswith("127.")
+            if believed and not self._candidates.add(address, now):
                 self.counters.add("gossip.full")
-        for guid in beacon.gossip:
-            if guid.place in self._endpoints or (guid.is_loopback and not self._sender.identity.guid.is_loopback):
-                continue
-            if not self._candidates.add(guid.endpoint, now):
-                self.counters.add("gossip.full")
-        for address in self._candidates.take_due(now):
-            self._sender.send(BeaconKind.ANNOUNCE, address)
-
-    # --- queries ----------------------------------------------------------------------------------------------
+        self._announce(self._candidates.take_due(now))
 
     def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
         return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]

@@ -1,7 +1,4 @@
-"""The network for discovery: interfaces, UDP sockets, and seeds that are resolved again and again.
-
-The machine's network interfaces: which there are, which we use, and when they change.
-"""
+"""The network for discovery: interfaces and their changes, UDP sockets, and seeds, resolved again and again."""
 
 from __future__ import annotations
 
@@ -12,9 +9,9 @@ import logging
 import random
 import socket
 import struct
-import threading
 from dataclasses import dataclass
-from ipaddress import AddressValueError, IPv4Address
+from functools import partial
+from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
 
 import psutil
@@ -22,11 +19,11 @@ import psutil
 from rmpa.core.counters import Backoff
 from rmpa.core.limits import KIB
 from rmpa.discovery import limits
+from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.config.values import HostPort
     from rmpa.core.counters import Counters
     from rmpa.discovery.beacon import Address
 
@@ -113,88 +110,44 @@ def further_addresses(interfaces: Iterable[Interface], guid_address: IPv4Address
     return tuple(sorted(dict.fromkeys(addresses), key=lambda a: a.is_link_local))[: limits.BEACON_ADDRESSES_MAX]
 
 
-class InterfaceWatcher:
-    """Calls back when interfaces or their addresses change.
-
-    The kernel reports changes through a netlink socket (``rtnetlink(7)``); where that is refused, the interfaces are
-    listed every ``limits.INTERFACE_LOOK`` seconds.
-
-    Args:
-        on_change: Called in the loop with all interfaces, ``INTERFACE_SETTLE`` seconds after a change.
-        look: Lists them.
-    """
-
-    def __init__(
-        self,
-        on_change: Callable[[tuple[Interface, ...]], None],
-        *,
-        look: Callable[[], tuple[Interface, ...]] = list_interfaces,
-    ) -> None:
-        self._on_change = on_change
-        self._look = look
-        self._known: tuple[Interface, ...] = ()
-        self._netlink: socket.socket | None = None
-        self._timer: asyncio.TimerHandle | None = None
-
-    def start(self) -> tuple[Interface, ...]:
-        """Begin to watch; return the present interfaces."""
-        self._netlink = _open_netlink()
-        self._known = self._look()
-        if self._netlink is not None:
-            asyncio.get_running_loop().add_reader(self._netlink.fileno(), self._netlink_readable)
-        else:
-            self._compare_in(limits.INTERFACE_LOOK)
-        return self._known
-
-    def close(self) -> None:
-        """Stop watching."""
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._netlink is not None:
-            asyncio.get_running_loop().remove_reader(self._netlink.fileno())
-            self._netlink.close()
-            self._netlink = None
-
-    def _netlink_readable(self) -> None:
-        # The messages only mean that something changed; ENOBUFS means that some were lost, which is the same.
-        with contextlib.suppress(OSError):
-            while self._netlink is not None:
-                self._netlink.recv(64 * KIB)
-        if self._timer is None:
-            self._compare_in(limits.INTERFACE_SETTLE)
-
-    def _compare_in(self, delay: float) -> None:
-        self._timer = asyncio.get_running_loop().call_later(delay, self._compare)
-
-    def _compare(self) -> None:
-        self._timer = None
-        if self._netlink is None:
-            self._compare_in(limits.INTERFACE_LOOK)
-        try:
-            now = self._look()
-        except OSError as error:  # no file descriptor is left to ask the kernel: tried again later
-            _log.debug("! interfaces cannot be listed: %s", error)
-            if self._timer is None:
-                self._compare_in(limits.INTERFACE_LOOK)
-            return
-        if now != self._known:
-            self._known = now
-            self._on_change(now)
-
-
-def _open_netlink() -> socket.socket | None:
+def open_netlink() -> socket.socket | None:
+    """A socket to which the kernel reports changes of interfaces (rtnetlink(7)); ``None`` where that is refused."""
+    netlink = None
     try:
         netlink = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, 0)
-    except OSError as error:
-        _log.info("= no netlink here (%s); interfaces are read every %g s", error, limits.INTERFACE_LOOK)
-        return None
-    try:
         netlink.bind((0, _RTMGRP_LINK | _RTMGRP_IPV4_IFADDR))
     except OSError as error:
-        netlink.close()
         _log.info("= netlink is refused (%s); interfaces are read every %g s", error, limits.INTERFACE_LOOK)
+        if netlink is not None:
+            netlink.close()
         return None
     return netlink
+
+
+async def watch_interfaces(look: Callable[[], bool]) -> None:
+    """Look at the interfaces now and after each change of them, ``limits.INTERFACE_SETTLE`` seconds later.
+
+    Where the kernel reports no changes, the interfaces are looked at every ``limits.INTERFACE_LOOK`` seconds.
+
+    Args:
+        look: Looks at them; returns whether that was possible. If not, it is called again after a while.
+    """
+    netlink = open_netlink()
+    try:
+        while True:
+            if not look() or netlink is None:
+                await asyncio.sleep(limits.INTERFACE_LOOK)
+                continue
+            # The messages only mean that something changed; ENOBUFS means that some were lost, which is the same.
+            with contextlib.suppress(OSError):
+                await asyncio.get_running_loop().sock_recv(netlink, 64 * KIB)
+            await asyncio.sleep(limits.INTERFACE_SETTLE)
+            with contextlib.suppress(OSError):
+                while netlink.recv(64 * KIB):
+                    pass
+    finally:
+        if netlink is not None:
+            netlink.close()
 
 
 # Seeds: addresses of other agents in the settings. Host names are looked up in threads, again and again.
@@ -210,100 +163,33 @@ def resolve_ipv4(host: str) -> list[str]:
     return list(dict.fromkeys(str(entry[4][0]) for entry in found))
 
 
-class SeedResolver:
-    """Keeps the numeric addresses of the seeds up to date.
+async def follow_seed(
+    host: str, resolve: Callable[[str], list[str]], on_addresses: Callable[[str, list[str]], None]
+) -> None:
+    """Look up the host name of a seed, again and again.
+
+    Each look-up has a daemon thread: a name server that never answers must not delay the end.
 
     Args:
-        seeds: As the user wrote them.
-        default_port: For seeds without a port.
-        on_change: Called in the loop with all addresses known so far, when they change.
-        resolve: Looks up a host name; runs in a thread.
+        host: The name.
+        resolve: Looks it up; runs in a thread.
+        on_addresses: Called in the loop with the name and the addresses that it has now.
     """
-
-    def __init__(
-        self,
-        seeds: tuple[HostPort, ...],
-        default_port: int,
-        on_change: Callable[[tuple[Address, ...]], None],
-        *,
-        resolve: Callable[[str], list[str]] = resolve_ipv4,
-    ) -> None:
-        self._seeds = seeds
-        self._default_port = default_port
-        self._on_change = on_change
-        self._resolve = resolve
-        self._hosts: dict[str, list[str]] = {}
-        self._tasks: list[asyncio.Task[None]] = []
-
-    def start(self) -> None:
-        """Report the numeric addresses at once; start to look up the names."""
-        names = []
-        for host in dict.fromkeys(seed.host for seed in self._seeds):
-            try:
-                self._hosts[host] = [str(IPv4Address(host))]
-            except AddressValueError:
-                names.append(host)
-        if self._hosts:
-            self._report()
-        self._tasks = [asyncio.get_running_loop().create_task(self._follow(host)) for host in names]
-
-    async def close(self) -> None:
-        """Stop. A look-up in progress ends by itself, in its thread."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    def _report(self) -> None:
-        self._on_change(
-            tuple((a, s.port or self._default_port) for s in self._seeds for a in self._hosts.get(s.host, ()))
-        )
-
-    async def _follow(self, host: str) -> None:
-        backoff = Backoff(limits.SEED_RETRY_FIRST, limits.SEED_RETRY_MAX, random.random)
-        failed = False
-        while True:
-            try:
-                addresses = await self._look_up(host)
-            except OSError as error:
-                if not failed:
-                    _log.warning("! seed %s: cannot be resolved (%s); tried again for ever", host, error)
-                failed = True
-                await asyncio.sleep(backoff.delay())
-                continue
+    backoff = Backoff(limits.SEED_RETRY_FIRST, limits.SEED_RETRY_MAX, random.random)
+    failed = False
+    while True:
+        try:
+            addresses = await in_thread(partial(resolve, host), f"resolve {host}")
+        except (OSError, UnicodeError) as error:  # UnicodeError: a label that is empty or too long
+            if not failed:
+                _log.warning("! seed %s: cannot be resolved (%s); tried again for ever", host, error)
+            failed = True
+            await asyncio.sleep(backoff.delay())
+        else:
             failed = False
             backoff.reset()
-            if addresses != self._hosts.get(host):
-                _log.info("= seed %s is %s", host, ", ".join(addresses))
-                self._hosts[host] = addresses
-                self._report()
+            on_addresses(host, addresses)
             await asyncio.sleep(limits.SEED_RESOLVE_INTERVAL)
-
-    async def _look_up(self, host: str) -> list[str]:
-        """Look up a name in a daemon thread: a name server that never answers must not delay the end."""
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[list[str]] = loop.create_future()
-
-        def settle(result: list[str] | OSError) -> None:
-            if done.cancelled():
-                return
-            if isinstance(result, OSError):
-                done.set_exception(result)
-            else:
-                done.set_result(result)
-
-        def work() -> None:
-            result: list[str] | OSError
-            try:
-                result = self._resolve(host)
-            except OSError as error:
-                result = error
-            except UnicodeError as error:  # a label that is empty or too long
-                result = OSError(str(error))
-            with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
-                loop.call_soon_threadsafe(settle, result)
-
-        threading.Thread(target=work, name=f"resolve {host}", daemon=True).start()
-        return await done
 
 
 # The UDP sockets of discovery. The group is joined, and sent to, on each interface by its index.
@@ -386,21 +272,19 @@ class GroupMembership:
     def update(self, interfaces: Iterable[Interface]) -> dict[str, OSError]:
         """Join on these interfaces and leave all others; return the errors by the name of the interface."""
         refused = {}
-        wanted = {i.index: i for i in interfaces}
+        wanted = {i.index: i.name for i in interfaces}
         for index in self._joined - wanted.keys():
-            try:
+            with contextlib.suppress(OSError):  # the kernel has left it already
                 self._change(socket.IP_DROP_MEMBERSHIP, index)
-            except OSError as error:
-                _log.debug("= interface %d was left by the kernel already: %s", index, error)
-        refused_indices = set()
+        self._joined &= wanted.keys()
         for index in sorted(wanted.keys() - self._joined):
             try:
                 self._change(socket.IP_ADD_MEMBERSHIP, index)
             except OSError as error:
                 if error.errno != errno.EADDRINUSE:  # joined already
-                    refused[wanted[index].name] = error
-                    refused_indices.add(index)
-        self._joined = wanted.keys() - refused_indices
+                    refused[wanted[index]] = error
+                    continue
+            self._joined.add(index)
         return refused
 
     def _change(self, option: int, index: int) -> None:
@@ -424,10 +308,10 @@ class Sender:
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, limits.MULTICAST_TTL)
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
 
-    def multicast(self, data: bytes, interfaces: Iterable[Interface]) -> int:
-        """Send to the group on each interface; return the number of interfaces without an error."""
-        sent = 0
+    def multicast(self, data: bytes, interfaces: Iterable[Interface]) -> None:
+        """Send to the group on each interface."""
         for interface in interfaces:
+            name = interface.name
             # By default, Linux sends multicasts on loopback with a source address of another interface, because
             # loopback's own address has only host scope.
             source = interface.addresses[0].packed if interface.loopback and interface.addresses else _ANY
@@ -437,14 +321,17 @@ class Sender:
             except (BlockingIOError, InterruptedError):
                 self._counters.add("beacon.send_full")
             except OSError as error:
-                self.failed(interface.name, error, "beacons cannot be sent there")
+                self._counters.add("beacon.send_failed")
+                if self._failing.get(name) != error.errno:
+                    self._failing[name] = error.errno
+                    text = "! %s: beacons cannot be sent there (%s); tried again with each beacon"
+                    _log.warning(text, name, error.strerror)
             else:
-                sent += 1
-                self.worked(interface.name)
-        self._counters.add("beacon.out_multicast", sent)
-        return sent
+                self._counters.add("beacon.out_multicast")
+                if self._failing.pop(name, None) is not None:
+                    _log.info("= %s: works again", name)
 
-    def unicast(self, data: bytes, address: Address, *, count: str = "beacon.out_unicast") -> None:
+    def unicast(self, data: bytes, address: Address) -> None:
         """Send to one address; a failure is only counted: the next packet tries again."""
         try:
             self._sock.sendto(data, address)
@@ -452,16 +339,4 @@ class Sender:
             self._counters.add("beacon.send_failed")
             _log.debug("> %s:%d: %s", *address, error)
         else:
-            self._counters.add(count)
-
-    def failed(self, name: str, error: OSError, what: str) -> None:
-        """Say once that an interface refuses."""
-        self._counters.add("beacon.send_failed")
-        if self._failing.get(name) != error.errno:
-            self._failing[name] = error.errno
-            _log.warning("! %s: %s (%s); tried again with each beacon", name, what, error.strerror)
-
-    def worked(self, name: str) -> None:
-        """Say once that an interface that refused works again."""
-        if self._failing.pop(name, None) is not None:
-            _log.info("= %s: works again", name)
+            self._counters.add("beacon.out_unicast")

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
-    from rmpa.discovery.beacon import PeerView, Stranger
-    from rmpa.discovery.discovery import Discovery
+    from rmpa.discovery.discovery import Discovery, Stranger
+    from rmpa.discovery.endpoints import PeerView
     from rmpa.mesh.io.link import LaneSender, PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.keepalive import PeerStatus
@@ -353,7 +353,7 @@ class PeersSection:
         now = self._clock.now()
         links = {session.link.guid: session for session in self._bridge.sessions.linked()}
         yield_to_data()  # a millisecond each with a full roster
-        roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
+        roster = {view.run.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
         statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
         infos = []
@@ -421,15 +421,16 @@ class PeersSection:
     def _peer(
         self, view: PeerView | None, status: PeerStatus | None, session: PeerSession | None, now: float
     ) -> PeerInfo:
-        identity = (view or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
+        run = view.run if view is not None else None
+        identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
-        unlinked = status.since if status is not None and status.since is not None else view.since if view else now
+        unlinked = status.since if status is not None and status.since is not None else run.since if run else now
         if session is not None:
             state, since = "linked", session.link.since or now
         elif status is not None and status.foreign is not None:
             state, since = FOREIGN, unlinked
         elif view is not None and not view.present:
-            state, since = "conflict", view.since
+            state, since = "conflict", view.run.since
         elif status is not None and status.state == "refused":
             state, since = "refused", unlinked
         else:
@@ -445,9 +446,9 @@ class PeersSection:
             state=state,
             since_ago=max(0.0, now - since),
             addresses=tuple(f"{host}:{port}" for host, port in identity.endpoints),
-            found_ago=now - view.since if view else None,
-            beacon_ago=now - view.heard if view else None,
-            source=view.found_by.value if view else "link",
+            found_ago=now - run.since if run else None,
+            beacon_ago=now - run.heard if run else None,
+            source=run.found_by if run else "link",
             last_error=last_error,
             next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
             conflicts=conflicts,

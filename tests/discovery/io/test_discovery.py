@@ -16,26 +16,17 @@ import pytest
 
 from rmpa.config.settings import HostPort, Multicast, Settings
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery import limits
-from rmpa.discovery.beacon import (
-    Beacon,
-    BeaconKind,
-    Event,
-    HeardBy,
-    LossReason,
-    PeerConflict,
-    PeerFound,
-    PeerLost,
-    PeerRestarted,
-)
+from rmpa.discovery import limits, membership
+from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.discovery import Discovery
+from rmpa.discovery.membership import PeerEvent
 from rmpa.discovery.network import Interface, list_interfaces
 from rmpa.trust.packets import GroupKey, KeyRing, PacketSigner, PacketTrust, PacketVerifier
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.discovery.beacon import PeerView
+    from rmpa.discovery.endpoints import PeerView
 
 DEADLINE = 15.0
 
@@ -55,7 +46,7 @@ class Agent:
         self.sock.bind(("", port))
         self.port = self.sock.getsockname()[1]
         self.identity = Identity(Guid.of("127.0.0.1", self.port), os.urandom(16), name, settings.domain)
-        self.events: list[Event] = []
+        self.events: list[PeerEvent] = []
         self.discovery = Discovery(
             self.identity,
             settings,
@@ -65,10 +56,10 @@ class Agent:
         )
 
     def names(self) -> set[str]:
-        return {view.identity.name for view in self.discovery.peers() if view.present}
+        return {view.run.identity.name for view in self.discovery.peers() if view.present}
 
     def view(self, name: str) -> PeerView:
-        return next(v for v in self.discovery.peers() if v.identity.name == name)
+        return next(v for v in self.discovery.peers() if v.run.identity.name == name)
 
     async def end(self) -> None:
         await self.discovery.close()
@@ -106,7 +97,7 @@ async def test_agents_on_one_machine_find_each_other(agents: list[Agent], settin
     for agent in trio:
         others = {"base", "joystick", "pc"} - {agent.identity.name}
         await until(partial(lambda a, o: a.names() == o, agent, others))
-    assert all(isinstance(e, PeerFound) for e in trio[0].events)
+    assert all(e.change == "found" for e in trio[0].events)
 
 
 async def test_goodbye_is_seen_at_once(agents: list[Agent], settings: Settings) -> None:
@@ -115,7 +106,7 @@ async def test_goodbye_is_seen_at_once(agents: list[Agent], settings: Settings) 
     await until(lambda: base.names() and pc.names())
     await pc.discovery.close()
     await until(lambda: not base.names())
-    assert base.events[-1] == PeerLost(pc.identity, LossReason.GOODBYE)
+    assert base.events[-1] == PeerEvent("lost", pc.identity, reason=membership.GOODBYE)
 
 
 async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings: Settings) -> None:
@@ -127,8 +118,8 @@ async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings:
     await pc.end()
     again = Agent("pc", settings, port=pc.port)
     await start(agents, again)
-    await until(lambda: any(isinstance(e, PeerRestarted) for e in base.events))
-    assert base.view("pc").identity == again.identity
+    await until(lambda: any(e.reason == membership.RESTARTED for e in base.events))
+    assert base.view("pc").run.identity == again.identity
 
 
 async def test_garbage_is_counted_said_once_and_survived(
@@ -224,7 +215,7 @@ async def test_seeds_without_multicast_and_gossip(agents: list[Agent], settings:
     await start(agents, hub, left, right)
     await until(lambda: left.names() == {"hub", "right"} and right.names() == {"hub", "left"})
     assert hub.discovery.counters["beacon.out_multicast"] == 0
-    assert HeardBy.GOSSIP in {left.view("right").found_by, right.view("left").found_by}
+    assert "gossip" in {left.view("right").run.found_by, right.view("left").run.found_by}
 
 
 async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: Settings) -> None:
@@ -241,7 +232,7 @@ async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: 
     await start(agents, hub)
     # On one machine the last that opened the discovery port gets its unicasts; keep that one the hub.
     left = Agent("left", Settings(multicast=quiet, seeds=(HostPort("robot.local"),)), resolve=resolve)
-    left.discovery._open_seed_port = lambda: None  # type: ignore[method-assign]
+    left.discovery._open_receiver = lambda *_, **__: None  # type: ignore[method-assign]
     await start(agents, left)
     await until(lambda: left.names() == {"hub"} and hub.names() == {"left"})
     assert tries == ["robot.local"] * 2
@@ -267,21 +258,21 @@ async def test_a_link_keeps_and_brings_a_peer(agents: list[Agent], settings: Set
     await start(agents, base)
     friend = Identity(Guid.of("127.0.0.1", 1), os.urandom(16), "friend")
     base.discovery.link_up(friend)
-    assert base.view("friend").linked
+    assert base.view("friend").run.linked
     base.discovery.link_down(friend.guid)
-    assert not base.view("friend").linked
+    assert not base.view("friend").run.linked
 
 
 async def test_events_may_call_back(agents: list[Agent], settings: Settings) -> None:
     base, pc = Agent("base", settings), Agent("pc", settings)
 
-    def link(event: Event) -> None:
-        if isinstance(event, PeerFound):
+    def link(event: PeerEvent) -> None:
+        if event.change == "found":
             base.discovery.link_up(event.identity)
 
     base.discovery._on_event = link
     await start(agents, base, pc)
-    await until(lambda: base.names() and base.view("pc").linked)
+    await until(lambda: base.names() and base.view("pc").run.linked)
 
 
 async def test_two_of_one_name_are_told(
@@ -289,7 +280,7 @@ async def test_two_of_one_name_are_told(
 ) -> None:
     pair = [Agent("base", settings) for _ in range(2)]
     await start(agents, *pair)
-    await until(lambda: all(any(isinstance(e, PeerConflict) for e in agent.events) for agent in pair))
+    await until(lambda: all(any(e.change == "conflict" for e in agent.events) for agent in pair))
     assert "rename one: rmpa up --name" in caplog.text
 
 
@@ -307,10 +298,10 @@ async def test_an_unknown_interface_is_said_and_used_when_it_comes(
     assert "other machines are only found by --seed" in caplog.text
     assert base.discovery.interfaces == ()
     now_there.append(loopback)
-    base.discovery._watcher._compare()
+    base.discovery._look_again()
     await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
     now_there.remove(loopback)
-    base.discovery._watcher._compare()
+    base.discovery._look_again()
     assert base.discovery.interfaces == ()
 
 
@@ -343,7 +334,7 @@ async def test_a_discovery_port_that_somebody_keeps_is_said(
 async def test_the_watcher_looks_by_itself_where_netlink_is_refused(
     monkeypatch: pytest.MonkeyPatch, agents: list[Agent], settings: Settings
 ) -> None:
-    monkeypatch.setattr("rmpa.discovery.network._open_netlink", lambda: None)
+    monkeypatch.setattr("rmpa.discovery.network.open_netlink", lambda: None)
     monkeypatch.setattr(limits, "INTERFACE_LOOK", 0.05)
     there: list[Interface] = []
     base = Agent("base", settings, look=lambda: tuple(there))
@@ -375,7 +366,7 @@ async def test_what_leaves_by_loopback_comes_from_loopback(agents: list[Agent], 
     base, pc = Agent("base", settings), Agent("pc", settings)
     await start(agents, base, pc)
     await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
-    assert [event.source for event in base.events if isinstance(event, PeerFound)] == [("127.0.0.1", pc.port)]
+    assert [event.source for event in base.events if event.change == "found"] == [("127.0.0.1", pc.port)]
 
 
 async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list[Agent], settings: Settings) -> None:
@@ -392,7 +383,7 @@ async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list
     await until(lambda: not base.discovery._membership._burst)
     for times in (1, 2):
         now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
-        base.discovery._watcher._compare()
+        base.discovery._look_again()
         assert len(asked) == times
         assert bool(base.discovery._membership._burst) == (times == 2)
 
