@@ -137,7 +137,7 @@ async def test_a_peer_tells_of_itself_and_a_module_is_diagnosed(settings: Callab
         (why,) = await a.why.answer({"module": "b"})
         assert (why.kind, why.flows) == ("module", True)
         assert [stage.name for stage in why.stages][:4] == ["peer", "link", "lanes", "answer"]
-        b.bridge.rpc._handlers.pop("agent.info")  # as an agent of an earlier release
+        b.bridge.rpc.handlers.pop("agent.info")  # as an agent of an earlier release
         (why,) = await a.why.answer({"module": "b"})
         assert [stage.level.value for stage in why.stages if stage.name == "answer"] == ["unknown"]
 

@@ -102,8 +102,8 @@ async def test_an_older_agent_without_node_requests(settings: Callable[..., Sett
     async with running(settings("a"), settings("b")) as (a, b), node("talker", b) as talker:
         await talker.advertise("/chatter", "std_msgs/String")
         await until(lambda: proxy(a, "talker"))
-        for what in [what for what in b.bridge.rpc._handlers if what.startswith("node.")]:
-            del b.bridge.rpc._handlers[what]
+        for what in [what for what in b.bridge.rpc.handlers if what.startswith("node.")]:
+            del b.bridge.rpc.handlers[what]
         (told,) = await ask(a, tuple[PeerNodes, ...], "node.list")
         assert [line.name for line in told.nodes] == ["/talker"]
         assert "does not know the question 'node.list'" in told.problem

@@ -11,7 +11,8 @@ from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import Message, Request, Response
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.rules import key_problem
-from rmpa.bridge.rpc import LargeMessages
+from rmpa.bridge.rpc import LinkRequests, PeerRpc
+from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros.master.parameters import leaves
 from tests.bridge.services.io.test_calls import Wire
@@ -34,7 +35,8 @@ def fuzz(data: bytes) -> None:
     time = LinkTime()
     time.set(0.0, 0.001)
     session = cast("Any", SimpleNamespace(link=Wire(), time=time))
-    large = LargeMessages(session, lambda _session, message, *_: taken.append(message), lambda *_: None)
+    large = LinkRequests(PeerRpc(Counters()), session)
+    large.take = lambda message, *_: taken.append(message)  # type: ignore[method-assign]
     try:
         large.body(1, bytearray(data))
     except RmpaError as error:

@@ -12,7 +12,6 @@ line feed and that.
 from __future__ import annotations
 
 import asyncio
-import functools
 import inspect
 import itertools
 import logging
@@ -42,6 +41,7 @@ UNKNOWN_QUESTION: Final = "does not know the question"
 _ROUTE: Final = 0
 """The route of large messages; those of topics and services have numbers above it."""
 _UNTIL: Final = 8
+_LINK_ENDED: Final = "its link has just ended; try again"
 Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
 Listener = Callable[["PeerSession", dict[str, Any]], None]
 
@@ -54,17 +54,14 @@ class PeerRpc(Part):
     """
 
     def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        self._numbers = itertools.cycle(range(1, UINT32_MAX + 1))
-        self._waiting: dict[tuple[int, int], tuple[asyncio.Future[Any], str]] = {}
-        self._handlers: dict[str, Handler] = {}
+        self.counters = counters
+        self.handlers: dict[str, Handler] = {}
         self._listeners: dict[str, Listener] = {}
-        self._answering: dict[int, set[asyncio.Task[None]]] = {}
-        self._large: dict[int, LargeMessages] = {}
+        self._links: dict[int, LinkRequests] = {}
 
     def on_request(self, what: str, handler: Handler, _needs: Needs) -> None:
         """Set the handler of the requests named ``what``, which asks for the permissions that ``_needs`` declares."""
-        self._handlers[what] = handler
+        self.handlers[what] = handler
 
     def on_notification(self, what: str, listener: Listener, _needs: Needs) -> None:
         """Set the listener for the notifications named ``what``; ``_needs`` as of ``on_request``."""
@@ -88,182 +85,99 @@ class PeerRpc(Part):
             UnreachableError: The peer does not respond within ``timeout`` seconds, or its link ends meanwhile.
             LimitExceeded: The request is too large, or too much waits for the link.
         """
-        number = next(self._numbers)
-        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        self._waiting[session.peer, number] = (future, session.link.name)
-        try:
-            self._post(session, Request(number, what, args), timeout)
-            async with asyncio.timeout(timeout):
-                return await future
-        except TimeoutError:
-            remedy = "is its agent stopped, or its version older?"
-            raise UnreachableError("agent", f"{session.link.name} ({what}, {timeout:g} s)", remedy) from None
-        finally:
-            self._waiting.pop((session.peer, number), None)
+        link = self._links.get(session.peer)
+        if link is None:
+            raise UnreachableError("agent", session.link.name, _LINK_ENDED)
+        return await link.request(what, args, timeout)
 
     def link_up(self, session: PeerSession) -> None:
         """Take the large messages of a linked peer."""
-        self._large[session.peer] = session.link.routes[_ROUTE] = LargeMessages(session, self._take_large, self._send)
+        self._links[session.peer] = session.link.routes[_ROUTE] = LinkRequests(self, session)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Fail the requests to a peer that lost the bulk lane: it is unknown which were on it, or their responses."""
-        self._large[session.peer].drop("the connection for large messages was lost")
-        self._fail(session, "its connection for large messages has just ended; try again")
-
-    def _fail(self, session: PeerSession, remedy: str) -> None:
-        for (peer, _), (future, name) in list(self._waiting.items()):
-            if peer == session.peer and not future.done():
-                future.set_exception(UnreachableError("agent", name, remedy))
+        link = self._links[session.peer]
+        link.drop("the connection for large messages was lost")
+        link.fail("its connection for large messages has just ended; try again")
 
     def link_down(self, session: PeerSession) -> None:
         """Fail the requests to a peer whose link is gone, and cancel the handlers of its own requests."""
-        if (large := self._large.pop(session.peer, None)) is not None:
-            large.sender.close()
-        self._fail(session, "its link has just ended; try again")
-        for task in self._answering.pop(session.peer, ()):
-            task.cancel()
+        if (link := self._links.pop(session.peer, None)) is not None:
+            link.close()
 
     def depends(self, session: PeerSession) -> bool:
         """Whether a request to or from a peer waits for its response."""
-        return session.peer in self._answering or any(peer == session.peer for peer, _ in self._waiting)
+        link = self._links.get(session.peer)
+        return link is not None and bool(link.waiting or link.tasks)
 
     def message(self, session: PeerSession, message: Message) -> bool:
         """Take a request, a response or a notification."""
-        match message:
-            case Request():
-                self._answer(session, message)
-            case Response():
-                future, name = self._waiting.get((session.peer, message.number), (None, ""))
-                if future is not None and not future.done():
-                    if message.ok:
-                        future.set_result(message.value)
-                    else:
-                        future.set_exception(PeerRefused(name, message.error, message.remedy))
-            case Notification():
-                if (listener := self._listeners.get(message.what)) is not None:
-                    listener(session, message.args)
-            case _:
-                return False
+        if isinstance(message, Request | Response):
+            self._links[session.peer].take(message)
+        elif not isinstance(message, Notification):
+            return False
+        elif (listener := self._listeners.get(message.what)) is not None:
+            listener(session, message.args)
         return True
 
     async def close(self) -> None:
         """Cancel all handlers that are running."""
-        tasks = [task for tasks in self._answering.values() for task in tasks]
-        self._answering.clear()
+        tasks = [task for link in self._links.values() for task in link.tasks]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _take_large(self, session: PeerSession, message: Message, late: float, budget: Budget, size: int) -> None:
-        """Take a large message; its bytes count in ``budget`` while it is a request that is being answered."""
-        if not isinstance(message, Request):
-            self.message(session, message)
-        elif late > 0:
-            self._counters.add("ask.late")
-            text = f"the question came {late:.1f} s after the asking agent had given it up"
-            self._send(session, Response(message.number, ok=False, error=text, remedy="ask again"))
-        elif not budget.take(size):
-            self._send(session, Response(message.number, ok=False, error="too many large questions at once"))
-        elif (task := self._answer(session, message)) is None:
-            budget.give(size)
-        else:
-            task.add_done_callback(lambda _: budget.give(size))
 
-    def _answer(self, session: PeerSession, ask: Request) -> asyncio.Task[None] | None:
-        if session.link.abandoned:
-            self._counters.add("ask.late")
-            text = "this agent was stopped when the question came, and the asking one has given it up"
-            self._send(session, Response(ask.number, ok=False, error=text, remedy="ask again"))
-            return None
-        tasks = self._answering.setdefault(session.peer, set())
-        if len(tasks) >= limits.ASKS_AT_ONCE:
-            self._send(session, Response(ask.number, ok=False, error="too many questions at once"))
-            return None
-        task = asyncio.create_task(self._respond(session, ask), name=f"answer {ask.what} of {session.link.name}")
-        tasks.add(task)
-        task.add_done_callback(functools.partial(self._answered, session.peer))
-        return task
-
-    def _answered(self, peer: int, task: asyncio.Task[None]) -> None:
-        tasks = self._answering.get(peer, set())
-        tasks.discard(task)
-        if not tasks:
-            self._answering.pop(peer, None)
-
-    async def _respond(self, session: PeerSession, ask: Request) -> None:
-        handler = self._handlers.get(ask.what)
-        if handler is None:
-            text = f"this agent {UNKNOWN_QUESTION} {ask.what!r}"
-            self._send(session, Response(ask.number, ok=False, error=text, remedy="install the same release on both"))
-            return
-        try:
-            value = handler(session, ask.args)
-            if inspect.isawaitable(value):
-                value = await value
-            answer = Response(ask.number, ok=True, value=msgspec.to_builtins(value))
-        except RmpaError as error:
-            answer = Response(ask.number, ok=False, error=str(error)[: limits.CONTROL_TEXT_MAX])
-        except Exception:  # noqa: BLE001 - a task's top: one question must not end the link
-            self._counters.add("ask.failed")
-            _log.exception("! a question of %s failed: %s", session.link.name, ask.what[: limits.ASK_NAME_MAX])
-            answer = Response(
-                ask.number, ok=False, error=f"the agent failed at {ask.what}", remedy="its log says why"
-            )
-        self._send(session, answer)
-
-    def _send(self, session: PeerSession, answer: Response) -> None:
-        try:
-            self._post(session, answer)
-        except LimitExceeded as error:
-            self._post(session, Response(answer.number, ok=False, error=f"the answer cannot be sent: {error}"))
-
-    def _post(self, session: PeerSession, message: Request | Response, wait: float = 0.0) -> None:
-        """Send a message; the peer does not act on a large request that comes after ``wait`` seconds."""
-        fields = message.args if isinstance(message, Request) else message.value
-        short, text = without_text(fields)
-        if text:
-            named = {"args": short} if isinstance(message, Request) else {"value": short}
-            body = b"\n".join((encode(msgspec.structs.replace(message, **named)), text))
-        elif len(body := encode(message)) <= limits.ASK_EXPRESS_MAX:
-            session.link.send_control(body)
-            return
-        if len(body) > limits.ASK_BYTES_MAX:
-            raise LimitExceeded("message between agents", len(body), limits.ASK_BYTES_MAX)
-        large = self._large.get(session.peer)
-        if large is None:
-            return  # its link is gone
-        if not large.outgoing.take(len(body)):
-            raise LimitExceeded("waiting messages between agents", large.outgoing.used, large.outgoing.limit)
-        until = time.time_ns() + round(wait * 1e9)
-        number = message.number if isinstance(message, Request) else 0
-        large.sender.send(number, body, until.to_bytes(_UNTIL, "little"), large.outgoing)
-
-
-class LargeMessages(BodyReceiver):
-    """The large requests and responses of one link.
+class LinkRequests(BodyReceiver):
+    """The requests over one link, in both directions, and its large messages.
 
     Args:
+        rpc: Has the handlers.
         session: The peer.
-        take: ``(session, message, late, budget, size)``: takes a message. ``late``: for how many seconds at least the
-            peer has not waited any more; at most 0 if it may still wait.
-        send: Sends the response to a request that was lost.
     """
 
-    def __init__(
-        self,
-        session: PeerSession,
-        take: Callable[[PeerSession, Message, float, Budget, int], None],
-        send: Callable[[PeerSession, Response], None],
-    ) -> None:
+    def __init__(self, rpc: PeerRpc, session: PeerSession) -> None:
         super().__init__(Budget(limits.ASK_BYTES), limits.ASK_BYTES_MAX + _UNTIL)
+        self._rpc = rpc
         self._session = session
-        self._take = take
-        self._respond = send
-        self.sender = BodySender(session.link, _ROUTE)
-        self.outgoing = Budget(limits.ASK_BYTES)
+        self._link = session.link
+        self._sender = BodySender(session.link, _ROUTE)
+        self._outgoing = Budget(limits.ASK_BYTES)
+        self._numbers = itertools.cycle(range(1, UINT32_MAX + 1))
+        self.waiting: dict[int, asyncio.Future[Any]] = {}
+        """The requests to the peer that have no response yet, by number."""
+        self.tasks: set[asyncio.Task[None]] = set()
+        """The handlers of the peer's requests."""
+
+    async def request(self, what: str, args: dict[str, Any], timeout: float) -> Any:  # noqa: ASYNC109 - as above
+        """Send a request, and return the value of its response; errors as ``PeerRpc.request``."""
+        number = next(self._numbers)
+        future = self.waiting[number] = asyncio.get_running_loop().create_future()
+        try:
+            self._post(Request(number, what, args), timeout)
+            async with asyncio.timeout(timeout):
+                return await future
+        except TimeoutError:
+            remedy = "is its agent stopped, or its version older?"
+            raise UnreachableError("agent", f"{self._link.name} ({what}, {timeout:g} s)", remedy) from None
+        finally:
+            del self.waiting[number]
+
+    def fail(self, remedy: str) -> None:
+        """Fail the requests to the peer."""
+        for future in self.waiting.values():
+            if not future.done():
+                future.set_exception(UnreachableError("agent", self._link.name, remedy))
+
+    def close(self) -> None:
+        """End everything: the link is gone."""
+        self._sender.close()
+        self.fail(_LINK_ENDED)
+        for task in self.tasks:
+            task.cancel()
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:  # noqa: ARG002 - the message has its own number
-        """Take a message.
+        """Take a large message.
 
         Raises:
             RemoteProtocolError: It is none; the caller closes the link.
@@ -276,13 +190,95 @@ class LargeMessages(BodyReceiver):
         if end >= 0:
             with_text(message.args if isinstance(message, Request) else message.value, view[end + 1 :])
         clock = self._session.time
-        late = -1.0
+        late = 0.0
         if clock.error_ns is not None:
             now = time.time_ns() + clock.ahead_ns - clock.error_ns
             late = (now - int.from_bytes(view[:_UNTIL], "little")) / 1e9
-        self._take(self._session, message, late, self._budget, len(body))
+        self.take(message, late, len(body))
 
     def failed(self, sequence: int, reason: str) -> None:
         """Respond to a request of which the rest was lost; a lost response has the requesting agent's time-out."""
         if sequence:
-            self._respond(self._session, Response(sequence, ok=False, error=f"the question was lost: {reason}"))
+            self._refuse(sequence, f"the question was lost: {reason}")
+
+    def take(self, message: Request | Response, late: float = 0.0, size: int = 0) -> None:
+        """Take a request or a response.
+
+        Args:
+            message: The message.
+            late: For how many seconds at least the peer has not waited for a response any more; at most 0: it waits.
+            size: The bytes of a large message; those of a request count in the budget while it is answered.
+        """
+        if isinstance(message, Response):
+            future = self.waiting.get(message.number)
+            if future is not None and not future.done():
+                if message.ok:
+                    future.set_result(message.value)
+                else:
+                    future.set_exception(PeerRefused(self._link.name, message.error, message.remedy))
+        elif late > 0 or self._link.abandoned:
+            self._rpc.counters.add("ask.late")
+            text = "this agent was stopped when the question came, and the asking one has given it up"
+            if late > 0:
+                text = f"the question came {late:.1f} s after the asking agent had given it up"
+            self._refuse(message.number, text, "ask again")
+        elif len(self.tasks) >= limits.ASKS_AT_ONCE:
+            self._refuse(message.number, "too many questions at once")
+        elif not self._budget.take(size):
+            self._refuse(message.number, "too many large questions at once")
+        else:
+            name = f"answer {message.what} of {self._link.name}"
+            task = asyncio.create_task(self._answer(message, size), name=name)
+            self.tasks.add(task)
+            task.add_done_callback(self.tasks.discard)
+
+    async def _answer(self, ask: Request, size: int) -> None:
+        try:
+            await self._respond(ask)
+        finally:
+            self._budget.give(size)
+
+    async def _respond(self, ask: Request) -> None:
+        handler = self._rpc.handlers.get(ask.what)
+        if handler is None:
+            text = f"this agent {UNKNOWN_QUESTION} {ask.what!r}"
+            self._refuse(ask.number, text, "install the same release on both")
+            return
+        try:
+            value = handler(self._session, ask.args)
+            if inspect.isawaitable(value):
+                value = await value
+            self._send(Response(ask.number, ok=True, value=msgspec.to_builtins(value)))
+        except RmpaError as error:
+            self._refuse(ask.number, str(error)[: limits.CONTROL_TEXT_MAX])
+        except Exception:  # noqa: BLE001 - a task's top: one question must not end the link
+            self._rpc.counters.add("ask.failed")
+            _log.exception("! a question of %s failed: %s", self._link.name, ask.what)
+            self._refuse(ask.number, f"the agent failed at {ask.what}", "its log says why")
+
+    def _refuse(self, number: int, error: str, remedy: str = "") -> None:
+        self._send(Response(number, ok=False, error=error, remedy=remedy))
+
+    def _send(self, answer: Response) -> None:
+        try:
+            self._post(answer)
+        except LimitExceeded as error:
+            self._post(Response(answer.number, ok=False, error=f"the answer cannot be sent: {error}"))
+
+    def _post(self, message: Request | Response, wait: float = 0.0) -> None:
+        """Send a message; the peer does not act on a large request that comes after ``wait`` seconds."""
+        fields = message.args if isinstance(message, Request) else message.value
+        short, text = without_text(fields)
+        if text:
+            named = {"args": short} if isinstance(message, Request) else {"value": short}
+            body = b"\n".join((encode(msgspec.structs.replace(message, **named)), text))
+        elif len(body := encode(message)) <= limits.ASK_EXPRESS_MAX:
+            self._link.send_control(body)
+            return
+        if len(body) > limits.ASK_BYTES_MAX:
+            raise LimitExceeded("message between agents", len(body), limits.ASK_BYTES_MAX)
+        if not self._outgoing.take(len(body)):
+            raise LimitExceeded("waiting messages between agents", self._outgoing.used, self._outgoing.limit)
+        until = time.time_ns() + round(wait * 1e9)
+        number = message.number if isinstance(message, Request) else 0
+        self._sender.send(number, body, until.to_bytes(_UNTIL, "little"), self._outgoing)

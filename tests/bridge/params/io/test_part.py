@@ -278,7 +278,7 @@ async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set(si
 
 async def test_large_messages_are_bounded(sides: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     base, pad, args = await owner_and_peer(sides)
-    base.asks._large[1]._budget.limit = pad.asks._large[1].outgoing.limit = 30_000
+    base.asks._links[1]._budget.limit = pad.asks._links[1]._outgoing.limit = 30_000
     entered, leave = asyncio.Event(), asyncio.Event()
 
     async def hold(_session: PeerSession, _args: dict[str, Any]) -> object:
@@ -300,7 +300,7 @@ async def test_large_messages_are_bounded(sides: Any, monkeypatch: pytest.Monkey
     with pytest.raises(PeerRefused, match="the answer cannot be sent: message between agents"):
         await held
     assert await pad.ask(transfer.SET, args) == {"count": 1}, "what was answered counts no more"
-    assert base.asks._large[1]._budget.used == pad.asks._large[1].outgoing.used == 0
+    assert base.asks._links[1]._budget.used == pad.asks._links[1]._outgoing.used == 0
 
 
 async def test_a_large_value_does_not_replace_one_that_was_told_after_it(sides: Any) -> None:
@@ -326,7 +326,7 @@ async def test_a_lost_lane_fails_what_waits(sides: Any) -> None:
     base, pad, args = await owner_and_peer(sides)
     cast("Any", pad.links[1].link).bulk.slow = True
     asked = asyncio.create_task(pad.ask(transfer.SET, args))
-    await until(lambda: pad.asks._waiting)
+    await until(lambda: pad.asks._links[1].waiting)
     pad.asks.lane_lost(pad.links[1])
     with pytest.raises(UnreachableError, match="its connection for large messages has just ended"):
         await asked
