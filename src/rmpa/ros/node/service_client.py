@@ -18,7 +18,6 @@ from rmpa.core.errors import (
     RmpaError,
     UnreachableError,
 )
-from rmpa.core.limits import KIB
 from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import connect
@@ -43,8 +42,6 @@ from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, Header
-
-_WHOLE = 64 * KIB
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
@@ -76,13 +73,14 @@ class ServiceConnection:
         fields: The server's header.
     """
 
-    def __init__(self, sock: socket.socket, service: str, on_closed: Callable[[], None] | None) -> None:
+    def __init__(
+        self, sock: socket.socket, service: str, fields: Header, on_closed: Callable[[], None] | None
+    ) -> None:
         self.service = service
-        self.fields: Header = {}
+        self.fields = fields
         self._sock = sock
         self._on_closed = on_closed
         self._loop = asyncio.get_running_loop()
-        self._header: asyncio.Future[Header] | None = self._loop.create_future()
         self._done: Done | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._body: BodyBuffer | None = None
@@ -128,13 +126,12 @@ class ServiceConnection:
         try:
             async with asyncio.timeout(timeout):
                 sock = await connect(host, port)
-                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                keep_alive(sock)
-                made = cls(sock, service, on_closed)
                 try:
-                    await made._exchange(header, md5sum)
+                    keep_alive(sock)
+                    fields = _checked(await exchange_headers(sock, header), service, md5sum)
+                    return cls(sock, service, fields, on_closed)
                 except BaseException:
-                    made.close()
+                    sock.close()
                     raise
         except TimeoutError:
             where = f"{uri} within {timeout:g} s"
@@ -144,7 +141,6 @@ class ServiceConnection:
                 remedy = "`rmpa doctor` says what to do"
                 raise OutOfDescriptors(f"server of service {service}", uri, remedy) from error
             raise UnreachableError(f"server of service {service}", f"{uri} ({error})") from error
-        return made
 
     @property
     def description(self) -> ServiceDescription:
@@ -232,16 +228,6 @@ class ServiceConnection:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    async def _exchange(self, header: Header, md5sum: str) -> None:
-        assert self._header is not None  # noqa: S101 - set by __init__
-        self._stream.send([encode_header(header)], BODIES)
-        self.fields = await self._header
-        self._header = None
-        problem = check_server(self.fields, self.service, md5sum)
-        if problem is not None:
-            who = printable(self.caller_id) or "its server"
-            raise PeerRefused(f"service {self.service}: {who}", problem)
-
     def _was_closed_by_server(self) -> bool:
         """Whether the server has closed the connection since the last call; cheaper than a call that fails."""
         try:
@@ -258,34 +244,20 @@ class ServiceConnection:
             self._sending = None
 
     def _take(self, data: memoryview) -> tuple[int, int]:
-        if self._header is not None:
-            fields, consumed, wanted = parse_header(data)
-            if fields is not None and not self._header.done():
-                self._header.set_result(fields)
-            return consumed, wanted
         if self._done is None:
             raise RemoteProtocolError(f"the server of {self.service} sent {len(data)} bytes that were not asked for")
-        if self._body is not None:
-            return self._grow(self._body, data, 0)
-        head = parse_reply_head(data)
-        if head is None:
-            return 0, REPLY.size
-        self._ok, size = head
-        end = REPLY.size + size
-        if size > _WHOLE:
-            self._body = BodyBuffer(size)
-            return self._grow(self._body, data, REPLY.size)
-        if len(data) < end:
-            return 0, end
-        self._answered((self._ok, bytes(data[REPLY.size : end])))
-        return end, 0
-
-    def _grow(self, body: BodyBuffer, data: memoryview, start: int) -> tuple[int, int]:
-        count = body.take(data[start:])
+        at, body = 0, self._body
+        if body is None:
+            head = parse_reply_head(data)
+            if head is None:
+                return 0, REPLY.size
+            self._ok, size = head
+            at, body = REPLY.size, BodyBuffer(size)
+        at += body.take(data[at:])
+        self._body = None if body.whole else body
         if body.whole:
-            self._body = None
             self._answered((self._ok, body.data))
-        return start + count, 0
+        return at, 0
 
     def _answered(self, result: tuple[bool, bytes | bytearray] | ServiceFailed) -> None:
         done, self._done = self._done, None
@@ -300,30 +272,31 @@ class ServiceConnection:
         self._stop(f"no answer within {timeout:g} s")
 
     def _ended(self, error: Exception | None) -> None:
-        if self._header is not None:
-            problem = error or RemoteProtocolError(f"the server of {self.service} closed before its header")
-            if not self._header.done():
-                self._header.set_exception(problem)
-            return
         if error is not None and not isinstance(error, OSError):
-            problem_text = f"its server broke the protocol: {error}"
+            self._stop(f"its server broke the protocol: {error}")
         else:
-            problem_text = "its server died, or closed the connection, in the middle of the call"
-        self._stop(problem_text)
+            self._stop("its server died, or closed the connection, in the middle of the call")
 
     def _stop(self, problem: str) -> None:
         self._stream.close()
         self._body = None
         if self._sending is not None:
             self._sending.cancel()
-        if self._header is not None and not self._header.done():
-            self._header.cancel()
         on_closed, self._on_closed = self._on_closed, None
         if self._done is not None:
             self._answered(ServiceFailed(self.service, problem))
         if on_closed is not None:
             with contextlib.suppress(RmpaError):
                 on_closed()
+
+
+def _checked(fields: Header | None, service: str, md5sum: str) -> Header:
+    if fields is None:
+        raise RemoteProtocolError(f"the server of {service} closed before its header")
+    problem = check_server(fields, service, md5sum)
+    if problem is not None:
+        raise PeerRefused(f"service {service}: {printable(fields.get('callerid', '')) or 'its server'}", problem)
+    return fields
 
 
 # Finds out whether the TCPROS server of a node can be reached, without a trace at that node.
@@ -338,7 +311,6 @@ class ServiceConnection:
 
 
 _CALLER_ID: Final = "/rmpa"
-_CHUNK: Final = 64 * KIB
 
 
 async def probe(
@@ -405,10 +377,10 @@ async def exchange_headers(sock: socket.socket, header: Header) -> Header | None
     await loop.sock_sendall(sock, encode_header(header))
     data = b""
     while True:
-        fields, _, _ = parse_header(data)
+        fields, _, wanted = parse_header(data)
         if fields is not None:
             return fields
-        chunk = await loop.sock_recv(sock, _CHUNK)
+        chunk = await loop.sock_recv(sock, wanted - len(data))  # what follows the header is left to the caller
         if not chunk:
             return None
         data += chunk

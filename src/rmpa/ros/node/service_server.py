@@ -62,9 +62,6 @@ async def send_large(stream: Stream, head: bytes, body: Buffer) -> None:
 
 _log = logging.getLogger(__name__)
 
-_WHOLE: Final = 64 * KIB
-"""Requests of up to this many bytes are read in one piece, without a ``BodyBuffer``."""
-
 Describe = Callable[[], Awaitable[ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
 
@@ -84,7 +81,7 @@ class ServiceCall:
     __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
 
     def __init__(
-        self, client: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
+        self, client: _ClientConnection, service: str, caller_id: str, request: bytearray, deadline: float
     ) -> None:
         self._client: _ClientConnection | None = client
         self.service = service
@@ -158,7 +155,6 @@ class ServiceEndpoint:
         self._describe = describe
         self._on_mismatch = on_mismatch
         self._clients: set[_ClientConnection] = set()
-        self._waiting: list[_ClientConnection] = []
         self._describing: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
 
@@ -172,10 +168,8 @@ class ServiceEndpoint:
         client = _ClientConnection(self, connection)
         self._clients.add(client)
         if self.description is not None:
-            client.open(self.description, resume=False)
-            return
-        self._waiting.append(client)
-        if self._describing is None:
+            client.open(self.description)
+        elif self._describing is None:
             self._describing = asyncio.get_running_loop().create_task(
                 self._fetch_description(), name=f"describe {self.service}"
             )
@@ -185,8 +179,7 @@ class ServiceEndpoint:
         text = text or f"service [{self.service}] is no longer offered by [{self.caller_id}]"
         if self._describing is not None:
             self._describing.cancel()
-        self._refuse_waiting(text)
-        self._each(tuple(self._clients), lambda client: client.withdraw(text))
+        self._each(self._clients, lambda client: client.withdraw(text))
 
     async def closed(self) -> None:
         """After ``withdraw``: wait until the last replies are sent, at most ``runtime.limits.DRAIN_TIMEOUT``."""
@@ -206,8 +199,6 @@ class ServiceEndpoint:
     def remove(self, client: _ClientConnection) -> None:
         """Forget a connection that has ended; called by the connection."""
         self._clients.discard(client)
-        if client in self._waiting:
-            self._waiting.remove(client)
         if not self._clients and self._empty is not None and not self._empty.done():
             self._empty.set_result(None)
 
@@ -216,12 +207,13 @@ class ServiceEndpoint:
             answer = await self._call_describe()
         finally:
             self._describing = None
+        waiting = [client for client in self._clients if not client.opened]
         if isinstance(answer, str):
-            self._refuse_waiting(answer)
-            return
-        self.description = answer
-        waiting, self._waiting = self._waiting, []
-        self._each(waiting, lambda client: client.open(answer))
+            self._each(waiting, lambda client: client.refuse(answer))
+        else:
+            self.description = answer
+            self._each(waiting, lambda client: client.open(answer))
+            self._each(waiting, _ClientConnection.resume)  # with requests that are buffered already
 
     async def _call_describe(self) -> ServiceDescription | str:
         if self._describe is None:
@@ -237,13 +229,9 @@ class ServiceEndpoint:
             _log.exception("! %s could not be described", self.service)
             return f"service [{self.service}]: [{self.caller_id}] failed to describe it; its log says why"
 
-    def _refuse_waiting(self, text: str) -> None:
-        waiting, self._waiting = self._waiting, []
-        self._each(waiting, lambda client: client.refuse(text))
-
     def _each(self, clients: Iterable[_ClientConnection], answer: Callable[[_ClientConnection], None]) -> None:
         """Answers clients; one whose answer fails loses its connection, and the next ones get theirs."""
-        for client in clients:
+        for client in tuple(clients):
             try:
                 answer(client)
             except Exception:  # noqa: BLE001 - one client must not cost the others their answers
@@ -252,53 +240,44 @@ class ServiceEndpoint:
 
 
 class _ClientConnection:
-    """One client's connection: a request, its reply, and, if the connection is persistent, the next request."""
+    """One client's connection: a request, its reply, and, if the connection is persistent, the next request.
 
+    It waits for the service's description (``opened`` is not set yet), receives a request (``_body``), has a call
+    under way (``_call``), or sends a reply (``_sending``). A request that is too large is read away (``_discard``)
+    while its error is sent.
+    """
+
+    # More than 12 fields: what is above, and the client's time and end.
     def __init__(self, endpoint: ServiceEndpoint, connection: AcceptedConnection) -> None:
+        self.caller_id = connection.caller_id
         self._endpoint = endpoint
         self._connection = connection
         self._loop = asyncio.get_running_loop()
         self._persistent = is_persistent(connection.request)
-        self._open = False
-        self._ended = False
-        self._taking = False
-        self._served = False
-        self._call: ServiceCall | None = None
+        self.opened = self._ended = self._taking = False
         self._body: BodyBuffer | None = None
-        self._discard = 0
+        self._call: ServiceCall | None = None
         self._sending: asyncio.Task[None] | None = None
-        self._deadline: asyncio.TimerHandle | None = None
-        self._stall: asyncio.TimerHandle | None = None
-        self._seen = 0
+        self._discard = 0
+        self._timer: asyncio.TimerHandle | None = None
+        """Ends a call that takes too long, or a connection whose client sends nothing."""
         connection.on_data = self._take
         connection.on_end = self._left
 
-    @property
-    def caller_id(self) -> str:
-        """The client's node."""
-        return self._connection.caller_id
-
-    def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
-        """Answer the client's header, or refuse it if the md5 sums differ.
-
-        Args:
-            description: The service's description.
-            resume: Read requests that are buffered already; ``False`` within the read that received the header.
-        """
+    def open(self, description: ServiceDescription) -> None:
+        """Answer the client's header, or refuse it if the md5 sums differ."""
         connection, endpoint = self._connection, self._endpoint
         problem = check_client(connection.request, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
             endpoint.mismatch(connection.request, problem)
             self.refuse(problem)
             return
-        self._open = True
+        self.opened = True
         connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = server_header(endpoint.caller_id, description)
         connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
         if not self._persistent or is_probe(connection.request):
-            self._start_stall_timer()
-        if resume:
-            self._resume()
+            self._watch(connection.bytes_in)
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close."""
@@ -308,13 +287,15 @@ class _ClientConnection:
     def withdraw(self, text: str) -> None:
         """Answer a call under way with an error, and close once the last reply is sent."""
         call, self._call = self._call, None
-        if call is not None and not self._ended:
+        if not self.opened:
+            self.refuse(text)
+        elif call is not None and not self._ended:
             call.abandon()
             self._persistent = False
             self._respond(False, text.encode(errors="replace"))
         elif self._sending is not None:
             self._persistent = False
-        elif not self._served:
+        else:
             self.close()
 
     def close(self) -> None:
@@ -344,57 +325,42 @@ class _ClientConnection:
 
     def _step(self, data: memoryview) -> tuple[int, int]:
         """Consume a request, a part of a large one, or a part of one that is too large."""
+        at, body = 0, self._body
         if self._discard:
             count = min(self._discard, len(data))
             self._discard -= count
             if not self._discard:
-                self._stop_stall_timer()
-                self._reply_sent()
+                self._stop_timer()
+                self._proceed()
             return count, 0
-        if self._body is not None:
-            return self._grow(data)
-        if self._busy:
-            # One request at a time; at most one more is buffered.
-            if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
-                raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
-            return 0, 0
-        size = parse_request_length(data)
-        if size is None:
-            return 0, LENGTH.size
-        end = LENGTH.size + size
-        if size <= _WHOLE:
-            if len(data) < end:
-                self._start_stall_timer()
-                return 0, end
-            self._start_call(bytes(data[LENGTH.size : end]))
-            return end, 0
-        if size > limits.SERVICE_MESSAGE_MAX:
-            self._too_large(size)
-        else:
-            self._body = BodyBuffer(size)
-        self._start_stall_timer()
-        return LENGTH.size, 0
-
-    def _grow(self, data: memoryview) -> tuple[int, int]:
-        body = self._body
-        assert body is not None  # noqa: S101 - the caller looked
-        count = body.take(data)
+        if body is None:
+            if not self.opened or self._call is not None or self._sending is not None:
+                # One request at a time; at most one more is buffered.
+                if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
+                    raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
+                return 0, 0
+            size = parse_request_length(data)
+            if size is None:
+                return 0, LENGTH.size
+            at = LENGTH.size
+            if size > limits.SERVICE_MESSAGE_MAX:
+                self._too_large(size)
+                return at, 0
+            body = self._body = BodyBuffer(size)
+        at += body.take(data[at:])
         if body.whole:
             self._body = None
             self._start_call(body.data)
-        return count, 0
+        elif self._timer is None:
+            self._watch(self._connection.bytes_in)
+        return at, 0
 
-    @property
-    def _busy(self) -> bool:
-        return not self._open or self._call is not None or self._sending is not None or self._served
-
-    def _start_call(self, request: bytes | bytearray) -> None:
-        self._stop_stall_timer()
+    def _start_call(self, request: bytearray) -> None:
+        self._stop_timer()
         endpoint = self._endpoint
         endpoint.calls += 1
         deadline = self._loop.time() + endpoint.timeout
-        call = ServiceCall(self, endpoint.service, self._connection.caller_id, request, deadline)
-        self._call = call
+        call = self._call = ServiceCall(self, endpoint.service, self.caller_id, request, deadline)
         try:
             endpoint.serve(call)
         except RmpaError as error:
@@ -403,137 +369,111 @@ class _ClientConnection:
             _log.exception("! %s: a call of %s failed", endpoint.service, printable(call.caller_id))
             call.fail(f"service [{endpoint.service}]: [{endpoint.caller_id}] failed at this call; its log says why")
         if not call.answered:
-            self._deadline = self._loop.call_at(deadline, self._timed_out)
+            self._timer = self._loop.call_at(deadline, self._timed_out, call)
 
-    def _timed_out(self) -> None:
-        self._deadline = None
-        call, self._call = self._call, None
-        if call is not None:
-            call.abandon()
-            timeout = f"{self._endpoint.timeout:g} s"
-            self._respond(False, f"service [{self._endpoint.service}] did not answer within {timeout}".encode())
+    def _timed_out(self, call: ServiceCall) -> None:
+        self._call = None
+        call.abandon()
+        timeout = f"{self._endpoint.timeout:g} s"
+        self._respond(False, f"service [{self._endpoint.service}] did not answer within {timeout}".encode())
 
     def _too_large(self, size: int) -> None:
-        self._discard = size
         self._endpoint.calls += 1
         text = (
             f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
             f"{limits.SERVICE_MESSAGE_MAX}"
         )
-        _log.warning("! %s: a %s", printable(self._connection.caller_id), text)
+        _log.warning("! %s: a %s", printable(self.caller_id), text)
+        self._discard = size
         self._respond(False, text.encode())
+        self._watch(self._connection.bytes_in)
 
     # --- replies ----------------------------------------------------------------------------------------------
 
     def _respond(self, ok: bool, body: Buffer) -> None:
-        if self._deadline is not None:
-            self._deadline.cancel()
-            self._deadline = None
+        self._stop_timer()
         if ok and len(body) > limits.SERVICE_MESSAGE_MAX:
             ok, size = False, len(body)
             text = f"response of {size} bytes of service [{self._endpoint.service}] exceeds the limit of "
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
         head, body = frame_reply(ok, body)
-        stream = self._connection
         if len(body) > INLINE:
-            if isinstance(body, memoryview):
-                body = bytes(body)  # a view may be valid during this call only
-            self._sending = self._loop.create_task(self._send_large(head, body), name="service response")
+            # A view may be valid during this call only.
+            self._send(head, bytes(body) if isinstance(body, memoryview) else body)
             return
-        stream.send([head, body], BODIES)
-        if stream.pending_bytes:
-            # No request is read from a client that does not read its replies.
-            self._sending = self._loop.create_task(self._drain(), name="service response drains")
-            return
-        self._reply_sent()
+        self._connection.send([head, body], BODIES)
+        if self._connection.pending_bytes:
+            self._send()  # no request is read from a client that does not read its replies
+        else:
+            self._proceed()
 
-    async def _send_large(self, head: bytes, body: Buffer) -> None:
+    def _send(self, head: bytes = b"", body: Buffer = b"") -> None:
+        self._sending = self._loop.create_task(self._finish(head, body), name="service response")
+
+    async def _finish(self, head: bytes, body: Buffer) -> None:
+        """Send a large reply, if there is one; once all is sent close, or go on with the next request."""
         try:
-            await send_large(self._connection, head, body)
-            await self._drained()
+            if head:
+                await send_large(self._connection, head, body)
+            while self._connection.pending_bytes and not self._connection.closed:
+                await self._connection.drained()
         finally:
             self._sending = None
-        self._reply_sent()
+        if self._persistent or self._discard:
+            self._proceed()
+        else:
+            self.close()
 
-    async def _drain(self) -> None:
-        try:
-            await self._drained()
-        finally:
-            self._sending = None
-        self._reply_sent()
-
-    async def _drained(self) -> None:
-        stream = self._connection
-        while stream.pending_bytes and not stream.closed:
-            await stream.drained()
-
-    def _reply_sent(self) -> None:
-        """A reply was sent: close, or go on with the next request."""
+    def _proceed(self) -> None:
+        """Go on after a reply, unless the request is still being read away."""
         if self._discard or self._ended or self._sending is not None or self._call is not None:
             return
         if self._persistent:
-            self._resume()
-            return
-        self._served = True
-        # Not at once: a reply made during the read of another connection is only sent at the end of that read.
-        self._loop.call_soon(self._close_served)
+            self.resume()
+        else:
+            # Not closed at once: a reply made during the read of another connection is only sent at the end of that.
+            self._send()
 
-    def _close_served(self) -> None:
-        if self._ended:
-            return
-        if self._connection.pending_bytes and self._sending is None:
-            self._sending = self._loop.create_task(self._drain(), name="service response drains")
-            return
-        self.close()
-
-    def _resume(self) -> None:
+    def resume(self) -> None:
+        """Take what is buffered, unless this is within the read that would take it."""
         if not self._taking and not self._ended:
             self._connection.feed(b"")
 
     # --- the end ----------------------------------------------------------------------------------------------
 
-    def _start_stall_timer(self) -> None:
+    def _watch(self, seen: int) -> None:
         """Close the connection if no bytes arrive within ``limits.SERVICE_STALL`` seconds."""
-        if self._stall is None:
-            self._seen = self._connection.bytes_in
-            self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
+        self._stop_timer()
+        self._timer = self._loop.call_later(limits.SERVICE_STALL, self._stalled, seen)
 
-    def _stop_stall_timer(self) -> None:
-        if self._stall is not None:
-            self._stall.cancel()
-            self._stall = None
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
-    def _stalled(self) -> None:
-        self._stall = None
-        if self._connection.bytes_in != self._seen:
-            self._start_stall_timer()
+    def _stalled(self, seen: int) -> None:
+        if self._connection.bytes_in != seen:
+            self._watch(self._connection.bytes_in)
             return
-        who = printable(self._connection.caller_id)
+        who = printable(self.caller_id)
         _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
         self.close()
 
     def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
-            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._connection.caller_id), error)
+            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self.caller_id), error)
         self._release()
 
     def _release(self) -> None:
         self._ended = True
-        self._stop_stall_timer()
-        if self._deadline is not None:
-            self._deadline.cancel()
-            self._deadline = None
+        self._stop_timer()
         if self._sending is not None:
             self._sending.cancel()
         self._connection.on_data = None
-        self._connection.on_end = _ended
+        self._connection.on_end = lambda *_: None
         self._endpoint.remove(self)
         call, self._call = self._call, None
         if call is not None:
             self._endpoint.failed += 1
             call.abandon()
-
-
-def _ended(_connection: AcceptedConnection, _error: Exception | None) -> None:
-    """Does nothing; it is ``on_end`` of a connection that the endpoint has released."""
