@@ -11,7 +11,7 @@ from rmpa.core.contract import ContractRule
 from rmpa.observe.control_client import ControlClient
 from rmpa.observe.health import TOPIC
 from rmpa.observe.snapshot import Snapshot
-from rmpa.ros.types.definitions import ARRAY_MD5, ARRAY_TYPE
+from rmpa.ros.types.definitions import ARRAY_TYPE, known_description
 from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ async def test_diagnostics_of_a_link_its_topics_and_their_end(tmp_path: Path) ->
         assert (level, values["messages"], values["node"]) == (0, "10", "/talker")
         assert statuses.found["rmpa: a"][1].startswith("linked, round trip ")
         assert statuses.found["rmpa: this module"][0] == 0
-        assert statuses.headers == {(ARRAY_TYPE, ARRAY_MD5)}
+        assert statuses.headers == {(ARRAY_TYPE, known_description(ARRAY_TYPE).md5sum)}
         # Our own node's topic stays in its graph, on either side.
         assert list(b.core.state().publishers[TOPIC]) == ["/rmpa"]
         assert list(a.core.state().publishers[TOPIC]) == ["/rmpa"]

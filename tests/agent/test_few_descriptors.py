@@ -60,7 +60,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime_limits, "ACCEPT_PAUSE", 0.01)
     monkeypatch.setattr(runtime_limits, "DESCRIPTORS_TOLD", 0.05)
     monkeypatch.setattr(DESCRIPTORS, "_refusals", RefusalLog(logging.getLogger("rmpa"), DESCRIPTORS.counters))
-    monkeypatch.setattr(liveness, "listening_ports", lambda: None)
+    monkeypatch.setattr(liveness, "ask_listening_ports", lambda: None)
 
 
 def refused(use: Use) -> int:
@@ -179,12 +179,11 @@ async def test_without_descriptors_no_node_is_taken_for_dead(monkeypatch: pytest
     await core.start()
     try:
         core.call("registerPublisher", "/alive", "/t", "std_msgs/String", core.uri)
-        assert core._liveness is not None
         with descriptors_left(0):
             for _ in range(3):
                 core.suspect("/alive")
-                await until(lambda: core._liveness is not None and not core._liveness._checks)
-            assert not core._liveness.unreachable
+                await until(lambda: not core.liveness._checks)
+            assert not core.liveness.unreachable
         assert "/alive" in core.state().nodes
     finally:
         await core.close()

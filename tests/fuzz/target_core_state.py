@@ -8,6 +8,7 @@ import msgspec
 
 from rmpa.ros.core.state import parse, serialize
 from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.wire.xmlrpc import response_pieces
 
 _NODE = {
@@ -41,7 +42,7 @@ def _use(data: bytes) -> None:
     master.parameters.set("/", state.params)
     for name, node in state.nodes.items():
         for topic, kind in node.publishers.items():
-            master.registrations.register_publisher(topic, kind, name, node.api)
+            master.registrations.register(RegistrationKind.PUBLISHER, topic, name, node.api, kind)
     for method, *arguments in (("getSystemState",), ("getParam", "/"), ("getTopicTypes",)):
         for _ in response_pieces(list(master.call(method, ["/x", *arguments]))):
             pass

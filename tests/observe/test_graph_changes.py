@@ -8,6 +8,7 @@ import pytest
 from rmpa.observe import control as graph_changes
 from rmpa.observe import limits
 from rmpa.observe.control import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 
 _API = "http://127.0.0.1:9/"
@@ -21,7 +22,7 @@ class _Graph:
         self.history = GraphHistory(revision)
 
     def publish(self, topic: str, node: str = "/talker") -> None:
-        self.tables.register_publisher(topic, "std_msgs/String", node, _API)
+        self.tables.register(RegistrationKind.PUBLISHER, topic, node, _API, "std_msgs/String")
         self.note()
 
     def note(self) -> None:
@@ -42,8 +43,8 @@ def test_the_first_answer_has_the_whole_graph_and_the_next_one_what_has_changed(
     assert graph.ask(known) == GraphRows()
 
     graph.publish("/b")
-    graph.tables.register_subscriber("/b", "std_msgs/String", "/listener", _API)
-    graph.tables.register_service("/set", "rosrpc://127.0.0.1:8", "/talker", _API)
+    graph.tables.register(RegistrationKind.SUBSCRIBER, "/b", "/listener", _API, "std_msgs/String")
+    graph.tables.register(RegistrationKind.SERVICE, "/set", "/talker", _API, "rosrpc://127.0.0.1:8")
     graph.tables.purge("/none", _API)
     graph.note()
     assert graph.ask(known) == GraphRows(
@@ -56,7 +57,7 @@ def test_the_first_answer_has_the_whole_graph_and_the_next_one_what_has_changed(
 def test_what_is_gone_is_told_without_nodes() -> None:
     graph = _Graph()
     graph.publish("/a")
-    graph.tables.register_service("/set", "rosrpc://127.0.0.1:8", "/talker", _API)
+    graph.tables.register(RegistrationKind.SERVICE, "/set", "/talker", _API, "rosrpc://127.0.0.1:8")
     graph.note()
     graph.ask(None)
     known = graph.history.revision

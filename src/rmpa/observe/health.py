@@ -17,14 +17,12 @@ from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.why.diagnosis import BY_RULE, fallbacks, stuck, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import (
-    ARRAY_DEFINITION,
-    ARRAY_MD5,
     ARRAY_TYPE,
     DiagnosticLevel,
     DiagnosticStatus,
     frame_array,
+    known_description,
 )
-from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
@@ -448,7 +446,7 @@ class Diagnostics(PublicationEvents):
         self._publication = Publication(
             TOPIC,
             bridge.node.name,
-            TopicDescription(ARRAY_TYPE, ARRAY_MD5, ARRAY_DEFINITION),
+            known_description(ARRAY_TYPE),
             queue_messages=limits.DIAGNOSTICS_QUEUE,
             events=self,
         )

@@ -231,7 +231,7 @@ class NodeLine(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
-class NodeConnection(msgspec.Struct, kw_only=True, frozen=True):
+class NodeConnection(msgspec.Struct, frozen=True):
     """One connection of a node over which messages of a topic go, as the node tells it (``getBusInfo``).
 
     Attributes:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.ros.master.registrations import Unreachable
+    from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.node.publication import Publication
 
 MD5: Final = "5a9ea5f83505693b71e785041e67a8bb"

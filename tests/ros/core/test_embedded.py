@@ -10,12 +10,13 @@ from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core import liveness as identify
-from rmpa.ros.core.embedded import AGGREGATED, LOG_MD5, LOG_TYPE, RosCore
+from rmpa.ros.core.embedded import AGGREGATED, LOG_TYPE, RosCore
 from rmpa.ros.http.rpc import XmlRpcServer, call, call_api
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.types.definitions import known_description
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 DEADLINE: Final = 10.0
 STRING: Final = "std_msgs/String"
+LOG: Final = known_description(LOG_TYPE)
 
 
 class Slave:
@@ -167,8 +169,7 @@ async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.
         await slave.wait(lambda: len(slave.calls) >= 2)
         slave.go.set()
         await until(lambda: core.counters["notify.sent"] == 1)
-        assert core._notifier is not None
-        await until(lambda: core._notifier is not None and core._notifier.waiting == 0)
+        await until(lambda: core._notifier.waiting == 0)
 
 
 def _with_timeout(seconds: float) -> Callable[..., object]:
@@ -196,7 +197,6 @@ async def test_what_waits_for_a_slow_node_is_bounded(core: RosCore, monkeypatch:
         core.call("subscribeParam", "/s", slave.uri, "/")
         for number in range(1000):
             core.call("setParam", "/x", f"/p{number}", number)
-        assert core._notifier is not None
         assert core._notifier.waiting == 100
         assert core.counters["notify.dropped"] == 900
 
@@ -242,7 +242,7 @@ async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> Non
 async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     node = SlaveNode("/like_roscpp", "127.0.0.1", "http://127.0.0.1:11311/")
     await node.start()
-    node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG_TYPE, LOG_MD5, "")))
+    node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG_TYPE, LOG.md5sum, "")))
 
     async def no_get_name(uri: str, method: str, *params: XmlRpcValue, use: Use) -> object:
         if method == "getName":
@@ -318,8 +318,7 @@ async def test_a_live_node_survives_suspicion(core: RosCore) -> None:
     async with Slave() as alive:
         core.call("registerPublisher", "/alive", "/t", STRING, alive.uri)
         core.suspect("/alive")
-        assert core._liveness is not None
-        await until(lambda: core._liveness is not None and not core._liveness._checks)
+        await until(lambda: not core.liveness._checks)
         assert core.state().nodes == {"/alive": alive.uri}
 
 
@@ -330,7 +329,7 @@ async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monk
     async with Slave() as again:
         core.suspect("/n")
         core.call("registerPublisher", "/n", "/t", STRING, again.uri)
-        await until(lambda: core._liveness is not None and not core._liveness._checks)
+        await until(lambda: not core.liveness._checks)
         assert core.state().nodes == {"/n": again.uri}
 
 
@@ -373,7 +372,7 @@ class Logs:
         self.heard: list[bytes] = []
         self.speaker = SlaveNode("/speaker", "127.0.0.1", core.uri)
         self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
-        self.log = Publication("/rosout", "/speaker", TopicDescription(LOG_TYPE, LOG_MD5, "any"))
+        self.log = Publication("/rosout", "/speaker", TopicDescription(LOG_TYPE, LOG.md5sum, "any"))
         self.aggregated = Subscription(
             AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
         )

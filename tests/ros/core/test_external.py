@@ -260,7 +260,7 @@ async def test_dead_node_is_hidden_and_shown_again_if_alive(
     monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.01)
     monkeypatch.setattr(liveness.Liveness, "start", lambda _: None)  # only what is suspected is looked at
     master = await a_master()
-    master._liveness = None  # a roscore has none: it keeps what is dead
+    await master.liveness.close()  # a roscore has none: it keeps what is dead
     core = external(master.uri)
     await core.start()
     async with a_node() as api:

@@ -4,58 +4,13 @@ import asyncio
 import errno
 import socket
 import threading
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core.errors import UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core import liveness
-from rmpa.ros.core.liveness import listening_ports, read_tables
-from rmpa.runtime.tcp_connections import ask_listening_ports
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-
-@pytest.fixture
-def listening() -> Iterator[socket.socket]:
-    with socket.create_server(("127.0.0.1", 0)) as sock:
-        yield sock
-
-
-@pytest.mark.parametrize("look", [listening_ports, ask_listening_ports, read_tables])
-def test_listening_ports_are_found(listening: socket.socket, look: Callable[[], set[int] | None]) -> None:
-    port = listening.getsockname()[1]
-    with socket.create_connection(("127.0.0.1", port)) as client:
-        ports = look()
-        if ports is None:
-            pytest.skip("this kernel does not tell so")
-        assert port in ports
-        assert client.getsockname()[1] not in ports
-    listening.close()
-    assert port not in (look() or ())
-
-
-@pytest.mark.parametrize("piece", [1, 7, 100, 4096])
-def test_lines_are_read_in_any_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int) -> None:
-    table = tmp_path / "tcp"
-    table.write_text(
-        "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
-        "   0: 00000000:07E8 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1075 1 0 100 0\n"
-        "   1: 0100007F:9035 0100007F:1234 01 00000000:00000000 00:00000000 00000000     0        0 4661 1 0 100 0\n"
-        " 100: 0000000000000000FFFF00000100007F:97DB 00000000000000000000000000000000:0000 0A 00000000:00000000\n"
-    )
-    monkeypatch.setattr(liveness, "_TABLES", (table, tmp_path / "none"))
-    monkeypatch.setattr(liveness, "_PIECE", piece)
-    assert read_tables() == {0x07E8, 0x97DB}
-
-
-def test_a_kernel_that_does_not_tell_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(liveness, "_TABLES", (tmp_path / "none",))
-    assert read_tables() is None
-    monkeypatch.setattr(liveness, "ask_listening_ports", lambda: None)
-    assert listening_ports() is None
+from rmpa.ros.core.liveness import Liveness, Unreachable
 
 
 async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,8 +25,8 @@ async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatc
             assert go.wait(20.0)
         return set()
 
-    monkeypatch.setattr(liveness, "listening_ports", look)
-    looking = liveness.Liveness(nodes=dict, on_dead=lambda _node, _api: None)
+    monkeypatch.setattr(liveness, "ask_listening_ports", look)
+    looking = Liveness(nodes=dict, on_dead=lambda _node, _api: None)
     looking.start()
     assert await asyncio.to_thread(began.wait, 20.0)
     closing = asyncio.ensure_future(looking.close())
@@ -81,6 +36,10 @@ async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatc
     go.set()
     await closing
     assert seen[0].fileno() < 0
+
+
+AT = "http://10.9.9.9:1234/"
+AFTER = limits.NODE_UNREACHABLE_AFTER
 
 
 @pytest.mark.parametrize(
@@ -114,3 +73,47 @@ async def test_a_refusal_is_no_outage() -> None:
     with pytest.raises(ConnectionRefusedError):
         await liveness.try_connect("http://127.0.0.1:9/")
     assert await liveness.refuses("http://127.0.0.1:9/")
+
+
+class Bed:
+    """Attempts to reach the node ``/n``, and what the log says of them."""
+
+    def __init__(self, caplog: pytest.LogCaptureFixture) -> None:
+        self.liveness = Liveness(nodes=lambda: {"/n": "http://127.0.0.1:1/"}, on_dead=lambda _node, _api: None)
+        self.log = caplog
+
+    def tried(self, problem: str, now: float, api: str = AT) -> str:
+        """An attempt; returns what was logged."""
+        self.log.clear()
+        self.liveness.tried("/n", api, problem, now)
+        return self.log.text
+
+
+@pytest.fixture
+def bed(caplog: pytest.LogCaptureFixture) -> Bed:
+    return Bed(caplog)
+
+
+def test_a_node_is_withdrawn_after_a_while_and_comes_back(bed: Bed) -> None:
+    assert not bed.tried("no route", 100.0)
+    assert bed.liveness.unreachable == {"/n": Unreachable(AT, "no route", 100.0)}
+    assert not bed.tried("no answer", 99.9 + AFTER)
+    assert "cannot be reached (no answer)" in bed.tried("no answer", 100.0 + AFTER)
+    assert not bed.tried("no answer", 200.0 + AFTER), "told once"
+    assert bed.liveness.unreachable == {"/n": Unreachable(AT, "no answer", 100.0, withdrawn=True)}
+    assert "can be reached again" in bed.tried("", 300.0)
+    assert not bed.tried("", 301.0)
+    assert not bed.liveness.unreachable
+
+
+def test_a_short_outage_withdraws_nothing(bed: Bed) -> None:
+    bed.tried("no route", 0.0)
+    assert not bed.tried("", 1.0)
+    assert not bed.tried("no route", AFTER), "the time counts anew"
+
+
+def test_a_node_that_moves_is_forgotten(bed: Bed) -> None:
+    bed.tried("no route", 0.0)
+    assert not bed.tried("no route", AFTER, "http://10.9.9.8:1/"), "another address begins anew"
+    assert bed.liveness._not_listening(None) == ["/n"]
+    assert not bed.liveness.unreachable

@@ -113,7 +113,7 @@ async def running(path: Path, **options: object) -> AsyncIterator[RosCore]:
 
 def saved(core: RosCore) -> bool:
     """Whether the file has the present state."""
-    return core.stored is not None and core.stored._open and not core.stored._changed()
+    return core.stored is not None and core.stored._writer is not None and not core.stored._changed()
 
 
 def content(path: Path) -> StoredState:
@@ -405,7 +405,7 @@ async def test_new_registration_wins_over_the_stored_one(path: Path, monkeypatch
             await new.publish(core, "/b")
             old.go.set()
             assert core.stored is not None
-            late = core.stored._late
+            late = core.stored._asking
             await until(lambda: not late)
             assert core.state().nodes == {"/talker": new.uri}
             assert core.state().publishers == {"/b": {"/talker": new.uri}}
@@ -425,14 +425,19 @@ async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
             core.stored._took = 0.1  # type: ignore[union-attr] # it was set up above
 
         monkeypatch.setattr(core.stored, "_put", slow)
-        loop = asyncio.get_running_loop()
         for number in range(300):
             await call(core.uri, "registerPublisher", "/node", f"/t{number}", STRING, "http://127.0.0.1:1/")
         await until(lambda: saved(core))
         assert len(writes) <= 2
+        rests: list[float] = []
+
+        async def rest(seconds: float) -> None:
+            rests.append(seconds)
+
+        monkeypatch.setattr(core.stored, "_rest", rest)
         core.call("setParam", "/x", "/a", 1)
-        assert core.stored._timer is not None
-        assert core.stored._timer.when() > loop.time() + 0.05 * limits.CORE_STATE_SHARE
+        await until(lambda: saved(core) and len(rests) >= 2)
+        assert rests[-2:] == [limits.CORE_STATE_GATHER, 0.1 * limits.CORE_STATE_SHARE]
 
 
 @pytest.mark.parametrize("why", ["large", "full", "read-only"])

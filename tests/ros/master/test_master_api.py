@@ -8,13 +8,10 @@ import pytest
 from rmpa.ros import limits
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import (
-    Effect,
     GraphChange,
     GraphState,
-    ParamUpdate,
-    PublisherUpdate,
     RegistrationKind,
-    Shutdown,
+    SlaveCall,
 )
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
@@ -32,12 +29,12 @@ class Master:
     def __init__(self) -> None:
         self.ended: list[str] = []
         self.api = MasterApi("http://m:11311/", 42, self.ended.append)
-        self.effects: list[Effect] = []
+        self.calls: list[SlaveCall] = []
         self.changes: list[GraphChange] = []
 
     def __call__(self, method: str, *params: XmlRpcValue) -> RosReply:
         reply = self.api.call(method, params)
-        self.effects, self.changes = self.api.take()
+        self.calls, self.changes = self.api.take()
         serialize_response(list(reply))  # whatever is answered can be said
         return reply
 
@@ -54,9 +51,9 @@ def master() -> Master:
 
 def test_publisher_and_subscribers_are_notified(master: Master) -> None:
     assert master.value("registerSubscriber", "/s", "/t", "*", B) == []
-    assert master.effects == []
+    assert master.calls == []
     assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B]
-    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+    assert master.calls == [(B, "publisherUpdate", "/t", [A])]
     assert master.changes == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", A, STRING)]
 
 
@@ -73,7 +70,7 @@ def test_repeated_registration_notifies_but_is_no_change(master: Master) -> None
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/p", "/t", STRING, A)
     master("registerPublisher", "/p", "/t", STRING, A)
-    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+    assert master.calls == [(B, "publisherUpdate", "/t", [A])]
     assert master.changes == []
 
 
@@ -92,9 +89,9 @@ def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/p", "/t", STRING, A)
     assert master.value("unregisterPublisher", "/p", "/t", A) == 1
-    assert master.effects == [PublisherUpdate(B, "/t", ())]
+    assert master.calls == [(B, "publisherUpdate", "/t", [])]
     assert master.value("unregisterPublisher", "/p", "/t", A) == 0
-    assert master.effects == []
+    assert master.calls == []
     assert master("lookupNode", "/x", "/p").code == -1
 
 
@@ -112,7 +109,7 @@ def test_nodelets_with_one_uri_are_notified_once(master: Master) -> None:
     master("registerSubscriber", "/n1", "/t", "*", B)
     master("registerSubscriber", "/n2", "/t", "*", B)
     assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B, B]
-    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+    assert master.calls == [(B, "publisherUpdate", "/t", [A])]
 
 
 @pytest.mark.trap(33)
@@ -132,7 +129,7 @@ def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str
     master("registerService", "/twin", "/s", RPC, A)
     master("subscribeParam", "/twin", A, "/p")
     master(*taking)
-    assert Shutdown(A, "/twin", ("/t",)) in master.effects
+    assert (A, "shutdown", "/twin", ["/t"]) in master.calls
     gone = [change for change in master.changes if not change.added]
     assert master.value("lookupNode", "/x", "/twin") == C
     assert [(change.kind, change.name, change.api) for change in gone] == [
@@ -141,7 +138,7 @@ def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str
         (RegistrationKind.SERVICE, "/s", A),
     ]  # fmt: skip
     master("setParam", "/x", "/p", 1)
-    assert ParamUpdate(A, "/p/", 1) not in master.effects
+    assert (A, "paramUpdate", "/p/", 1) not in master.calls
 
 
 @pytest.mark.trap(33)
@@ -152,15 +149,15 @@ def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
         master("registerSubscriber", "/twin", "/u", STRING, uri)
         master("registerService", "/twin", "/s", service, uri)
         master("subscribeParam", "/twin", uri, "/p")
-    before = master.api.state()
+    before = master.api.registrations.state()
     assert master.value("unregisterPublisher", "/twin", "/t", A) == 0
     assert master.value("unregisterSubscriber", "/twin", "/u", A) == 0
     assert master.value("unregisterService", "/twin", "/s", RPC) == 0
     master("unsubscribeParam", "/twin", A, "/p")
-    assert master.effects == []
-    assert master.api.state() == before
+    assert master.calls == []
+    assert master.api.registrations.state() == before
     master("setParam", "/x", "/p", 1)
-    assert master.effects == [ParamUpdate(C, "/p/", 1)]
+    assert master.calls == [(C, "paramUpdate", "/p/", 1)]
 
 
 @pytest.mark.trap(33)
@@ -170,13 +167,13 @@ def test_an_evicted_node_does_not_take_its_name_back_by_a_parameter(master: Mast
     master("registerPublisher", "/twin", "/t", STRING, A)
     master("registerPublisher", "/twin", "/t", STRING, C)
     assert master.value("subscribeParam", "/twin", A, "/p") == 5
-    assert master.effects == []
+    assert master.calls == []
     assert master.value("lookupNode", "/x", "/twin") == C
     master("setParam", "/x", "/p", 6)
-    assert master.effects == []
+    assert master.calls == []
     # A real registration does take it, and a name that is free is anybody's.
     master("registerPublisher", "/twin", "/t", STRING, A)
-    assert Shutdown(C, "/twin", ("/t",)) in master.effects
+    assert (C, "shutdown", "/twin", ["/t"]) in master.calls
     master("unregisterPublisher", "/twin", "/t", A)
     master("subscribeParam", "/twin", C, "/p")
     assert master.value("lookupNode", "/x", "/twin") == C
@@ -190,8 +187,8 @@ def test_dead_node_is_purged_and_subscribers_notified(master: Master) -> None:
     registrations = master.api.registrations
     assert not registrations.purge("/dead", C), "it came back at another URI"
     assert registrations.purge("/dead", A)
-    effects, changes = master.api.take()
-    assert effects == [PublisherUpdate(B, "/t", ())]
+    calls, changes = master.api.take()
+    assert calls == [(B, "publisherUpdate", "/t", [])]
     assert [(change.kind, change.added) for change in changes] == [
         (RegistrationKind.PUBLISHER, False),
         (RegistrationKind.SERVICE, False),
@@ -199,7 +196,7 @@ def test_dead_node_is_purged_and_subscribers_notified(master: Master) -> None:
     assert master("lookupNode", "/x", "/dead").code == -1
     assert master("lookupService", "/x", "/srv")[0] == -1
     master("setParam", "/x", "/p", 1)
-    assert master.effects == []
+    assert master.calls == []
     assert not registrations.purge("/dead", A)
 
 
@@ -229,17 +226,17 @@ def test_lookups_may_be_answered_for_each_caller(master: Master) -> None:
 
 def test_states_are_snapshots(master: Master) -> None:
     master("registerPublisher", "/p", "/t", STRING, A)
-    state = master.api.state()
-    assert master.api.state() is state
+    state = master.api.registrations.state()
+    assert master.api.registrations.state() is state
     assert (state.publishers, state.types, state.nodes) == ({"/t": {"/p": A}}, {"/t": STRING}, {"/p": A})
     master("registerService", "/p", "/s", RPC, A)
     assert state.services == {}
-    assert master.api.state().services == {"/s": {"/p": RPC}}
+    assert master.api.registrations.state().services == {"/s": {"/p": RPC}}
 
 
 def test_a_state_handed_out_does_not_change(master: Master) -> None:
     def everything() -> GraphState:
-        return master.api.state()
+        return master.api.registrations.state()
 
     seen = [(everything(), copy.deepcopy(everything()))]
     for call in (
@@ -273,13 +270,13 @@ def test_parameters_handed_out_do_not_change(master: Master) -> None:
 def test_updates_have_slashes_and_deletion_is_an_empty_dict(master: Master) -> None:
     master("subscribeParam", "/s", B, "/a/b")
     master("setParam", "/x", "/a/b", 1)
-    assert master.effects == [ParamUpdate(B, "/a/b/", 1)]
+    assert master.calls == [(B, "paramUpdate", "/a/b/", 1)]
     master("setParam", "/s", "/a/b", 2)
-    assert master.effects == [], "the setter itself is not told"
+    assert master.calls == [], "the setter itself is not told"
     master("deleteParam", "/x", "/a")
-    assert master.effects == [ParamUpdate(B, "/a/b/", {})]
+    assert master.calls == [(B, "paramUpdate", "/a/b/", {})]
     master("setParam", "/x", "/", {"a": {"b": 3}})
-    assert master.effects == [ParamUpdate(B, "/a/b/", 3)]
+    assert master.calls == [(B, "paramUpdate", "/a/b/", 3)]
 
 
 def test_a_member_with_a_slash_in_its_name_is_no_news_of_another_parameter(master: Master) -> None:
@@ -288,7 +285,7 @@ def test_a_member_with_a_slash_in_its_name_is_no_news_of_another_parameter(maste
     master("subscribeParam", "/s", B, "/motors/limit")
     master("subscribeParam", "/s", B, "/speed/max")
     master("setParam", "/x", "/speed", {"/motors/limit": 99, "max": 2})
-    assert master.effects == [ParamUpdate(B, "/speed/max/", 2)]
+    assert master.calls == [(B, "paramUpdate", "/speed/max/", 2)]
     assert master.value("getParam", "/x", "/motors/limit") == 1
 
 

@@ -56,9 +56,12 @@ class Pair:
         """Ask the master for everything."""
         found = read_survey(self._many(survey_calls("/rmpa", self.nodes, ())), self.nodes, ())
         nodes = [node for node in found.nodes() if node not in found.uris]
-        services = list(found.holders_of_services())
+        services = list(found.holders[RegistrationKind.SERVICE])
         self.nodes = tuple(found.nodes())
-        return found.with_more(*read_lookups(self._many(lookup_calls("/rmpa", nodes, services)), nodes, services))
+        uris, places = read_lookups(self._many(lookup_calls("/rmpa", nodes, services)), nodes, services)
+        found.uris |= uris
+        found.services |= places
+        return found
 
     def look(self) -> list[Call]:
         """Look at the master and learn; what must be registered again is written."""
@@ -220,7 +223,7 @@ def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     pair.mirror.mark_dead("/p", THEIRS)
     pair.look()
     assert pair.changes() == {("-", "/t", "/p")}
-    pair.mirror.mark_alive("/p")
+    del pair.mirror.dead["/p"]
     pair.look()
     assert pair.mirror.registrations.at(RegistrationKind.PUBLISHER, "/t") == {"/p": THEIRS}
     pair.mirror.mark_dead("/p", THEIRS)
@@ -304,7 +307,11 @@ def test_what_a_survey_shows_of_a_node_between_two_of_its_registrations_goes_aga
     pair.look()
     pair.flush()
     assert pair.look() == []
-    assert set(pair.mirror.registrations.published()) == set(pair.master.registrations.published()) == {"/a"}
+    assert (
+        set(pair.mirror.registrations.state().publishers)
+        == set(pair.master.registrations.state().publishers)
+        == {"/a"}
+    )
 
 
 NAMES: Final = st.sampled_from(["/a", "/b"])

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import struct
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros.types.definitions import (
-    ARRAY_DEFINITION,
-    ARRAY_MD5,
     ARRAY_TYPE,
     DiagnosticLevel,
     DiagnosticStatus,
     frame_array,
+    known_description,
     md5sum,
     parse_definition,
 )
@@ -51,8 +51,17 @@ def test_golden_bytes() -> None:
     assert struct.unpack_from("<I", framed)[0] == len(framed) - 4
 
 
-def test_the_definition_is_that_of_ros() -> None:
-    assert md5sum(ARRAY_TYPE, parse_definition(ARRAY_TYPE, ARRAY_DEFINITION)) == ARRAY_MD5
+@pytest.mark.parametrize(
+    ("name", "md5"),
+    [
+        (ARRAY_TYPE, "60810da900de1dd6ddd437c3503511da"),
+        ("rosgraph_msgs/Log", "acffd30cd6b6de30f120938c17c593fb"),
+    ],
+)
+def test_the_definitions_are_those_of_ros(name: str, md5: str) -> None:
+    about = known_description(name)
+    assert (about.type, about.md5sum) == (name, md5)
+    assert md5sum(name, parse_definition(name, about.definition)) == md5
 
 
 TEXT = st.text(max_size=20)
@@ -64,7 +73,7 @@ STATUS = st.builds(
 @given(st.integers(0, 1 << 40), st.integers(0, (1 << 31) * 1_000_000_000 - 1), st.lists(STATUS, max_size=5))
 def test_others_read_what_we_write(sequence: int, stamp: int, statuses: list[DiagnosticStatus]) -> None:
     framed = frame_array(sequence, stamp, (status.serialize() for status in statuses))
-    message = MessageType.learn(ARRAY_TYPE, ARRAY_DEFINITION, ARRAY_MD5).deserialize(framed[4:])
+    message = MessageType(ARRAY_TYPE).deserialize(framed[4:])
     assert message.header.seq == sequence & 0xFFFFFFFF
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamp, 1_000_000_000)
     assert [

@@ -42,7 +42,7 @@ def _table(forgotten: list[str] | None = None) -> GraphTable:
 def _read(tables: Registrations) -> GraphTable:
     """The graph as the master's answers give it."""
     kinds = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)
-    state = [[[name, list(nodes)] for name, nodes in tables.providers(kind)] for kind in kinds]
+    state = [[[name, list(nodes)] for name, nodes in tables.table(kind).items()] for kind in kinds]
     made = _table()
     made.update(rows_of(state, [list(each) for each in tables.types().items()]))
     return made
@@ -52,17 +52,17 @@ def _act(tables: Registrations, what: str, name: str, node: str, more: str) -> N
     api, uri = f"http://host{node}:1/", f"rosrpc://host{node}:{more}"
     match what:
         case "publish":
-            tables.register_publisher(name, more, node, api)
+            tables.register(RegistrationKind.PUBLISHER, name, node, api, more)
         case "subscribe":
-            tables.register_subscriber(name, more, node, api)
+            tables.register(RegistrationKind.SUBSCRIBER, name, node, api, more)
         case "serve":
-            tables.register_service(name, uri, node, api)
+            tables.register(RegistrationKind.SERVICE, name, node, api, uri)
         case "unpublish":
             tables.unregister(RegistrationKind.PUBLISHER, name, node, api)
         case "unsubscribe":
             tables.unregister(RegistrationKind.SUBSCRIBER, name, node, api)
         case "unserve":
-            tables.unregister_service(name, uri, node)
+            tables.unregister(RegistrationKind.SERVICE, name, node, uri)
         case "die":
             tables.purge(node, api)
 

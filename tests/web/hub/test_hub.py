@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.definitions import HEADER_PART, parse_definition
+from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
@@ -340,7 +340,8 @@ async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(core: RosCor
 
 async def test_what_is_published_before_its_type_is_known_is_numbered_too(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "other") as other:
-        kind = MessageType.learn("my_msgs/Stamped", "Header header\n" + HEADER_PART)
+        text = f"Header header\n{SEPARATOR}\nMSG: std_msgs/Header\n{known_text('std_msgs/Header')}"
+        kind = MessageType.learn("my_msgs/Stamped", text)
         publisher = await other.advertise("/other", kind)
         await until(lambda: "/other" in hub.graph.topics)
         client = FakeClient(hub)

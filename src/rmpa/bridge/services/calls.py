@@ -26,11 +26,11 @@ from rmpa.core.counters import SampleRing
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import SERIAL_MASK, is_type_name
 from rmpa.mesh import limits as mesh_limits
-from rmpa.ros.core.liveness import listening_ports
 from rmpa.ros.http.rpc import is_own_name
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
+from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping
@@ -485,7 +485,7 @@ def _listening() -> tuple[set[int] | None, frozenset[str], float]:
     """
     began = time.thread_time()
     try:
-        ports, here = listening_ports(), frozenset(local_addresses())
+        ports, here = ask_listening_ports(), frozenset(local_addresses())
     except OSError:  # no file descriptor is left to ask the kernel; the next check may succeed
         ports, here = None, frozenset()
     return ports, here, time.thread_time() - began

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.registrations import Unreachable
+    from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import TopicConnection

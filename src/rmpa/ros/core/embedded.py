@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
-from rmpa.ros.core.external import Core
+from rmpa.ros.core.external import LOOPBACK, Core
 from rmpa.ros.core.liveness import Liveness, Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.rpc import XmlRpcServer
@@ -24,29 +24,38 @@ from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import LoggerServices, SlaveNode
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
-from rmpa.ros.types.definitions import HEADER_PART
-from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.ros.types.definitions import known_description
 from rmpa.runtime.accept import Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
     from pathlib import Path
 
     from rmpa.ros.master.parameters import GraphChange
-    from rmpa.ros.master.registrations import Registrations, Unreachable
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
+_log = logging.getLogger(__name__)
 
-# Repeats the list of a topic's publishers after one of them was withdrawn and soon registered again.
-#
-# A rospy subscriber that gets the new list before it has read the end of its connection to that publisher takes
-# itself
-# for connected, and would never connect again. Lists that bring nothing new change nothing at a node.
+NODE: Final = "/rosout"
+TOPIC: Final = "/rosout"
+AGGREGATED: Final = "/rosout_agg"
+_LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.embedded"}
+"""Python's loggers, by the names that the rosout of a roscore gives to its own."""
+LOG_TYPE: Final = "rosgraph_msgs/Log"
+DEFAULT_PORT: Final = 11311
+CALLER_ID: Final = "/rmpa_core"
+ROS_DISTRO: Final = "noetic\n"
+"""The value of ``/rosdistro``, with the line break that roscore takes from ``rosversion -d``; programs strip it."""
+ROS_VERSION: Final = "1.15.15\n"
+"""The value of ``/rosversion``: the version of ros_comm whose master this core replaces."""
 
 
 class ReturnedPublishers:
-    """The publishers that were withdrawn lately, and the topics whose list will be repeated.
+    """Repeats the list of a topic's publishers after one of them was withdrawn and soon registered again.
+
+    A rospy subscriber that gets the new list before it has read the end of its connection to that publisher takes
+    itself for connected, and would never connect again. Lists that bring nothing new change nothing at a node.
 
     Args:
         repeat: Called in the loop with the topics whose list of publishers is to be sent to their subscribers again.
@@ -87,77 +96,24 @@ class ReturnedPublishers:
         self._repeat(topics)
 
 
-# The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
-#
-# The messages are never decoded.
-
-
-_log = logging.getLogger(__name__)
-
-NODE: Final = "/rosout"
-TOPIC: Final = "/rosout"
-AGGREGATED: Final = "/rosout_agg"
-_LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.embedded"}
-"""Python's loggers, by the names that the rosout of a roscore gives to its own."""
-LOG_TYPE: Final = "rosgraph_msgs/Log"
-LOG_MD5: Final = "acffd30cd6b6de30f120938c17c593fb"
-_DEFINITION: Final = (
-    "##\n"
-    "## Severity level constants\n"
-    "##\n"
-    "byte DEBUG=1 #debug level\n"
-    "byte INFO=2  #general level\n"
-    "byte WARN=4  #warning level\n"
-    "byte ERROR=8 #error level\n"
-    "byte FATAL=16 #fatal/critical level\n"
-    "##\n"
-    "## Fields\n"
-    "##\n"
-    "Header header\n"
-    "byte level\n"
-    "string name # name of the node\n"
-    "string msg # message \n"
-    "string file # file the message came from\n"
-    "string function # function the message came from\n"
-    "uint32 line # line the message came from\n"
-    "string[] topics # topic names that the node publishes\n"
-    "\n"
-    f"{HEADER_PART}"
-)
-"""The text that ROS's own publishers send: rosbag and others compute the md5 sum from it."""
-
-
 class Rosout:
-    """Keeps the node ``/rosout`` in the graph, as users and tools expect it.
+    """The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
 
-    Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a new address, after
-    ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
+    The messages are never decoded. Like roscore it restarts the node when that ends (``rosnode kill /rosout``), at a
+    new address, after ``limits.ROSOUT_RESPAWN`` seconds. While another node has the name, this one does not run.
 
     Args:
+        core: The core, whose counters count ``rosout.restarted``.
         host: The address to listen at.
         advertised_host: The address that is registered.
-        master_uri: The core's URI.
-        call: Calls the core's master.
-        registrations: The core's tables, which show what node has the name.
-        counters: Count refusals, and ``rosout.restarted``.
     """
 
-    def __init__(
-        self,
-        host: str,
-        advertised_host: str,
-        master_uri: str,
-        call: Callable[..., RosReply],
-        registrations: Registrations,
-        counters: Counters,
-    ) -> None:
+    def __init__(self, core: RosCore, host: str, advertised_host: str) -> None:
+        self._core = core
         self._host = host
         self._advertised = advertised_host
-        self._master_uri = master_uri
-        self._call = call
-        self._registrations = registrations
-        self._counters = counters
-        self._aggregator: _Aggregator | None = None
+        self._node: SlaveNode | None = None
+        self._loggers: LoggerServices | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._asked_to_end = False
         self._changed = asyncio.Event()
@@ -165,7 +121,7 @@ class Rosout:
     @property
     def uri(self) -> str:
         """The node's slave API; empty while it does not run."""
-        return self._aggregator.uri if self._aggregator is not None else ""
+        return self._node.uri if self._node is not None else ""
 
     async def start(self) -> None:
         """Listen, register, and stay registered.
@@ -189,25 +145,51 @@ class Rosout:
             self._changed.set()
 
     async def _begin(self) -> None:
-        self._asked_to_end = False
-        aggregator = _Aggregator(
-            SlaveNode(
-                NODE,
-                self._host,
-                self._master_uri,
-                advertised_host=self._advertised,
-                counters=self._counters,
-                on_shutdown=self._killed,
-            ),
-            self._call,
+        core, self._asked_to_end = self._core, False
+        node = SlaveNode(
+            NODE,
+            self._host,
+            core.uri,
+            advertised_host=self._advertised,
+            counters=core.counters,
+            on_shutdown=self._killed,
         )
-        await aggregator.start()
-        self._aggregator = aggregator
+        await node.start()
+        self._node = node
+        log = known_description(LOG_TYPE)
+        aggregated = Publication(AGGREGATED, NODE, log, queue_messages=limits.ROSOUT_QUEUE)
+        node.add_publication(aggregated)
+
+        def pass_on(_publisher: PublisherConnection, framed: memoryview) -> None:
+            aggregated.publish_framed(framed)
+
+        subscription = Subscription(
+            TOPIC,
+            NODE,
+            on_message=pass_on,
+            on_refused=_refused,
+            own_uri=node.uri,
+            type_name=log.type,
+            md5sum=log.md5sum,
+            definition=log.definition,
+            number=node.next_number,
+        )
+        node.add_subscription(subscription)
+        core.call("registerPublisher", NODE, AGGREGATED, LOG_TYPE, node.uri)
+        core.call("registerSubscriber", NODE, TOPIC, LOG_TYPE, node.uri)
+        subscription.update(list(core.publishers(TOPIC).values()))
+        self._loggers = LoggerServices(node, core.call, _LOGGERS)
+        self._loggers.start()
 
     async def _end(self) -> None:
-        aggregator, self._aggregator = self._aggregator, None
-        if aggregator is not None:
-            await aggregator.close()
+        node, self._node = self._node, None
+        if node is None:
+            return
+        if self._loggers is not None:
+            self._loggers.close()
+        self._core.call("unregisterSubscriber", NODE, TOPIC, node.uri)
+        self._core.call("unregisterPublisher", NODE, AGGREGATED, node.uri)
+        await node.close()
 
     def _killed(self, reason: str) -> None:
         _log.info("= %s was asked to end (%s)", NODE, reason)
@@ -218,21 +200,18 @@ class Rosout:
         while True:
             await self._changed.wait()
             self._changed.clear()
-            if self._asked_to_end or not self._is_registered():
+            # Both registrations must be in the graph.
+            core, ours = self._core, self.uri
+            there = core.publishers(AGGREGATED).get(NODE) == core.subscribers(TOPIC).get(NODE) == ours
+            if self._asked_to_end or not there:
                 await self._end()
                 await asyncio.sleep(limits.ROSOUT_RESPAWN)
                 await self._restart()
 
-    def _is_registered(self) -> bool:
-        """Whether both registrations of the aggregator are in the graph."""
-        at = self._registrations.at
-        publisher, subscriber = at(RegistrationKind.PUBLISHER, AGGREGATED), at(RegistrationKind.SUBSCRIBER, TOPIC)
-        return publisher.get(NODE) == subscriber.get(NODE) == self.uri
-
     async def _restart(self) -> None:
         told = False
-        while self._aggregator is None:
-            if (holder := self._registrations.node_api(NODE)) is not None:
+        while self._node is None:
+            if (holder := self._core.registrations.node_api(NODE)) is not None:
                 if not told:
                     _log.warning("= another node is %s now, at %s; ours waits until it leaves", NODE, holder)
                     told = True
@@ -247,84 +226,12 @@ class Rosout:
             except (RmpaError, OSError) as error:
                 _log.error("! %s cannot be started again yet: %s", NODE, error)
                 await asyncio.sleep(limits.ROSOUT_LOOK)
-        self._counters.add("rosout.restarted")
+        self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)
 
 
-class _Aggregator:
-    """One run of the node, from its registration to its end.
-
-    Args:
-        node: Not started yet.
-        call: Calls the core's master.
-    """
-
-    def __init__(self, node: SlaveNode, call: Callable[..., RosReply]) -> None:
-        self._call = call
-        self._node = node
-        self._aggregated = Publication(
-            AGGREGATED,
-            NODE,
-            TopicDescription(LOG_TYPE, LOG_MD5, _DEFINITION),
-            queue_messages=limits.ROSOUT_QUEUE,
-        )
-        self._loggers = LoggerServices(node, call, _LOGGERS)
-
-    @property
-    def uri(self) -> str:
-        """The node's slave API."""
-        return self._node.uri
-
-    async def start(self) -> None:
-        """Listen and register.
-
-        Raises:
-            StartError: The address cannot be used.
-        """
-        await self._node.start()
-        self._node.add_publication(self._aggregated)
-        subscription = Subscription(
-            TOPIC,
-            NODE,
-            on_message=self._pass_on,
-            on_refused=self._refused,
-            own_uri=self._node.uri,
-            type_name=LOG_TYPE,
-            md5sum=LOG_MD5,
-            definition=_DEFINITION,
-            number=self._node.next_number,
-        )
-        self._node.add_subscription(subscription)
-        self._call("registerPublisher", NODE, AGGREGATED, LOG_TYPE, self._node.uri)
-        reply = self._call("registerSubscriber", NODE, TOPIC, LOG_TYPE, self._node.uri)
-        subscription.update(_texts(reply.value))
-        self._loggers.start()
-
-    async def close(self) -> None:
-        """Unregister, and close."""
-        self._loggers.close()
-        self._call("unregisterSubscriber", NODE, TOPIC, self._node.uri)
-        self._call("unregisterPublisher", NODE, AGGREGATED, self._node.uri)
-        await self._node.close()
-
-    def _pass_on(self, _publisher: PublisherConnection, framed: memoryview) -> None:
-        self._aggregated.publish_framed(framed)
-
-    def _refused(self, publisher: PublisherConnection, text: str) -> None:
-        _log.info("! %s of %s is not aggregated: %s", TOPIC, publisher.uri, text)
-
-
-def _texts(value: XmlRpcValue) -> list[str]:
-    return [uri for uri in value if isinstance(uri, str)] if isinstance(value, list) else []
-
-
-DEFAULT_PORT: Final = 11311
-CALLER_ID: Final = "/rmpa_core"
-_LOOPBACK: Final = "127.0.0.1"
-ROS_DISTRO: Final = "noetic\n"
-"""The value of ``/rosdistro``, with the line break that roscore takes from ``rosversion -d``; programs strip it."""
-ROS_VERSION: Final = "1.15.15\n"
-"""The value of ``/rosversion``: the version of ros_comm whose master this core replaces."""
+def _refused(publisher: PublisherConnection, text: str) -> None:
+    _log.info("! %s of %s is not aggregated: %s", TOPIC, publisher.uri, text)
 
 
 class RosCore(Core):
@@ -356,17 +263,19 @@ class RosCore(Core):
         temporary: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
+        self.uri, self.node_host, self.node_address = "", LOOPBACK, LOOPBACK
+        self.listeners = []
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
         self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
-        self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
-        self._notifier: Notifier | None = None
-        self._liveness: Liveness | None = None
-        self._with_rosout = rosout
-        self._rosout: Rosout | None = None
         self.registrations = self._api.registrations
-        self.listeners = []
+        self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
+        self._notifier = Notifier(
+            nodes_at=self.registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
+        )
+        self.liveness = Liveness(nodes=self.registrations.nodes, on_dead=self._dead)
+        self._rosout = Rosout(self, host, self._advertised) if rosout else None
         self._returned = ReturnedPublishers(self._repeat_publishers)
         self.on_change(self._returned.graph_changed)
         self.stored: CoreState | None = None
@@ -389,67 +298,41 @@ class RosCore(Core):
         Raises:
             StartError: The port is taken, or the address cannot be used.
         """
-        registrations = self._api.registrations
-        self._notifier = Notifier(
-            nodes_at=registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
-        )
-        self._liveness = Liveness(nodes=registrations.nodes, on_dead=self._dead)
         if self.stored is not None:
             await self.stored.restore()
         try:
             await self._server.start()
+            self.uri = self._api.uri = f"http://{self._advertised}:{self.port}/"
+            # roslaunch's convention: nodes of one run find their logs by it.
+            if not isinstance(self.call("getParam", CALLER_ID, "/run_id").value, str):
+                self.call("setParam", CALLER_ID, "/run_id", str(uuid.uuid1()))
+            self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
+            self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
+            self.liveness.start()
+            if self.stored is not None:
+                self.stored.start()
+            if self._rosout is not None:
+                self.on_change(self._rosout.graph_changed)
+                await self._rosout.start()
         except BaseException:
             await self.close()
             raise
-        self._api.uri = f"http://{self._advertised}:{self.port}/"
-        # roslaunch's convention: nodes of one run find their logs by it.
-        if not isinstance(self.call("getParam", CALLER_ID, "/run_id").value, str):
-            self.call("setParam", CALLER_ID, "/run_id", str(uuid.uuid1()))
-        self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
-        self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
-        self._liveness.start()
-        if self.stored is not None:
-            self.stored.start()
-        if self._with_rosout:
-            self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, registrations, self.counters)
-            self.on_change(self._rosout.graph_changed)
-            try:
-                await self._rosout.start()
-            except BaseException:
-                self._rosout = None
-                await self.close()
-                raise
 
     async def close(self) -> None:
         """Close /rosout, then the tasks that call nodes, then the server; then write the last state."""
-        rosout, self._rosout = self._rosout, None
-        if rosout is not None:
-            await rosout.close()
+        if self._rosout is not None:
+            await self._rosout.close()
         self._returned.close()
-        if self._notifier is not None:
-            await self._notifier.close()
-        if self._liveness is not None:
-            await self._liveness.close()
+        await self._notifier.close()
+        await self.liveness.close()
         await self._server.close()
         if self.stored is not None:
             await self.stored.close()
 
     @property
-    def uri(self) -> str:
-        return self._api.uri
-
-    @property
     def port(self) -> int:
         """The port at which the core listens."""
         return self._server.port
-
-    @property
-    def node_host(self) -> str:
-        return _LOOPBACK
-
-    @property
-    def node_address(self) -> str:
-        return _LOOPBACK
 
     # --- asking it --------------------------------------------------------------------------------------------
 
@@ -483,13 +366,6 @@ class RosCore(Core):
     def restored(self) -> str:
         return self.stored.summary() if self.stored is not None else ""
 
-    def unreachable(self) -> Mapping[str, Unreachable]:
-        return self._liveness.unreachable if self._liveness is not None else {}
-
-    def suspect(self, node: str) -> None:
-        if self._liveness is not None:
-            self._liveness.suspect(node)
-
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
@@ -499,13 +375,12 @@ class RosCore(Core):
             self._carry_out()
 
     def _carry_out(self) -> None:
-        effects, changes = self._api.take()
+        calls, changes = self._api.take()
         if self.stored is not None:
-            self.stored.schedule_write()
-        # Queued before the callbacks run: what a callback registers must be notified after these effects.
-        if self._notifier is not None:
-            for effect in effects:
-                self._notifier.add(effect)
+            self.stored.note_change()
+        # Queued before the callbacks run: what a callback registers must be notified after these calls.
+        for call in calls:
+            self._notifier.add(call)
         self.report(changes)
 
     def _repeat_publishers(self, topics: list[str]) -> None:

@@ -1,7 +1,5 @@
 """The interface of a ROS core as the agent needs it, and the core that is a roscore of its own.
 
-A real roscore (or any other master) in place of the embedded core.
-
 A ROS master does not notify of changes in its graph, so it is polled, a few times a second and in one call. The
 agent's registrations are sent in order, many in one call. One task does both in turn, so a poll is never older than
 the writes before it. While the master does not answer, the last known graph stays.
@@ -13,8 +11,7 @@ import asyncio
 import contextlib
 import logging
 from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from rmpa.core.counters import Counters, logged_failure
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
@@ -23,6 +20,7 @@ from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
 from rmpa.ros.master.mirror import (
     REGISTRATIONS,
+    Call,
     Mirror,
     Survey,
     lookup_calls,
@@ -40,35 +38,34 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.master.parameters import GraphChange, GraphState
-    from rmpa.ros.master.registrations import Registrations, Unreachable
-
-
-# The interface of a ROS core as the agent needs it: the embedded one (``ros.core.embedded``) or a real roscore.
-
+    from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)
+LOOPBACK: Final = "127.0.0.1"
 
 
 class Core(Protocol):
-    """The local graph: read at any time, changed by ``call``, observed by ``on_change``."""
+    """The local graph: read at any time, changed by ``call``, observed by ``on_change``.
+
+    Attributes:
+        counters: Counts what goes wrong.
+        registrations: The local graph's tables, or a copy of a real roscore's.
+        liveness: Checks the graph's nodes.
+        listeners: Called after each change.
+        uri: The master's URI: ``ROS_MASTER_URI`` of the nodes of this graph.
+        node_host: The address that the agent's own nodes (its proxies among them) listen at.
+        node_address: The address of the agent's own nodes that is registered in this graph.
+    """
 
     counters: Counters
     registrations: Registrations
-    """The local graph's tables, or a copy of a real roscore's."""
+    liveness: Liveness
     listeners: list[Callable[[GraphChange], None]]
-
-    @property
-    def uri(self) -> str:
-        """The master's URI: ``ROS_MASTER_URI`` of the nodes of this graph."""
-
-    @property
-    def node_host(self) -> str:
-        """The address that the agent's own nodes (its proxies among them) listen at."""
-
-    @property
-    def node_address(self) -> str:
-        """The address of the agent's own nodes that is registered in this graph."""
+    uri: str
+    node_host: str
+    node_address: str
 
     async def start(self) -> None:
         """Start the core, or connect to it.
@@ -142,9 +139,11 @@ class Core(Protocol):
 
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
+        return self.liveness.unreachable
 
     def suspect(self, node: str) -> None:
         """Check now whether this node is dead or has moved."""
+        self.liveness.suspect(node)
 
     def notes(self) -> tuple[str, ...]:
         """Problems that the user should know of, such as a master that does not answer."""
@@ -155,26 +154,8 @@ class Core(Protocol):
 
 _PARAM_WRITES: Final = frozenset({"setParam", "deleteParam"})
 _MULTICALL: Final = "system.multicall"
-_LOOPBACK: Final = "127.0.0.1"
-
-
-@dataclass(slots=True, eq=False)
-class _Write:
-    """One call in the queue to the master.
-
-    Args:
-        method: A method of the Master API.
-        params: Its parameters, the caller id included.
-        done: Gets the answer; ``None`` if no caller waits for it.
-    """
-
-    method: str
-    params: tuple[XmlRpcValue, ...]
-    done: asyncio.Future[RosReply] | None = None
-
-    def fail(self, error: Exception) -> None:
-        if self.done is not None and not self.done.done():
-            self.done.set_exception(error)
+_Write: TypeAlias = "tuple[Call, asyncio.Future[RosReply] | None]"
+"""A call in the queue to the master, and the future of its answer, if a caller waits for it."""
 
 
 class ExternalCore(Core):
@@ -193,17 +174,15 @@ class ExternalCore(Core):
         uri: str,
         *,
         own_node: str,
-        node_host: str = _LOOPBACK,
-        node_address: str = _LOOPBACK,
+        node_host: str = LOOPBACK,
+        node_address: str = LOOPBACK,
         counters: Counters | None = None,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
-        self._uri = uri
+        self.uri, self.node_host, self.node_address = uri, node_host, node_address
         self._own_node = own_node
-        self._node_host = node_host
-        self._node_address = node_address
         self._mirror = Mirror(yielder=yielding_to_data)
-        self._liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
+        self.liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
         self.registrations = self._mirror.registrations
         self.listeners = []
         self._writes: deque[_Write] = deque()
@@ -233,7 +212,7 @@ class ExternalCore(Core):
         await self._poll()
         await self._flush()
         self._task = self._loop.create_task(self._work(), name="external core")
-        self._liveness.start()
+        self.liveness.start()
 
     async def close(self) -> None:
         """Unregister all that the agent registered at the master, if it answers in ``limits.MASTER_FAREWELL``."""
@@ -247,33 +226,21 @@ class ExternalCore(Core):
                 async with asyncio.timeout(limits.MASTER_FAREWELL):
                     await asyncio.shield(self._task)
             if self._writes and not self._problem:
-                _log.warning("! the roscore at %s was not told of %d changes", self._uri, len(self._writes))
+                _log.warning("! the roscore at %s was not told of %d changes", self.uri, len(self._writes))
         tasks = [task for task in (self._task, self._revival) if task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await self._liveness.close()
-        self._drop_writes(UnreachableError("ROS master", self._uri, "the agent has ended"))
-
-    @property
-    def uri(self) -> str:
-        return self._uri
-
-    @property
-    def node_host(self) -> str:
-        return self._node_host
-
-    @property
-    def node_address(self) -> str:
-        return self._node_address
+        await self.liveness.close()
+        self._drop_writes(UnreachableError("ROS master", self.uri, "the agent has ended"))
 
     def notes(self) -> tuple[str, ...]:
         """Whether the master does not answer, or another agent is at it too."""
         if self._problem:
-            where = f"the roscore at {self._uri} does not answer ({self._problem})"
+            where = f"the roscore at {self.uri} does not answer ({self._problem})"
             return (f"{where}: what flows goes on, new nodes are not seen; start it again",)
         if self._other_agent and self._loop.time() < self._other_until:
-            where = f"another agent (its node at {self._other_agent}) is at the roscore {self._uri} too"
+            where = f"another agent (its node at {self._other_agent}) is at the roscore {self.uri} too"
             return (f"{where}, and each undoes what the other registers: end one, or give it a roscore of its own",)
         return ()
 
@@ -283,46 +250,45 @@ class ExternalCore(Core):
         """Queue a registration or a write of a parameter, after all previous calls."""
         yield_to_data()
         if method in REGISTRATIONS:
-            reply = self._mirror.apply(method, params)
-            self._report_changes()
-            if reply.code == 1:
-                self._write(_Write(method, params))
-            return reply
-        if method not in _PARAM_WRITES:
+            reply = self._apply(method, params)
+        elif method not in _PARAM_WRITES:
             return RosReply(-1, f"{method} is for the master itself to answer: it has to be asked", 0)
-        if self._problem:
+        elif self._problem:
             return RosReply(0, self.notes()[0], 0)
-        self._write(_Write(method, params))
-        return RosReply(1, "will be written", 0)
+        else:
+            reply = RosReply(1, "will be written", 0)
+        if reply.code == 1:
+            self._write(((method, params), None))
+        return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        writes = method in REGISTRATIONS
-        if writes:
-            reply = self._mirror.apply(method, params)
-            self._report_changes()
+        if method in REGISTRATIONS:
+            reply = self._apply(method, params)
             if reply.code != 1:
                 return reply
-        if writes or method in _PARAM_WRITES:
-            if self._problem:
-                raise UnreachableError("ROS master", self._uri, self._problem)
-            done: asyncio.Future[RosReply] = asyncio.get_running_loop().create_future()
-            self._write(_Write(method, params, done))
-            return await done
-        await self._written.wait()
-        return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
+        elif method not in _PARAM_WRITES:
+            await self._written.wait()
+            return await call_api(self.uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
+        if self._problem:
+            raise UnreachableError("ROS master", self.uri, self._problem)
+        done: asyncio.Future[RosReply] = asyncio.get_running_loop().create_future()
+        self._write(((method, params), done))
+        return await done
+
+    def _apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
+        reply = self._mirror.apply(method, params)
+        self._report_changes()
+        return reply
 
     def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - a roscore has no such hook
         return False
-
-    def unreachable(self) -> Mapping[str, Unreachable]:
-        return self._liveness.unreachable
 
     def restored(self) -> str:
         return ""
 
     def suspect(self, node: str) -> None:
-        if not self._mirror.is_ours(node):
-            self._liveness.suspect(node)
+        if node not in self._mirror.ours():
+            self.liveness.suspect(node)
         self._poll_soon()
 
     # --- the one task -----------------------------------------------------------------------------------------
@@ -337,7 +303,7 @@ class ExternalCore(Core):
                 if self._loop.time() >= self._next_poll:
                     await self._poll()
             except Exception:  # noqa: BLE001 - a task's top: polling must go on
-                _log.exception("! looking at the roscore %s failed", self._uri)
+                _log.exception("! looking at the roscore %s failed", self.uri)
                 self._seen = b""
                 self._next_poll = self._loop.time() + limits.MASTER_LOOK_MAX
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
@@ -365,8 +331,8 @@ class ExternalCore(Core):
         self._queue(write)
         if len(self._writes) > limits.MASTER_WRITES_MAX:
             # Dropping all is cheaper than choosing: the next poll finds what is missing.
-            _log.warning("! the roscore at %s is slow: %d changes are told anew", self._uri, len(self._writes))
-            self._drop_writes(UnreachableError("ROS master", self._uri, "it is too slow"))
+            _log.warning("! the roscore at %s is slow: %d changes are told anew", self.uri, len(self._writes))
+            self._drop_writes(UnreachableError("ROS master", self.uri, "it is too slow"))
             self._poll_soon()
 
     def _queue(self, write: _Write) -> None:
@@ -376,8 +342,8 @@ class ExternalCore(Core):
 
     def _drop_writes(self, error: Exception) -> None:
         self._seen = b""
-        while self._writes:
-            self._writes.popleft().fail(error)
+        _fail(self._writes, error)
+        self._writes.clear()
         self._written.set()
 
     async def _flush(self) -> None:
@@ -387,22 +353,19 @@ class ExternalCore(Core):
             try:
                 await self._send(batch)
             except UnreachableError as error:
-                for write in batch:
-                    write.fail(error)
                 self._lost(error)
-            except BaseException:
-                for write in batch:
-                    write.fail(UnreachableError("ROS master", self._uri, "the call was given up"))
-                raise
+                _fail(batch, error)
+            finally:
+                _fail(batch, UnreachableError("ROS master", self.uri, "the call was given up"))
         self._written.set()
 
     async def _send(self, batch: list[_Write]) -> None:
         """Send calls as one ``system.multicall``; if that fails as a whole, one by one."""
         try:
             # A master needs long to read parameters of megabytes.
-            large = any(write.method in _PARAM_WRITES for write in batch)
+            large = any(method in _PARAM_WRITES for (method, _), _ in batch)
             timeout = limits.MASTER_ASK_TIMEOUT if large else limits.MASTER_TIMEOUT
-            answers = await self._many([one_call(write.method, write.params) for write in batch], timeout)
+            answers = await self._many([one_call(*asked) for asked, _ in batch], timeout)
         except (LocalProtocolError, RemoteProtocolError, RosFault) as error:
             if len(batch) > 1:
                 for write in batch:
@@ -412,27 +375,20 @@ class ExternalCore(Core):
             return
         for write, answer in zip(yielding_to_data(batch), answers, strict=False):
             match answer:
-                case [value]:
-                    self._answered(write, value)
+                case [[int(code), str(status), value]]:
+                    if write[1] is not None and not write[1].done():
+                        write[1].set_result(RosReply(code, status, value))
+                    if code != 1:
+                        self._refused(write, RosFault(code, status))
                 case _:
                     self._refused(write, RosFault(1, brief(answer)))
 
-    def _answered(self, write: _Write, value: XmlRpcValue) -> None:
-        try:
-            reply = RosReply.of(value)
-        except RemoteProtocolError as error:
-            self._refused(write, error)
-            return
-        if write.done is not None and not write.done.done():
-            write.done.set_result(reply)
-        if reply.code != 1:
-            self._refused(write, RosFault(reply.code, reply.status))
-
     def _refused(self, write: _Write, error: Exception) -> None:
-        write.fail(error)
+        _fail([write], error)
         self.counters.add("master.refused")
-        _log.error("! the roscore at %s does not take %s%s: %s", self._uri, write.method, brief(write.params), error)
-        self._mirror.forget((write.method, write.params))
+        method, params = write[0]
+        _log.error("! the roscore at %s does not take %s%s: %s", self.uri, method, brief(params), error)
+        self._mirror.forget(write[0])
         self._report_changes()
 
     # --- polling ----------------------------------------------------------------------------------------------
@@ -460,7 +416,7 @@ class ExternalCore(Core):
         if not self._request:
             calls = survey_calls(self._own_node, self._nodes, self._services)
             self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls]), every=1))
-        body = await exchange(self._uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
+        body = await exchange(self.uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
         if body == self._seen and not self._problem:
             return False
         answer = await read_response(body)
@@ -475,12 +431,14 @@ class ExternalCore(Core):
 
     async def _completed(self, survey: Survey) -> Survey:
         """Look up the nodes and services that are new in a survey; later polls include them in their request."""
-        nodes, services = survey.nodes(), survey.holders_of_services()
+        nodes, services = survey.nodes(), survey.holders[RegistrationKind.SERVICE]
         new_nodes = [node for node in nodes if node not in survey.uris]
         new_services = [service for service in services if service not in survey.services]
         if new_nodes or new_services:
             answer = await self._many(lookup_calls(self._own_node, new_nodes, new_services))
-            survey = survey.with_more(*read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data))
+            uris, places = read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data)
+            survey.uris |= uris
+            survey.services |= places
         if tuple(nodes) != self._nodes or tuple(services) != self._services:
             self._nodes, self._services = tuple(nodes), tuple(services)
             self._request, self._seen = b"", b""
@@ -489,17 +447,17 @@ class ExternalCore(Core):
     def _take(self, survey: Survey, seen: int) -> None:
         if other := self._mirror.taken(survey, self._own_node, seen):
             if not self._other_agent:
-                _log.error("! another agent (its node at %s) is at the roscore %s too: end one", other, self._uri)
+                _log.error("! another agent (its node at %s) is at the roscore %s too: end one", other, self.uri)
             self._other_agent, self._other_until = other, self._loop.time() + limits.MASTER_OTHER_AGENT
         again = self._mirror.update(survey, seen)
         self._report_changes()
         if again and self._loop.time() >= self._other_until:
-            _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
-        for method, params in again:
-            self._queue(_Write(method, params))
+            _log.info("= %d registrations are made, or ended, anew at %s", len(again), self.uri)
+        for missing in again:
+            self._queue((missing, None))
 
     async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
-        answers = await call(self._uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
+        answers = await call(self.uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
         if not isinstance(answers, list) or len(answers) != len(calls):
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers
@@ -512,13 +470,13 @@ class ExternalCore(Core):
     def _found(self) -> None:
         if self._problem:
             if self._task is not None:
-                _log.warning("= the roscore at %s answers", self._uri)
+                _log.warning("= the roscore at %s answers", self.uri)
             self._problem = ""
 
     def _lost(self, error: RmpaError) -> None:
         problem = str(error)
         if not self._problem or self._task is None:
-            _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self._uri, problem)
+            _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self.uri, problem)
         self._problem = problem
         self._drop_writes(error)
 
@@ -536,5 +494,12 @@ class ExternalCore(Core):
         for node, api in dead.items():
             if not await refuses(api) and self._mirror.dead.get(node) == api:
                 _log.info("= node %s at %s lives after all", node, api)
-                self._mirror.mark_alive(node)
+                del self._mirror.dead[node]
                 self._seen = b""
+
+
+def _fail(writes: Iterable[_Write], error: Exception) -> None:
+    """Answer the calls with an error, as far as a caller waits for an answer."""
+    for _, done in writes:
+        if done is not None and not done.done():
+            done.set_exception(error)

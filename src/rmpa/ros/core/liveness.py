@@ -1,19 +1,17 @@
-"""Which nodes live: the node at an address, pings, and the notices of changes to nodes.
-
-Finds out which node is at an address: its port may be another node's by now (ros_comm#2018, #2241).
-"""
+"""Which nodes live: the node at an address, pings, and the notices of changes to nodes."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import os
 import random
-import re
+from collections import OrderedDict
+from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 from rmpa.core.counters import Backoff
 from rmpa.core.errors import (
@@ -24,16 +22,13 @@ from rmpa.core.errors import (
     RmpaError,
     UnreachableError,
 )
-from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeConnection, NodePing
 from rmpa.ros.http.rpc import call, call_api, connect, is_own_name, split_uri
-from rmpa.ros.master.parameters import Effect, ParamUpdate, PublisherUpdate, Shutdown
-from rmpa.ros.master.registrations import Reachability
 from rmpa.ros.node.service_client import exchange_headers
 from rmpa.ros.wire.slave_api import read_bus_info
 from rmpa.ros.wire.tcpros import subscriber_header
-from rmpa.ros.wire.xmlrpc import RosFault, RosReply
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use, is_shortage
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
@@ -43,12 +38,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from rmpa.core.counters import Counters
-    from rmpa.ros.master.registrations import Unreachable
+    from rmpa.ros.master.parameters import SlaveCall
 
 _log = logging.getLogger(__name__)
 
 _CALLER_ID: Final = "/rmpa_identify"
 _TOPICS_ASKED: Final = 2
+_PORTIONS: Final = 10
+"""Wake-ups in one interval over which the connects to nodes are spread."""
+
+
+# --- which node is at an address: its port may be another node's by now (ros_comm#2018, #2241) ---------------------
 
 
 async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
@@ -90,62 +90,38 @@ async def _publisher_of(api: str, topic: str) -> str | None:
     reply = await call_api(api, "requestTopic", _CALLER_ID, topic, [["TCPROS"]], use=Use.CORE)
     match reply:
         case (1, _, ["TCPROS", str(host), int(port)]):
-            return await _callerid(host, port, topic)
+            with await connect(host, port, Use.CORE) as sock:
+                fields = await exchange_headers(sock, subscriber_header(topic, _CALLER_ID))
+            return None if fields is None else fields.get("callerid")
     return None
 
 
-async def _callerid(host: str, port: int, topic: str) -> str | None:
-    sock = await connect(host, port, Use.CORE)
-    try:
-        fields = await exchange_headers(sock, subscriber_header(topic, _CALLER_ID))
-    finally:
-        sock.close()
-    return None if fields is None else fields.get("callerid")
-
-
-# Detects nodes that died without unregistering.
+# --- nodes that died without unregistering -------------------------------------------------------------------------
 #
 # A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. For a node on this machine the
 # kernel's table shows whether it still listens, which spares the connection (rospy starts a thread for each). Other
-# nodes, and those that the table lacks, are checked by connecting. Only two refused connects prove a node dead: a
-# network that is down does not. A node to which connecting fails for another reason is unreachable
-# (``ros.master.registrations``).
+# nodes, and all where the kernel does not tell, are checked by connecting. Only two refused connects prove a node
+# dead: a network that is down does not.
 
 
-_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
-_PIECE: Final = 4 * KIB
-_PORTIONS: Final = 10
-"""Wake-ups in one interval over which the connects to nodes are spread."""
-_LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9A-F]{4} 0A ", re.MULTILINE)
+@dataclass(frozen=True, slots=True)
+class Unreachable:
+    """A registered node to which connecting fails: an address without a route, a host name that does not resolve.
 
+    It may live: its network may be down for a moment. It stays registered, as at roscore, but after
+    ``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: its topics and services are no longer offered to peers.
 
-def listening_ports() -> set[int] | None:
-    """TCP ports in state LISTEN in this network namespace, or ``None`` where the kernel does not report them.
-
-    Call it in a thread: the kernel may take milliseconds.
+    Args:
+        api: The slave API's URI that it registered with.
+        problem: Why the last attempt failed, for people.
+        since: When the first attempt failed, in seconds of the monotonic clock.
+        withdrawn: Whether its topics and services are no longer offered to peers.
     """
-    ports = ask_listening_ports()
-    return ports if ports is not None else read_tables()
 
-
-def read_tables() -> set[int] | None:
-    """Read the TCP ports in state LISTEN from ``/proc``, for kernels without sock_diag; ``None`` without ``/proc``.
-
-    The kernel takes milliseconds where there are thousands of sockets. The files are read in short pieces, between
-    which other threads can run.
-    """
-    ports: set[int] = set()
-    try:
-        for table in _TABLES:
-            if table == _TABLES[0] or table.exists():
-                with table.open("rb", buffering=0) as file:
-                    rest = b""
-                    while piece := file.read(_PIECE):
-                        lines, end, rest = (rest + piece).rpartition(b"\n")
-                        ports.update(int(port, 16) for port in _LISTENING.findall(lines + end))
-    except OSError:
-        return None
-    return ports
+    api: str
+    problem: str
+    since: float
+    withdrawn: bool = False
 
 
 class Liveness:
@@ -170,17 +146,13 @@ class Liveness:
         self._task: asyncio.Task[None] | None = None
         self._checks: dict[str, asyncio.Task[None]] = {}
         self._ports: asyncio.Future[set[int] | None] | None = None
-        """The latest call of ``listening_ports`` in a thread."""
+        """The latest call of ``ask_listening_ports`` in a thread."""
         self._closed = False
         self._local_ports: dict[str, int | None] = {}
         """The port of each slave API on this machine; ``None`` of the others."""
-        self._reachability = Reachability()
+        self.unreachable: dict[str, Unreachable] = {}
+        """The nodes to which connecting failed when it was last tried, by name; not to be changed by others."""
         self._slow = asyncio.Semaphore(limits.NODE_UNREACHABLE_CHECKS)
-
-    @property
-    def unreachable(self) -> Mapping[str, Unreachable]:
-        """The nodes to which connecting failed, by name; the caller must not change the mapping."""
-        return self._reachability.unreachable
 
     def start(self) -> None:
         """Begin to check."""
@@ -189,12 +161,10 @@ class Liveness:
     async def close(self) -> None:
         """Stop checking; ``suspect`` does nothing from now on.
 
-        A call of ``listening_ports`` cannot be stopped in its thread; it is waited for, because it has a socket open.
+        A call of ``ask_listening_ports`` cannot be stopped in its thread. It is waited for, as it has a socket open.
         """
         self._closed = True
-        tasks = [*self._checks.values()]
-        if self._task is not None:
-            tasks.append(self._task)
+        tasks = [*self._checks.values(), *([self._task] if self._task is not None else [])]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -212,7 +182,8 @@ class Liveness:
 
     async def _check_all(self) -> None:
         while True:
-            self._ports = asyncio.get_running_loop().run_in_executor(None, listening_ports)
+            # In a thread: where there are thousands of sockets, the kernel may take milliseconds.
+            self._ports = asyncio.get_running_loop().run_in_executor(None, ask_listening_ports)
             silent = self._not_listening(await asyncio.shield(self._ports))
             # Connects are spread over the interval, in as few wake-ups as their number allows.
             portion = max(1, math.ceil(len(silent) / _PORTIONS))
@@ -226,20 +197,20 @@ class Liveness:
     def _not_listening(self, ports: set[int] | None) -> list[str]:
         """The nodes that the kernel's table does not prove to live; the others are noted as reached."""
         nodes = self._nodes()
-        self._reachability.keep(nodes)
+        self.unreachable = {node: found for node, found in self.unreachable.items() if nodes.get(node) == found.api}
         before, self._local_ports = self._local_ports, {}
         silent = []
         for node, api in yielding_to_data(nodes.items()):
             port = self._local_ports[api] = before[api] if api in before else _local_port(api)
             if ports is not None and port in ports:
-                self._reached(node)
+                self.tried(node, api, "", 0.0)
             else:
                 silent.append(node)
         return silent
 
     async def _check(self, node: str, api: str) -> None:
         try:
-            if node in self._reachability.unreachable:
+            if node in self.unreachable:
                 async with self._slow:
                     problem = await try_connect(api)
             else:
@@ -252,17 +223,30 @@ class Liveness:
             return
         except OutOfDescriptors:
             return  # a shortage of this process shows nothing about the node
-        if self._nodes().get(node) != api:
-            return
+        if self._nodes().get(node) == api:
+            self.tried(node, api, problem, asyncio.get_running_loop().time())
+
+    def tried(self, node: str, api: str, problem: str, now: float) -> None:
+        """Take in an attempt to connect to a node that was not refused.
+
+        Args:
+            node: The node's name.
+            api: Its slave API.
+            problem: Why the attempt failed, for people; empty if it did not.
+            now: Monotonic seconds.
+        """
+        known = self.unreachable.pop(node, None)
+        was_withdrawn = known is not None and known.withdrawn
         if not problem:
-            self._reached(node)
-        elif self._reachability.failed(node, api, problem, asyncio.get_running_loop().time()):
+            if was_withdrawn:
+                _log.warning("= node %s can be reached again", node)
+            return
+        since = known.since if known is not None and known.api == api else now
+        withdrawn = now - since >= limits.NODE_UNREACHABLE_AFTER
+        self.unreachable[node] = Unreachable(api, problem, since, withdrawn)
+        if withdrawn and not was_withdrawn:
             text = "! node %s at %s cannot be reached (%s): peers are not offered it until it can"
             _log.warning(text, node, api, problem)
-
-    def _reached(self, node: str) -> None:
-        if self._reachability.reached(node):
-            _log.warning("= node %s can be reached again", node)
 
 
 def _local_port(api: str) -> int | None:
@@ -278,10 +262,10 @@ async def refuses(api: str) -> bool:
     """Whether connects to a slave API are refused; ``False`` where that cannot be found out."""
     try:
         await try_connect(api)
+    except OutOfDescriptors:
+        pass
     except ConnectionRefusedError:
         return True
-    except OutOfDescriptors:
-        return False
     return False
 
 
@@ -310,7 +294,7 @@ async def try_connect(api: str) -> str:
     return ""
 
 
-# Calls to one node's slave API: ping and shut down.
+# --- calls to one node's slave API ----------------------------------------------------------------------------------
 
 
 async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
@@ -346,12 +330,7 @@ async def node_connections(uri: str, caller_id: str, names: Mapping[str, str]) -
         links = read_bus_info(await call(uri, "getBusInfo", caller_id))
     except (RmpaError, RosFault):
         return None
-    found = (
-        NodeConnection(
-            topic=link.topic, inbound=link.inbound, other=names.get(link.other, link.other), connected=link.connected
-        )
-        for link in links
-    )
+    found = (NodeConnection(one.topic, one.inbound, names.get(one.other, one.other), one.connected) for one in links)
     return tuple(islice(found, limits.NODE_CONNECTIONS_SHOWN))
 
 
@@ -381,17 +360,12 @@ async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
         return True
     if reply.code != 1:
         raise PeerRefused(node, reply.status or "it does not end")
-    return await _ended(uri)
-
-
-async def _ended(uri: str) -> bool:
-    loop = asyncio.get_running_loop()
-    give_up = loop.time() + limits.NODE_KILL_WAIT
-    while not await refuses(uri):
-        if loop.time() >= give_up:
-            return False
-        await asyncio.sleep(limits.NODE_KILL_LOOK)
-    return True
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(limits.NODE_KILL_WAIT):
+            while not await refuses(uri):  # noqa: ASYNC110 - the port of another process
+                await asyncio.sleep(limits.NODE_KILL_LOOK)
+            return True
+    return False
 
 
 async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
@@ -401,18 +375,17 @@ async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
         raise PeerRefused(node, error.text) from error
 
 
-# Sends the master's notifications to slave APIs: in order and one at a time to each, independently of the others.
+# --- the master's calls of slaves -----------------------------------------------------------------------------------
 #
 # rosmaster has three threads for all slaves, so three stopped nodes stop every notification; here each URI has its
-# own
-# queue. For each topic only the latest list of publishers is queued. Parameter updates are all sent, until
+# own queue. For each topic only the latest list of publishers is queued. Parameter updates are all sent, until
 # ``limits.NOTIFY_COALESCE`` notifications wait; from then on a newer update of a parameter replaces an older one.
 
 
 MASTER_ID = "/master"
 """The caller id of masters in calls to slaves."""
-
-_Key: TypeAlias = tuple[type[Effect], str, int]
+_Queue: TypeAlias = OrderedDict[tuple[str, str, int], XmlRpcValue]
+"""By method, by what it tells of, and by a number that lets a newer notification replace an older one."""
 
 
 class Notifier:
@@ -435,7 +408,7 @@ class Notifier:
         self._nodes_at = nodes_at
         self._on_unreachable = on_unreachable
         self._counters = counters
-        self._queues: dict[str, dict[_Key, Effect]] = {}
+        self._queues: dict[str, _Queue] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._closed = False
         self._serial = 0
@@ -445,31 +418,23 @@ class Notifier:
         """Notifications in the queues."""
         return sum(map(len, self._queues.values()))
 
-    def add(self, effect: Effect) -> None:
-        """Queue a notification; a task sends it, never this call."""
+    def add(self, slave_call: SlaveCall) -> None:
+        """Queue a call; a task makes it, never this call."""
         if self._closed:
             return
-        queue = self._queues.setdefault(effect.api, {})
-        key = self._key(effect, len(queue))
+        api, method, name, value = slave_call
+        queue = self._queues.setdefault(api, OrderedDict())
+        number = 0
+        if method == "paramUpdate" and len(queue) < limits.NOTIFY_COALESCE:
+            number = self._serial = self._serial + 1
         # Moved to the end: updates of nested parameters overlap, so a newer one must also be sent later.
-        queue.pop(key, None)
-        queue[key] = effect
+        queue.pop((method, name, number), None)
+        queue[method, name, number] = value
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
             del queue[next(iter(queue))]
             self._counters.add("notify.dropped")
-        if effect.api not in self._tasks:
-            self._tasks[effect.api] = asyncio.get_running_loop().create_task(
-                self._empty(effect.api, queue), name=f"notify {effect.api}"
-            )
-
-    def _key(self, effect: Effect, waiting: int) -> _Key:
-        """The key by which a newer notification replaces an older one."""
-        match effect:
-            case PublisherUpdate(topic=name) | Shutdown(node=name):
-                return type(effect), name, 0
-            case ParamUpdate(key=name):
-                self._serial += 1
-                return ParamUpdate, name, self._serial if waiting < limits.NOTIFY_COALESCE else 0
+        if api not in self._tasks:
+            self._tasks[api] = asyncio.get_running_loop().create_task(self._empty(api, queue), name=f"notify {api}")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
@@ -479,33 +444,36 @@ class Notifier:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _empty(self, api: str, queue: dict[_Key, Effect]) -> None:
+    async def _empty(self, api: str, queue: _Queue) -> None:
         backoff = Backoff(limits.NOTIFY_RETRY_FIRST, limits.NOTIFY_RETRY_MAX, random.random)
         try:
             while queue:
-                key = next(iter(queue))
-                effect = queue.pop(key)
-                if await self._sent(effect):
+                key = method, name, _ = next(iter(queue))
+                value = queue.pop(key)
+                if await self._sent(api, method, name, value):
                     backoff.reset()
-                elif isinstance(effect, Shutdown):
+                elif method == "shutdown":
                     continue
                 elif not self._nodes_at(api):
                     queue.clear()
                 else:
                     if key not in queue:
-                        rest = dict(queue)
-                        queue.clear()
-                        queue.update({key: effect, **rest})
+                        queue[key] = value
+                        queue.move_to_end(key, last=False)
                     await asyncio.sleep(backoff.delay())
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! notifications to %s failed", api)
         finally:
             del self._queues[api], self._tasks[api]
 
-    async def _sent(self, effect: Effect) -> bool:
+    async def _sent(self, api: str, method: str, name: str, value: XmlRpcValue) -> bool:
         """Send one; return whether it need not be sent again."""
         try:
-            await self._send(effect)
+            if method == "shutdown":
+                await self._shut_down(api, name, value)
+            else:
+                _log.debug("> %s %s %s", api, method, name)
+                await call(api, method, MASTER_ID, name, value, use=Use.CORE)
         except OutOfDescriptors as error:
             # The shortage is this process's, and is reported elsewhere: the node may be well.
             self._counters.add("notify.failed")
@@ -514,36 +482,24 @@ class Notifier:
         except UnreachableError as error:
             self._counters.add("notify.failed")
             _log.info("! %s", error)
-            self._on_unreachable(effect.api)
+            self._on_unreachable(api)
             return False
         except (RosFault, RemoteProtocolError, LocalProtocolError) as error:
             # The node got it, or never will: sending again would not help.
             self._counters.add("notify.failed")
-            _log.info("! %s: %s", effect.api, error)
+            _log.info("! %s: %s", api, error)
         else:
             self._counters.add("notify.sent")
         return True
 
-    async def _send(self, effect: Effect) -> None:
-        match effect:
-            case PublisherUpdate(api, topic, publishers):
-                _log.debug("> %s publisherUpdate %s %s", api, topic, publishers)
-                await call(api, "publisherUpdate", MASTER_ID, topic, list(publishers), use=Use.CORE)
-            case ParamUpdate(api, key, value):
-                _log.debug("> %s paramUpdate %s", api, key)
-                await call(api, "paramUpdate", MASTER_ID, key, value, use=Use.CORE)
-            case Shutdown():
-                await self._shut_down(effect)
-
-    async def _shut_down(self, effect: Shutdown) -> None:
+    async def _shut_down(self, api: str, node: str, topics: XmlRpcValue) -> None:
         """Ask a node whose name another node has taken to end, unless its address is another node's by now."""
-        found = await name_at(effect.api, effect.topics)
-        if found is None and self._nodes_at(effect.api):
-            found = self._nodes_at(effect.api)[0]
-        if found is not None and found != effect.node:
-            _log.info("= %s is not asked to end: %s is at %s now", effect.node, found, effect.api)
+        found = await name_at(api, cast("list[str]", topics))
+        if found is None:
+            found = next(iter(self._nodes_at(api)), None)
+        if found is not None and found != node:
+            _log.info("= %s is not asked to end: %s is at %s now", node, found, api)
             self._counters.add("notify.stale")
             return
-        _log.warning("> %s at %s is asked to end: another node has its name", effect.node, effect.api)
-        reason = f"[{effect.node}] Reason: new node registered with same name"
-        await call(effect.api, "shutdown", MASTER_ID, reason, use=Use.CORE)
+        _log.warning("> %s at %s is asked to end: another node has its name", node, api)
+        await call(api, "shutdown", MASTER_ID, f"[{node}] Reason: new node registered with same name", use=Use.CORE)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import errno
 import logging
+import math
 import os
 import time
 from collections import defaultdict
@@ -24,13 +25,14 @@ from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.master.registrations import NodeRecord  # noqa: TC001 - msgspec reads the annotations
+from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
 from rmpa.ros.wire.xmlrpc import RosFault, brief, legal_text
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from rmpa.ros.master.api import MasterApi
 
@@ -59,7 +61,7 @@ class StoredState(msgspec.Struct):
 
     format: Literal["rmpa core 1"]
     boot: str = ""
-    nodes: dict[str, NodeRecord] = {}
+    nodes: dict[Name, NodeRecord] = {}
     params: dict[str, Any] = {}
 
 
@@ -69,17 +71,13 @@ def _unpacked_ext(code: int, data: memoryview) -> datetime:
     return datetime.fromisoformat(bytes(data).decode())
 
 
-_decode = msgspec.msgpack.Decoder(StoredState, ext_hook=_unpacked_ext).decode
-_encode = msgspec.msgpack.Encoder().encode
-
-
 def serialize(state: StoredState) -> bytes:
     """Return the content of the file.
 
     Raises:
         ValueError, TypeError, OverflowError, RecursionError: MessagePack cannot express a parameter.
     """
-    return _encode(StoredState(state.format, state.boot, state.nodes, _packable(state.params)))
+    return msgspec.msgpack.encode(StoredState(state.format, state.boot, state.nodes, _packable(state.params)))
 
 
 def _packable(value: Any) -> Any:
@@ -101,38 +99,25 @@ def parse(data: bytes) -> StoredState:
         ValueError: It is damaged, of another format, or holds what no call of a node could have caused.
     """
     try:
-        state = _decode(data)
+        state = msgspec.msgpack.decode(data, type=StoredState, ext_hook=_unpacked_ext)
     except (msgspec.MsgspecError, TypeError, RecursionError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
-    for name, node in state.nodes.items():
-        for text in (name, *node.publishers, *node.subscribers, *node.services, *node.params):
-            if not text.startswith("/") or len(text) > limits.CORE_STATE_NAME_MAX:
-                raise ValueError(f"{brief(text)} is no global name")
-        if not node.api.startswith("http://"):
-            raise ValueError(f"{brief(node.api)} is no URI of a slave API")
-        for texts in (node.publishers, node.subscribers, node.services):
-            _check_text("".join((*texts, *texts.values())))
-        _check_text("".join((name, node.api, *node.params)))
+    _check(msgspec.to_builtins(state.nodes))
     _check(state.params)
     return state
-
-
-def _check_text(text: str) -> None:
-    if legal_text(text) != text:
-        raise ValueError(f"{brief(text)} has a character that XML cannot hold")
 
 
 def _check(value: Any, depth: int = 0) -> None:
     """Raise ``ValueError`` for what ``setParam`` could not have set."""
     match value:
         case bool() | float() | bytes() | datetime():
-            pass
-        case str():
-            _check_text(value)
+            return
+        case str() if legal_text(value) == value:
+            return
         case int() if INT32_MIN <= value <= INT32_MAX:
-            pass
+            return
         case dict() if depth < limits.CORE_STATE_DEPTH_MAX and all(isinstance(name, str) for name in value):
-            _check_text("".join(value))
+            _check("".join(value))
             for part in value.values():
                 _check(part, depth + 1)
         case list() if depth < limits.CORE_STATE_DEPTH_MAX:
@@ -169,20 +154,20 @@ class CoreState:
         self._temporary = temporary
         self._carry_out = carry_out
         self._boot = ""
+        # What was restored: the nodes of the file with their slave APIs, each moved once its address has answered.
+        self._asked: dict[str, str] = {}
+        self._up = self._gone = self._params = 0
+        self._dropped = ""
+        self._asking: set[asyncio.Task[None]] = set()
+        # What is written.
         self._unread = False
         """Whether there is a file that could not be read: it is renamed before another one is written."""
-        self._up = self._gone = self._params = 0
-        self._silent: dict[str, str] = {}
-        self._dropped = ""
-        self._late: set[asyncio.Task[bool | None]] = set()
         self._problem = ""
         self._written: tuple[int, object] = (-1, None)
         self._digest = 0
-        self._rest_until = 0.0
-        self._timer: asyncio.TimerHandle | None = None
-        self._task: asyncio.Task[None] | None = None
-        self._began = self._took = 0.0
-        self._open = False
+        self._began, self._took = math.inf, 0.0
+        self._writer: asyncio.Task[None] | None = None
+        self._news, self._ending = asyncio.Event(), asyncio.Event()
 
     # --- the start --------------------------------------------------------------------------------------------
 
@@ -195,15 +180,15 @@ class CoreState:
             return
         except (OSError, ValueError) as error:
             self._unread = True
-            self._problem = self._reason(error) if isinstance(error, OSError) else ""
             why, aside = self._reason(error), self._aside.name
+            self._problem = why if isinstance(error, OSError) else ""
             _log.warning("! the core begins empty: %s; before it is written anew, it is renamed to %s", why, aside)
             return
         if self._keep == "never":
             self._drop(state, "core.keep is never")
             return
         await self._ask_all({name: node for name, node in state.nodes.items() if not self._temporary(name)})
-        left, died = bool(self._up or self._silent), bool(self._boot) and state.boot == self._boot
+        left, died = bool(self._up or self._asked), bool(self._boot) and state.boot == self._boot
         if self._keep == "auto" and not left and not died:
             self._drop(state, "no node of the run before is left")
             return
@@ -215,10 +200,10 @@ class CoreState:
 
     def start(self) -> None:
         """Begin to write changes; to be called once the core listens."""
-        self._open = True
         if text := self.restored():
             _log.info("= %s: %s", self.path, text)
-        self.schedule_write()
+        self._writer = asyncio.get_running_loop().create_task(self._write_changes(), name="keep the core's state")
+        self.note_change()
 
     def _read(self) -> StoredState:
         with contextlib.suppress(OSError):
@@ -228,86 +213,80 @@ class CoreState:
         return parse(self.path.read_bytes())
 
     def _drop(self, state: StoredState, why: str) -> None:
-        names = [name for name in state.params if f"/{name}" not in _OF_A_CORE]
-        if not names and not state.nodes:
-            return
-        self._dropped = f"the core begins empty: {why}"
+        names = [f"/{name}" for name in state.params if f"/{name}" not in _OF_A_CORE]
+        if names or state.nodes:
+            self._dropped = f"the core begins empty: {why}"
         if names and self._keep == "auto":
-            shown = _first([f"/{name}" for name in names])
-            self._dropped += f'; its parameters {shown} are dropped (core.keep = "always" keeps them)'
+            self._dropped += f'; its parameters {_first(names)} are dropped (core.keep = "always" keeps them)'
 
     async def _ask_all(self, nodes: dict[str, NodeRecord]) -> None:
         """Ask all nodes at once, and register those that answer within ``limits.CORE_STATE_ASK``.
 
         One that answers later, within the time-outs of its calls, is registered then.
         """
+        self._asked = {name: node.api for name, node in nodes.items()}
         at: defaultdict[str, dict[str, NodeRecord]] = defaultdict(dict)  # nodelets share an address
         for name, node in nodes.items():
             at[node.api][name] = node
-        asked = {asyncio.create_task(_is_there(api, at[api]), name=f"ask {api}"): at[api] for api in at}
-        if not asked:
+        if not at:
             return
-        done, self._late = await asyncio.wait(asked, timeout=limits.CORE_STATE_ASK)
-        up: dict[str, NodeRecord] = {}
-        for task, asked_nodes in asked.items():
-            if task not in done or task.result() is None:
-                self._silent |= {name: node.api for name, node in asked_nodes.items()}
-            elif task.result():
-                up |= asked_nodes
-            else:
-                self._gone += len(asked_nodes)
-                _log.info("= %s, of the run before, is not there any more", ", ".join(asked_nodes))
-        self._register(up)
-        for task in self._late:
-            task.add_done_callback(lambda task: self._answered_late(task, asked[task]))
+        asking = {asyncio.create_task(self._ask(api, at[api]), name=f"ask {api}") for api in at}
+        _, self._asking = await asyncio.wait(asking, timeout=limits.CORE_STATE_ASK)
+        self._carry_out()  # once for all: a list that lacks a publisher would end the connections to it
+        for task in self._asking:
+            task.add_done_callback(self._asking.discard)
+            task.add_done_callback(lambda _: self._carry_out())
 
-    def _answered_late(self, task: asyncio.Task[bool | None], nodes: dict[str, NodeRecord]) -> None:
-        self._late.discard(task)
-        if task.cancelled() or task.result() is None:
+    async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> None:
+        """Ask what is at an address, and register its nodes if they are."""
+        there = await _is_there(api, nodes)
+        if there is None:
             return
         for name in nodes:
-            del self._silent[name]
-        if not task.result():
+            del self._asked[name]
+        if there:
+            self._register(nodes)
+        else:
             self._gone += len(nodes)
-            return
-        self._register(nodes)
+            _log.info("= %s, of the run before, is not there any more", ", ".join(nodes))
 
     def _register(self, nodes: dict[str, NodeRecord]) -> None:
         table = self._api.registrations
-        nodes = {name: node for name, node in nodes.items() if table.node_api(name) in {None, node.api}}
+        topics: set[str] = set()
         for name, node in nodes.items():
+            if table.node_api(name) not in {None, node.api}:
+                continue  # a new node has its name
+            self._up += 1
+            topics |= node.subscribers.keys()
             for topic, kind in node.publishers.items():
-                table.register_publisher(topic, kind, name, node.api)
-        for name, node in nodes.items():
+                table.register(RegistrationKind.PUBLISHER, topic, name, node.api, kind)
             for topic, kind in node.subscribers.items():
-                table.register_subscriber(topic, kind, name, node.api)
+                table.register(RegistrationKind.SUBSCRIBER, topic, name, node.api, kind)
             for service, uri in node.services.items():
                 if table.service_uri(service) is None:
-                    table.register_service(service, uri, name, node.api)
+                    table.register(RegistrationKind.SERVICE, service, name, node.api, uri)
             for key in node.params:
-                table.subscribe_param(key, name, node.api)
-        for topic in {topic for node in nodes.values() for topic in node.subscribers}:
+                table.register(RegistrationKind.PARAM, key, name, node.api)
+        for topic in topics:
             table.notify_subscribers(topic)
-        self._up += len(nodes)
-        self._carry_out()
 
     # --- what people see --------------------------------------------------------------------------------------
 
     @property
     def problem(self) -> str:
         """Why nothing is stored at present, or empty."""
-        late = self._task is not None and self._loop_time() - self._began > limits.CORE_STATE_WRITE
+        late = asyncio.get_running_loop().time() - self._began > limits.CORE_STATE_WRITE
         return f"{self.path}: the disk does not answer" if late else self._problem
 
     def restored(self) -> str:
         """What became of the file's content at the start; empty if there was none."""
         parts = [self._dropped] if self._dropped else []
-        if nodes := self._up + self._gone + len(self._silent):
+        if nodes := self._up + self._gone + len(self._asked):
             text = f"{self._up} of {nodes} nodes of the run before are taken up"
             if self._gone:
                 text += f", {self._gone} {'is' if self._gone == 1 else 'are'} gone"
-            if self._silent:
-                text += f", {_first(list(self._silent))} did not answer"
+            if self._asked:
+                text += f", {_first(list(self._asked))} did not answer"
             parts.append(text)
         if self._params:
             some = "1 parameter of it was" if self._params == 1 else f"{self._params} parameters of it were"
@@ -324,78 +303,77 @@ class CoreState:
         notes = [f"nothing of the core is kept over a restart: {self.problem}"] if self.problem else []
         notes += [
             f"{node} at {api}, of the run before, does not answer and is not shown: start it again"
-            for node, api in list(self._silent.items())[:_SHOWN]
-            if not self._late and self._api.registrations.node_api(node) is None
+            for node, api in list(self._asked.items())[:_SHOWN]
+            if not self._asking and self._api.registrations.node_api(node) is None
         ]
         return tuple(notes)
 
     # --- writing ----------------------------------------------------------------------------------------------
 
-    def schedule_write(self) -> None:
+    def note_change(self) -> None:
         """Write soon, if something has changed."""
-        if self._open and self._timer is None and self._task is None and self._changed():
-            at = max(self._loop_time() + limits.CORE_STATE_GATHER, self._rest_until)
-            self._timer = asyncio.get_running_loop().call_at(at, self._begin)
+        if self._changed():
+            self._news.set()
 
     async def close(self) -> None:
         """Write what has changed, and that the core ended in order."""
-        for task in self._late:
+        self._ending.set()
+        self._news.set()
+        tasks = [*self._asking]
+        if self._writer is not None:  # else another core may have the port, and so this file
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(asyncio.shield(self._writer), limits.CORE_STATE_CLOSE)
+            tasks.append(self._writer)
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._late, return_exceptions=True)
-        if not self._open:  # another core may have the port, and so this file
-            return
-        self._open = False
-        if self._timer is not None:
-            self._timer.cancel()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(limits.CORE_STATE_CLOSE):
-                if self._task is not None:
-                    await self._task
-                await self._write("")
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def _changed(self) -> bool:
         revision, tree = self._written
         return revision != self._api.registrations.revision or tree is not self._api.parameters.tree
 
-    def _loop_time(self) -> float:
-        return asyncio.get_running_loop().time()
-
-    def _begin(self) -> None:
-        self._timer = None
-        self._began = self._loop_time()
-        self._task = asyncio.get_running_loop().create_task(self._work(), name="keep the core's state")
-
-    async def _work(self) -> None:
-        try:
-            await self._write(self._boot)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! keeping the core's state failed")
-        finally:
+    async def _write_changes(self) -> None:
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            await self._rest(limits.CORE_STATE_GATHER)
+            ended = self._ending.is_set()
+            try:
+                await self._write("" if ended else self._boot)
+            except Exception:  # noqa: BLE001 - a task's top
+                _log.exception("! keeping the core's state failed")
+            if ended:
+                return
             rest = limits.CORE_STATE_RETRY if self._problem else self._took * limits.CORE_STATE_SHARE
-            self._rest_until = self._loop_time() + min(rest, limits.CORE_STATE_REST)
-            self._task = None
-            self.schedule_write()
+            await self._rest(min(rest, limits.CORE_STATE_REST))
+            self.note_change()
+
+    async def _rest(self, seconds: float) -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._ending.wait(), seconds)
 
     async def _write(self, boot: str) -> None:
         table, tree = self._api.registrations, self._api.parameters.tree
         now = table.revision, tree
+        self._began = asyncio.get_running_loop().time()
         nodes = {
             name: record
             for name in yielding_to_data(list(table.nodes()), every=_RECORDS)
             if not self._temporary(name) and (record := table.record(name)) is not None
         }
-        # Trees and records are never changed in place, so that a thread may read them.
-        state = StoredState("rmpa core 1", boot, nodes, tree)
         try:
-            await in_thread(lambda: self._put(state), "core state")
+            # Trees and records are never changed in place, so that a thread may read them.
+            await in_thread(lambda: self._put(StoredState("rmpa core 1", boot, nodes, tree)), "core state")
         except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
             if not self._problem:
                 _log.warning("! nothing of the core is kept over a restart: %s", self._reason(error))
             self._problem = self._reason(error)
-            return
-        if self._problem:
-            _log.info("= %s: everything is kept again", self.path)
-        self._problem, self._written = "", now
+        else:
+            if self._problem:
+                _log.info("= %s: everything is kept again", self.path)
+            self._problem, self._written = "", now
+        finally:
+            self._began = math.inf
 
     def _put(self, state: StoredState) -> None:
         began = time.thread_time()
@@ -477,11 +455,9 @@ async def _listed(api: str, method: str) -> dict[str, str] | None:
         return None
     if reply.code != 1 or not isinstance(reply.value, list):
         return None
-    return dict(_entries(reply.value))
-
-
-def _entries(listed: list[Any]) -> Iterator[tuple[str, str]]:
-    for entry in listed:
-        match entry:
-            case [str(topic), str(topic_type)] if topic.startswith("/"):
-                yield topic, topic_type
+    entries = (entry for entry in reply.value if isinstance(entry, list) and len(entry) == 2)
+    return {
+        topic: kind
+        for topic, kind in entries
+        if isinstance(topic, str) and isinstance(kind, str) and topic.startswith("/")
+    }

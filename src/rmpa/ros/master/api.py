@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rmpa.ros import limits
 from rmpa.ros.master import parameters as params
-from rmpa.ros.master.parameters import Effect, GraphChange, GraphState, RegistrationKind, resolve, with_slash
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind, SlaveCall, resolve, with_slash
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
@@ -22,29 +22,35 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Yielder
 
+_log = logging.getLogger(__name__)
 
-# Checks of the Master API's parameters: they refuse what rosmaster answers with code -1.
+SUCCESS: Final = 1
+FAILURE: Final = 0
+ERROR: Final = -1
+_DOES: Final = {
+    RegistrationKind.PUBLISHER: "publishes",
+    RegistrationKind.SUBSCRIBER: "subscribes to",
+    RegistrationKind.SERVICE: "provides",
+}
+
+# --- checks of the Master API's parameters: they refuse what rosmaster answers with code -1 -------------------------
 #
-# They are stricter in one point: ``limits.PARAM_DEPTH_MAX`` bounds the namespaces in a parameter's name.
+# They are stricter in one point: ``limits.PARAM_DEPTH_MAX`` bounds the namespaces in a parameter's name. Each is
+# called with ``(value, the parameter's name, caller id)`` and returns the value to use. It raises ``ValueError`` for
+# what the caller has to correct; the text names the parameter and the fault.
+
+Check: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
 
 
-class InvalidParameterError(Exception):
-    """A parameter that the caller has to correct; the text names it and the fault. ``MasterApi.call`` catches it."""
-
-
-Validator: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
-"""``(value, the parameter's name, caller id) -> the value to use``; raises ``InvalidParameterError``."""
-
-
-def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
+def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Check
     """Accept every value."""
     return value
 
 
-def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
     """A string that is not empty."""
     if not isinstance(value, str) or not value:
-        raise InvalidParameterError(f"{name} must be a non-empty string, not {brief(value)}")
+        raise ValueError(f"{name} must be a non-empty string, not {brief(value)}")
     return value
 
 
@@ -52,7 +58,7 @@ def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
     """A parameter's name, resolved."""
     resolved = resolve(text(value, name, caller_id), caller_id)
     if resolved.count("/") > limits.PARAM_DEPTH_MAX:
-        raise InvalidParameterError(f"{name} has more than {limits.PARAM_DEPTH_MAX} namespaces")
+        raise ValueError(f"{name} has more than {limits.PARAM_DEPTH_MAX} namespaces")
     return resolved
 
 
@@ -60,7 +66,7 @@ def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
     """A graph name, resolved; one with a colon or a space is refused."""
     given = text(value, name, caller_id)
     if ":" in given or " " in given:
-        raise InvalidParameterError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
+        raise ValueError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
     return resolve(given, caller_id)
 
 
@@ -68,45 +74,27 @@ def resource(value: XmlRpcValue, name: str, caller_id: str) -> str:
     """The name of a topic or service, resolved; not the root."""
     resolved = node_name(value, name, caller_id)
     if value == "/":
-        raise InvalidParameterError(f"{name} cannot be the root namespace")
+        raise ValueError(f"{name} cannot be the root namespace")
     return resolved
 
 
 def subgraph(value: XmlRpcValue, name: str, caller_id: str) -> str:
     """A namespace, resolved, or the empty string for all."""
-    if not isinstance(value, str):
-        raise InvalidParameterError(f"{name} must be a string, not {brief(value)}")
-    return resolve(value, caller_id) if value else ""
+    return resolve(text(value, name, caller_id), caller_id) if value != "" else ""
 
 
-def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
     """A URI of a slave API or service, kept unchanged: roscpp recognises itself by the exact text."""
     if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
-        raise InvalidParameterError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
+        raise ValueError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
     return value
 
 
-def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
     """``package/Name``, or ``*`` for any type."""
     if not isinstance(value, str) or (value != ANY_TYPE and value.count("/") != 1):
-        raise InvalidParameterError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
+        raise ValueError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
     return value
-
-
-_log = logging.getLogger(__name__)
-
-SUCCESS: Final = 1
-FAILURE: Final = 0
-ERROR: Final = -1
-
-
-@dataclass(frozen=True, slots=True)
-class _Method:
-    """One method of the API: its parameters after ``caller_id``, and the value in the reply of an error."""
-
-    function: Callable[..., RosReply]
-    parameters: tuple[tuple[str, Validator], ...]
-    error_value: XmlRpcValue
 
 
 class MasterApi:
@@ -132,11 +120,6 @@ class MasterApi:
 
     # --- calling ----------------------------------------------------------------------------------------------
 
-    @property
-    def methods(self) -> list[str]:
-        """The names of all methods, in order."""
-        return sorted([*self._methods, "system.listMethods", "system.multicall"])
-
     def call(self, method: str, arguments: Sequence[XmlRpcValue]) -> RosReply:
         """Call a method of the Master or Parameter Server API.
 
@@ -150,23 +133,23 @@ class MasterApi:
         Raises:
             RosFault: There is no such method.
         """
-        found = self._methods.get(method)
-        if found is None:
+        if method not in self._methods:
             raise RosFault(1, f"this master has no method {brief(method)}; system.listMethods names them")
-        if len(arguments) != 1 + len(found.parameters):
-            wanted = ", ".join(["caller_id", *(name for name, _ in found.parameters)])
-            return RosReply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", found.error_value)
+        function, error_value, checks = self._methods[method]
+        if len(arguments) != 1 + len(checks):
+            wanted = ", ".join(["caller_id", *checks])
+            return RosReply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", error_value)
         caller_id, *rest = arguments
         if not isinstance(caller_id, str):
-            return RosReply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", found.error_value)
+            return RosReply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", error_value)
         try:
             checked = [
-                check(value, name, caller_id) for (name, check), value in zip(found.parameters, rest, strict=True)
+                check(value, name, caller_id) for (name, check), value in zip(checks.items(), rest, strict=True)
             ]
-        except InvalidParameterError as error:
+        except ValueError as error:
             _log.info("! %s: %s: %s", caller_id, method, error)
-            return RosReply(ERROR, str(error), found.error_value)
-        return found.function(caller_id, *checked)
+            return RosReply(ERROR, str(error), error_value)
+        return function(caller_id, *checked)
 
     def answer(self, method: str, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
         """Answer an XML-RPC call: one of the API's, ``system.listMethods`` or ``system.multicall``.
@@ -174,13 +157,10 @@ class MasterApi:
         Raises:
             RosFault: There is no such method, or a system method is called wrongly.
         """
-        if method == "system.multicall":
-            return self._multicall(arguments)
         if method == "system.listMethods":
-            return self.methods
-        return list(self.call(method, arguments))
-
-    def _multicall(self, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
+            return sorted([*self._methods, "system.listMethods", "system.multicall"])
+        if method != "system.multicall":
+            return list(self.call(method, arguments))
         match arguments:
             case [list(calls)] | [tuple(calls)]:
                 return [self._one_of_many(call) for call in calls]
@@ -199,15 +179,11 @@ class MasterApi:
                 problem = RosFault(1, f"{brief(call)} is not a struct of methodName and params")
         return {"faultCode": problem.code, "faultString": problem.text}
 
-    def take(self) -> tuple[list[Effect], list[GraphChange]]:
-        """Return the effects and changes since the previous call of this method, in order."""
-        taken = self.registrations.effects, self.registrations.changes
-        self.registrations.effects, self.registrations.changes = [], []
+    def take(self) -> tuple[list[SlaveCall], list[GraphChange]]:
+        """Return the calls of slaves and the changes since the previous call of this method, in order."""
+        taken = self.registrations.calls, self.registrations.changes
+        self.registrations.calls, self.registrations.changes = [], []
         return taken
-
-    def state(self) -> GraphState:
-        """All registrations."""
-        return self.registrations.state()
 
     # --- the node's own API -----------------------------------------------------------------------------------
 
@@ -216,12 +192,6 @@ class MasterApi:
         self._on_shutdown(f"{caller_id}: {brief(reason)}")
         return RosReply(SUCCESS, "the core ends", 0)
 
-    def _get_uri(self, _caller_id: str) -> RosReply:
-        return RosReply(SUCCESS, "", self.uri)
-
-    def _get_pid(self, _caller_id: str) -> RosReply:
-        return RosReply(SUCCESS, "", self._pid)
-
     # --- parameters -------------------------------------------------------------------------------------------
 
     def _delete_param(self, _caller_id: str, key: str) -> RosReply:
@@ -229,7 +199,7 @@ class MasterApi:
             self.parameters.delete(key)
         except KeyError:
             return RosReply(ERROR, f"there is no parameter {key} to delete", 0)
-        self.registrations.effects += params.updates(self.registrations.param_subscribers(), key, {})
+        self.registrations.calls += params.updates(self._param_subscribers, key, {})
         return RosReply(SUCCESS, f"deleted {key}", 0)
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
@@ -241,9 +211,12 @@ class MasterApi:
             self.parameters.set(key, value)
         except TypeError as error:
             return RosReply(ERROR, str(error), 0)
-        subscribers = self.registrations.param_subscribers()
-        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._yielder)
+        self.registrations.calls += params.updates(self._param_subscribers, key, value, caller_id, self._yielder)
         return RosReply(SUCCESS, f"set {key}", 0)
+
+    @property
+    def _param_subscribers(self) -> dict[str, dict[str, str]]:
+        return self.registrations.table(RegistrationKind.PARAM)
 
     def _get_param(self, _caller_id: str, key: str) -> RosReply:
         try:
@@ -262,7 +235,7 @@ class MasterApi:
 
     def _subscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
         value = self.parameters.get(key) if self.parameters.has(key) else {}
-        self.registrations.subscribe_param(with_slash(key), caller_id, api)
+        self.registrations.register(RegistrationKind.PARAM, with_slash(key), caller_id, api)
         return RosReply(SUCCESS, f"subscribed to parameter {key}", value)
 
     def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
@@ -270,22 +243,16 @@ class MasterApi:
         # rosmaster answers 1 whether it was subscribed or not.
         return RosReply(SUCCESS, f"not subscribed to parameter {key}", 1)
 
-    def _has_param(self, _caller_id: str, key: str) -> RosReply:
-        # rosmaster puts the name into the status, and old clients read it.
-        return RosReply(SUCCESS, key, self.parameters.has(key))
+    # --- topics and services ----------------------------------------------------------------------------------
 
-    def _get_param_names(self, _caller_id: str) -> RosReply:
-        return RosReply(SUCCESS, "the names of all parameters", list(self._yielder(self.parameters.names())))
+    def _register(self, kind: RegistrationKind, caller_id: str, key: str, detail: str, api: str) -> RosReply:
+        self.registrations.register(kind, key, caller_id, api, detail)
+        return RosReply(SUCCESS, f"{caller_id} {_DOES[kind]} {key}", self.registrations.counterparts(kind, key))
 
-    # --- services ---------------------------------------------------------------------------------------------
-
-    def _register_service(self, caller_id: str, service: str, uri: str, api: str) -> RosReply:
-        self.registrations.register_service(service, uri, caller_id, api)
-        return RosReply(SUCCESS, f"{caller_id} provides {service}", 1)
-
-    def _unregister_service(self, caller_id: str, service: str, uri: str) -> RosReply:
-        found = self.registrations.unregister_service(service, uri, caller_id)
-        return _unregistered(caller_id, service, found=found)
+    def _unregister(self, kind: RegistrationKind, caller_id: str, key: str, detail: str) -> RosReply:
+        if self.registrations.unregister(kind, key, caller_id, detail):
+            return RosReply(SUCCESS, f"{caller_id} is no longer registered for {key}", 1)
+        return RosReply(SUCCESS, f"{caller_id} was not registered for {key} with that URI", 0)
 
     def _lookup_service(self, caller_id: str, service: str) -> RosReply:
         uri = self.registrations.service_uri(service)
@@ -294,26 +261,6 @@ class MasterApi:
         if self.service_lookup is not None:
             uri = self.service_lookup(service, uri, caller_id, self.registrations.node_api(caller_id) or "") or uri
         return RosReply(SUCCESS, f"the provider of {service}", uri)
-
-    # --- topics -----------------------------------------------------------------------------------------------
-
-    def _register_subscriber(self, caller_id: str, topic: str, topic_type: str, api: str) -> RosReply:
-        self.registrations.register_subscriber(topic, topic_type, caller_id, api)
-        publishers = self.registrations.apis(RegistrationKind.PUBLISHER, topic)
-        return RosReply(SUCCESS, f"{caller_id} subscribes to {topic}", publishers)
-
-    def _unregister_subscriber(self, caller_id: str, topic: str, api: str) -> RosReply:
-        found = self.registrations.unregister(RegistrationKind.SUBSCRIBER, topic, caller_id, api)
-        return _unregistered(caller_id, topic, found=found)
-
-    def _register_publisher(self, caller_id: str, topic: str, topic_type: str, api: str) -> RosReply:
-        self.registrations.register_publisher(topic, topic_type, caller_id, api)
-        subscribers = self.registrations.apis(RegistrationKind.SUBSCRIBER, topic)
-        return RosReply(SUCCESS, f"{caller_id} publishes {topic}", subscribers)
-
-    def _unregister_publisher(self, caller_id: str, topic: str, api: str) -> RosReply:
-        found = self.registrations.unregister(RegistrationKind.PUBLISHER, topic, caller_id, api)
-        return _unregistered(caller_id, topic, found=found)
 
     # --- the graph --------------------------------------------------------------------------------------------
 
@@ -326,7 +273,7 @@ class MasterApi:
     def _get_published_topics(self, _caller_id: str, subgraph: str) -> RosReply:
         prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
         types = self.registrations.types()
-        published = self._yielder(self.registrations.published())
+        published = self._yielder(list(self.registrations.table(RegistrationKind.PUBLISHER)))
         found = [[topic, types[topic]] for topic in published if topic.startswith(prefix)]
         return RosReply(SUCCESS, "the topics that somebody publishes", found)
 
@@ -336,46 +283,40 @@ class MasterApi:
 
     def _get_system_state(self, _caller_id: str) -> RosReply:
         tables: list[XmlRpcValue] = []
-        for kind in (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE):
-            providers = self._yielder(self.registrations.providers(kind))
+        for kind in _DOES:
+            providers = self._yielder(list(self.registrations.table(kind).items()))
             tables.append([[key, list(nodes)] for key, nodes in providers])
         return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 
-    def _table(self) -> dict[str, _Method]:
-        def method(function: Callable[..., RosReply], error_value: XmlRpcValue, **parameters: Validator) -> _Method:
-            return _Method(function, tuple(parameters.items()), error_value)
-
+    def _table(self) -> dict[str, tuple[Callable[..., RosReply], XmlRpcValue, dict[str, Check]]]:
+        """Each method's function, the value in the reply of an error, and its parameters after ``caller_id``."""
+        topic: dict[str, Check] = {"topic": resource}
+        service: dict[str, Check] = {"service": resource, "service_api": uri}
+        typed: dict[str, Check] = {**topic, "topic_type": type_name, "caller_api": uri}
+        subscription: dict[str, Check] = {"caller_api": uri, "key": key}
+        publisher, subscriber, provider = _DOES
         return {
-            "shutdown": method(self._shutdown, 0, msg=anything),
-            "getUri": method(self._get_uri, ""),
-            "getPid": method(self._get_pid, -1),
-            "deleteParam": method(self._delete_param, 0, key=key),
-            "setParam": method(self._set_param, 0, key=key, value=anything),
-            "getParam": method(self._get_param, 0, key=key),
-            "searchParam": method(self._search_param, 0, key=text),
-            "subscribeParam": method(self._subscribe_param, 0, caller_api=uri, key=key),
-            "unsubscribeParam": method(self._unsubscribe_param, 0, caller_api=uri, key=key),
-            "hasParam": method(self._has_param, False, key=key),
-            "getParamNames": method(self._get_param_names, []),
-            "registerService": method(self._register_service, 0, service=resource, service_api=uri, caller_api=uri),
-            "unregisterService": method(self._unregister_service, 0, service=resource, service_api=uri),
-            "lookupService": method(self._lookup_service, "", service=resource),
-            "registerSubscriber": method(
-                self._register_subscriber, [], topic=resource, topic_type=type_name, caller_api=uri
-            ),
-            "unregisterSubscriber": method(self._unregister_subscriber, 0, topic=resource, caller_api=uri),
-            "registerPublisher": method(
-                self._register_publisher, [], topic=resource, topic_type=type_name, caller_api=uri
-            ),
-            "unregisterPublisher": method(self._unregister_publisher, 0, topic=resource, caller_api=uri),
-            "lookupNode": method(self._lookup_node, "", node=node_name),
-            "getPublishedTopics": method(self._get_published_topics, 0, subgraph=subgraph),
-            "getTopicTypes": method(self._get_topic_types, []),
-            "getSystemState": method(self._get_system_state, [[], [], []]),
+            "shutdown": (self._shutdown, 0, {"msg": anything}),
+            "getUri": (lambda _: RosReply(SUCCESS, "", self.uri), "", {}),
+            "getPid": (lambda _: RosReply(SUCCESS, "", self._pid), -1, {}),
+            "deleteParam": (self._delete_param, 0, {"key": key}),
+            "setParam": (self._set_param, 0, {"key": key, "value": anything}),
+            "getParam": (self._get_param, 0, {"key": key}),
+            "searchParam": (self._search_param, 0, {"key": text}),
+            "subscribeParam": (self._subscribe_param, 0, subscription),
+            "unsubscribeParam": (self._unsubscribe_param, 0, subscription),
+            # rosmaster puts the name into the status, and old clients read it.
+            "hasParam": (lambda _, key: RosReply(SUCCESS, key, self.parameters.has(key)), False, {"key": key}),
+            "getParamNames": (lambda _: RosReply(SUCCESS, "", list(self._yielder(self.parameters.names()))), [], {}),
+            "registerService": (partial(self._register, provider), 0, {**service, "caller_api": uri}),
+            "unregisterService": (partial(self._unregister, provider), 0, service),
+            "lookupService": (self._lookup_service, "", {"service": resource}),
+            "registerSubscriber": (partial(self._register, subscriber), [], typed),
+            "unregisterSubscriber": (partial(self._unregister, subscriber), 0, {**topic, "caller_api": uri}),
+            "registerPublisher": (partial(self._register, publisher), [], typed),
+            "unregisterPublisher": (partial(self._unregister, publisher), 0, {**topic, "caller_api": uri}),
+            "lookupNode": (self._lookup_node, "", {"node": node_name}),
+            "getPublishedTopics": (self._get_published_topics, 0, {"subgraph": subgraph}),
+            "getTopicTypes": (self._get_topic_types, [], {}),
+            "getSystemState": (self._get_system_state, [[], [], []], {}),
         }
-
-
-def _unregistered(caller_id: str, name: str, *, found: bool) -> RosReply:
-    if found:
-        return RosReply(SUCCESS, f"{caller_id} is no longer registered for {name}", 1)
-    return RosReply(SUCCESS, f"{caller_id} was not registered for {name} with that URI", 0)

@@ -11,43 +11,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.core.counters import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 
-@dataclass(frozen=True, slots=True)
-class PublisherUpdate:
-    """``publisherUpdate`` for the slave API at ``api``: the publishers of ``topic``, in order of registration."""
-
-    api: str
-    topic: str
-    publishers: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ParamUpdate:
-    """``paramUpdate`` for the slave API at ``api``: ``key``, which ends in ``/``, is ``value``; ``{}`` if deleted."""
-
-    api: str
-    key: str
-    value: XmlRpcValue
-
-
-@dataclass(frozen=True, slots=True)
-class Shutdown:
-    """``shutdown`` for ``node`` at the slave API ``api``, because another node has taken its name.
-
-    ``topics`` are those that it published: the header of one shows whether that node is still at the address.
-    """
-
-    api: str
-    node: str
-    topics: tuple[str, ...]
-
-
-Effect: TypeAlias = PublisherUpdate | ParamUpdate | Shutdown
+# A call of a slave that follows from a change: its slave API, the method, and what the call tells.
+#
+# * ``publisherUpdate``: a topic, and its publishers in order of registration;
+# * ``paramUpdate``: a key that ends in ``/``, and its value; ``{}`` if deleted;
+# * ``shutdown``: a node whose name another node has taken, and the topics that it published: the header of one shows
+#   whether that node is still at the address.
+SlaveCall: TypeAlias = "tuple[str, str, str, XmlRpcValue]"
 
 
 class RegistrationKind(enum.Enum):
@@ -155,27 +131,15 @@ def _parts(key: str) -> list[str]:
     return [part for part in key.split("/") if part]
 
 
-def _with(tree: Tree, parts: list[str], value: XmlRpcValue) -> Tree:
+def _changed(tree: Tree, parts: list[str], change: Callable[[Tree, str], object]) -> Tree:
+    """A copy of the tree in which ``change`` was made to the namespace at the end of a path, and to its last part."""
     first, *rest = parts
     copy = dict(tree)
     if rest:
         below = tree.get(first)
-        copy[first] = _with(below if isinstance(below, dict) else {}, rest, value)
+        copy[first] = _changed(below if isinstance(below, dict) else {}, rest, change)
     else:
-        copy[first] = value
-    return copy
-
-
-def _without(tree: Tree, parts: list[str]) -> Tree:
-    first, *rest = parts
-    copy = dict(tree)
-    if rest:
-        below = tree[first]
-        if not isinstance(below, dict):
-            raise KeyError(first)
-        copy[first] = _without(below, rest)
-    else:
-        del copy[first]
+        change(copy, first)
     return copy
 
 
@@ -210,12 +174,8 @@ class Parameters:
     """The tree of one parameter server."""
 
     def __init__(self) -> None:
-        self._tree: Tree = {}
-
-    @property
-    def tree(self) -> Tree:
+        self.tree: Tree = {}
         """The whole tree, not to be changed; it and each of its parts stay the same object until a value changes."""
-        return self._tree
 
     def get(self, key: str) -> XmlRpcValue:
         """The value or the namespace at ``key``; ``/`` is the whole tree. The caller must not change it.
@@ -223,7 +183,7 @@ class Parameters:
         Raises:
             KeyError: ``key`` does not exist.
         """
-        value: XmlRpcValue = self._tree
+        value: XmlRpcValue = self.tree
         for part in _parts(key):
             if not isinstance(value, dict):
                 raise KeyError(key)
@@ -250,11 +210,10 @@ class Parameters:
         Raises:
             TypeError: ``key`` is the root, and ``value`` is no dict.
         """
-        parts = _parts(key)
-        if parts:
-            self._tree = _with(self._tree, parts, value)
+        if parts := _parts(key):
+            self.tree = _changed(self.tree, parts, lambda namespace, name: namespace.update({name: value}))
         elif isinstance(value, dict):
-            self._tree = value
+            self.tree = value
         else:
             raise TypeError("the root of the parameter tree can only be set to a dictionary")
 
@@ -267,11 +226,11 @@ class Parameters:
         parts = _parts(key)
         if not parts:
             raise KeyError(key)
-        self._tree = _without(self._tree, parts)
+        self.tree = _changed(self.tree, parts, dict.pop)
 
     def names(self) -> Iterator[str]:
         """The full names of all values, from the tree at the time of the call; an empty namespace has none."""
-        return _names("/", self._tree)
+        return _names("/", self.tree)
 
     def search(self, namespace: str, key: str) -> str | None:
         """Find ``key`` in ``namespace`` or the nearest one above it.
@@ -288,15 +247,13 @@ class Parameters:
             raise ValueError(f"{namespace!r} is not a global name to search from")
         if key.startswith("/"):
             return key if self.has(key) else None
-        first = _parts(key)[0]
-        if self.has(join(namespace, first)):
-            return join(namespace, key)
-        above = _parts(namespace)
-        while above:
+        first, above = _parts(key)[0], _parts(namespace)
+        while not self.has(join(namespace, first)):
+            if not above:
+                return None
             above.pop()
-            if self.has("/" + "/".join([*above, first])):
-                return "/" + "/".join([*above, key])
-        return None
+            namespace = "/" + "/".join(above)
+        return join(namespace, key)
 
 
 def _names(namespace: str, tree: Tree) -> Iterator[str]:
@@ -327,7 +284,7 @@ def updates(
     value: XmlRpcValue,
     setter: str | None = None,
     yielder: Yielder = iter,
-) -> list[ParamUpdate]:
+) -> list[SlaveCall]:
     """The notifications after a parameter was set or deleted.
 
     Args:
@@ -347,12 +304,12 @@ def updates(
     # Walks through the value only if there is a subscription below it: few values have one, and some are large.
     within = any(subscribed != key and subscribed.startswith(key) for subscribed in subscribers)
     below = dict(yielder(_below(key, value))) if within else {}
-    found: list[ParamUpdate] = []
+    found: list[SlaveCall] = []
     for subscribed, nodes in subscribers.items():
         if key.startswith(subscribed):
-            found += [ParamUpdate(api, key, value) for node, api in nodes.items() if node != setter]
+            found += [(api, "paramUpdate", key, value) for node, api in nodes.items() if node != setter]
         elif isinstance(value, dict) and subscribed.startswith(key) and subscribed not in below:
-            found += [ParamUpdate(api, subscribed, {}) for api in nodes.values()]
+            found += [(api, "paramUpdate", subscribed, {}) for api in nodes.values()]
     for full, part in below.items():
-        found += [ParamUpdate(api, full, part) for api in subscribers.get(full, {}).values()]
+        found += [(api, "paramUpdate", full, part) for api in subscribers.get(full, {}).values()]
     return found

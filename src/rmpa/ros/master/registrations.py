@@ -1,92 +1,25 @@
 """The tables of a master: publishers, subscribers, services and nodes.
 
-Registered nodes to which connecting fails: an address without a route, a host name that does not resolve.
-
-Such a node may live: its network may be down for a moment. It stays registered, as at roscore, but after
-``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: its topics and services are no longer offered to peers. Pure: the
-time is an argument.
+Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Annotated, Final
 
 import msgspec
 
 from rmpa.ros import limits
-from rmpa.ros.master.parameters import Effect, GraphChange, GraphState, PublisherUpdate, RegistrationKind, Shutdown
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-
-@dataclass(frozen=True, slots=True)
-class Unreachable:
-    """A node to which connecting fails.
-
-    Args:
-        api: The slave API's URI that it registered with.
-        problem: Why the last attempt failed, for people.
-        since: When the first attempt failed, in seconds of the monotonic clock.
-        withdrawn: Whether its topics and services are no longer offered to peers.
-    """
-
-    api: str
-    problem: str
-    since: float
-    withdrawn: bool = False
-
-
-class Reachability:
-    """The nodes that could not be reached when they were last tried."""
-
-    def __init__(self) -> None:
-        self._nodes: dict[str, Unreachable] = {}
-
-    @property
-    def unreachable(self) -> Mapping[str, Unreachable]:
-        """The nodes that could not be reached, by name; not to be changed."""
-        return self._nodes
-
-    def failed(self, node: str, api: str, problem: str, now: float) -> bool:
-        """Note an attempt to connect that failed without being refused; return whether this withdraws the node.
-
-        Args:
-            node: The node's name.
-            api: Its slave API.
-            problem: Why the attempt failed, for people.
-            now: Monotonic seconds.
-        """
-        known = self._nodes.get(node)
-        if known is None or known.api != api:
-            known = Unreachable(api, problem, now)
-        withdrawn = now - known.since >= limits.NODE_UNREACHABLE_AFTER
-        self._nodes[node] = replace(known, problem=problem, withdrawn=withdrawn)
-        return withdrawn and not known.withdrawn
-
-    def reached(self, node: str) -> bool:
-        """Note that a node can be connected to; return whether it was withdrawn before."""
-        known = self._nodes.pop(node, None)
-        return known is not None and known.withdrawn
-
-    def keep(self, nodes: Mapping[str, str]) -> None:
-        """Drop all but these nodes at these slave APIs."""
-        if self._nodes:
-            self._nodes = {node: known for node, known in self._nodes.items() if nodes.get(node) == known.api}
-
-
-# The master's tables of publishers, subscribers, services and parameter subscriptions.
-#
-# Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them.
-
+from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
 
 ANY_TYPE: Final = "*"
-_NOBODY: Final[dict[str, str]] = {}
+_NONE: Final[dict[str, str]] = {}
+Name = Annotated[str, msgspec.Meta(pattern="^/", max_length=limits.CORE_STATE_NAME_MAX)]
+"""A name in a core's state file."""
 
 
 class NodeRecord(msgspec.Struct, omit_defaults=True):
-    """Everything that one node registered.
+    """Everything that one node registered, as a core's state file has it.
 
     Attributes:
         api: The URI of its slave API.
@@ -96,40 +29,26 @@ class NodeRecord(msgspec.Struct, omit_defaults=True):
         params: Parameters that it subscribed to; each ends in ``/``.
     """
 
-    api: str
-    publishers: dict[str, str] = {}
-    subscribers: dict[str, str] = {}
-    services: dict[str, str] = {}
-    params: list[str] = []
-
-
-@dataclass(slots=True)
-class _Node:
-    """One node: its slave API, and what it registered (dicts, for their order)."""
-
-    api: str
-    keys: dict[RegistrationKind, dict[str, None]] = field(
-        default_factory=lambda: {kind: {} for kind in RegistrationKind}
-    )
-
-    @property
-    def empty(self) -> bool:
-        return not any(self.keys.values())
+    api: Annotated[str, msgspec.Meta(pattern="^http://")]
+    publishers: dict[Name, str] = {}
+    subscribers: dict[Name, str] = {}
+    services: dict[Name, str] = {}
+    params: list[Name] = []
 
 
 class Registrations:
-    """The tables, and the effects of each change.
+    """The tables, and what follows from each change.
 
-    Each change appends to ``effects`` (calls to be made to slaves, in order) and to ``changes``; the owner empties
-    both.
+    Each change appends to ``calls`` (of slaves, to be made in order) and to ``changes``; the owner empties both.
     """
 
     def __init__(self) -> None:
-        self._nodes: dict[str, _Node] = {}
+        self._apis: dict[str, str] = {}
+        # node -> what it registered (dicts, for their order)
+        self._entries: dict[str, dict[tuple[RegistrationKind, str], None]] = {}
         # key -> node -> slave API. The inner dicts are replaced, never changed: callers may hold them.
         self._tables: dict[RegistrationKind, dict[str, dict[str, str]]] = {kind: {} for kind in RegistrationKind}
-        self._service_uris: dict[str, str] = {}
-        # service -> node -> service URI, likewise
+        # service -> node -> service URI, likewise; a service has one provider
         self._services: dict[str, dict[str, str]] = {}
         self._types: dict[str, str] = {}
         # node -> the slave API of the former node of that name, for as long as a new node has the name.
@@ -137,68 +56,64 @@ class Registrations:
         self._state: GraphState | None = None
         self.revision = 0
         """Another number after each change of a node's record."""
-        self.effects: list[Effect] = []
+        self.calls: list[SlaveCall] = []
         self.changes: list[GraphChange] = []
 
     # --- questions --------------------------------------------------------------------------------------------
 
     def node_api(self, node: str) -> str | None:
         """The slave API of a node; ``None`` if the node has no registration."""
-        found = self._nodes.get(node)
-        return found.api if found is not None else None
+        return self._apis.get(node)
 
     def nodes(self) -> dict[str, str]:
         """All nodes with their slave APIs."""
-        return {name: node.api for name, node in self._nodes.items()}
+        return dict(self._apis)
 
     def nodes_at(self, api: str) -> list[str]:
         """The nodes with this slave API; nodelets share one."""
-        return [name for name, node in self._nodes.items() if node.api == api]
-
-    def apis(self, kind: RegistrationKind, key: str) -> list[str]:
-        """The slave APIs registered for a key, in order."""
-        return list(self._tables[kind].get(key, {}).values())
+        return [node for node, its in self._apis.items() if its == api]
 
     def at(self, kind: RegistrationKind, key: str) -> dict[str, str]:
         """The nodes registered for a key, in order, and their slave APIs; never changed afterwards."""
-        return self._tables[kind].get(key, _NOBODY)
+        return self._tables[kind].get(key, _NONE)
 
-    def param_subscribers(self) -> dict[str, dict[str, str]]:
-        """Subscribed parameters (keys end in ``/``), each with its nodes and their slave APIs; not to be changed."""
-        return self._tables[RegistrationKind.PARAM]
+    def table(self, kind: RegistrationKind) -> dict[str, dict[str, str]]:
+        """All keys of a kind, each with its nodes and their slave APIs; not to be changed."""
+        return self._tables[kind]
+
+    def counterparts(self, kind: RegistrationKind, key: str) -> list[str] | int:
+        """The value in the reply to a registration: the slave APIs at the other side of a topic; 1 for a service."""
+        match kind:
+            case RegistrationKind.PUBLISHER:
+                return list(self.at(RegistrationKind.SUBSCRIBER, key).values())
+            case RegistrationKind.SUBSCRIBER:
+                return list(self.at(RegistrationKind.PUBLISHER, key).values())
+        return 1
 
     def service_uri(self, service: str) -> str | None:
         """The ``rosrpc://`` URI of a service's provider."""
-        return self._service_uris.get(service)
+        return next(iter(self._services.get(service, _NONE).values()), None)
 
     def types(self) -> dict[str, str]:
         """The type of each topic that ever had one; not to be changed."""
         return self._types
 
-    def published(self) -> list[str]:
-        """Topics with a publisher."""
-        return list(self._tables[RegistrationKind.PUBLISHER])
-
-    def providers(self, kind: RegistrationKind) -> list[tuple[str, dict[str, str]]]:
-        """All keys (topics, services or parameters) of a kind, each with its nodes and their slave APIs.
-
-        The caller must not change the inner dicts.
-        """
-        return list(self._tables[kind].items())
-
     def record(self, node: str) -> NodeRecord | None:
         """Everything that a node registered; ``None`` for an unknown node."""
-        found = self._nodes.get(node)
-        if found is None:
+        if node not in self._apis:
             return None
-        services = found.keys[RegistrationKind.SERVICE]
-        return NodeRecord(
-            found.api,
-            {topic: self._types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.PUBLISHER]},
-            {topic: self._types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.SUBSCRIBER]},
-            {name: uri for name in services if (uri := self._services.get(name, {}).get(node))},
-            list(found.keys[RegistrationKind.PARAM]),
-        )
+        record = NodeRecord(self._apis[node])
+        for kind, key in self._entries[node]:
+            match kind:
+                case RegistrationKind.PUBLISHER:
+                    record.publishers[key] = self._types.get(key, ANY_TYPE)
+                case RegistrationKind.SUBSCRIBER:
+                    record.subscribers[key] = self._types.get(key, ANY_TYPE)
+                case RegistrationKind.SERVICE:
+                    record.services[key] = self._services[key][node]
+                case RegistrationKind.PARAM:
+                    record.params.append(key)
+        return record
 
     def state(self) -> GraphState:
         """All registrations; the same object until something changes.
@@ -217,73 +132,70 @@ class Registrations:
 
     # --- changes ----------------------------------------------------------------------------------------------
 
-    def register_publisher(self, topic: str, topic_type: str, node: str, api: str) -> None:
-        """Add a publisher and notify the topic's subscribers, even if it was registered already.
+    def register(self, kind: RegistrationKind, key: str, node: str, api: str, detail: str = "") -> None:
+        """Add a registration.
 
-        Clients rely on the repeated notification: it makes rospy connect again.
+        The subscribers of a topic are notified of a publisher even if it was registered already: clients rely on the
+        repeated notification, which makes rospy connect again. A service has one provider, the last one.
+
+        A node whose name another node has taken does not take it back by subscribing to a parameter. With rosmaster
+        it does, and the new node is asked to end: roscpp logs the request to end, and its log subscribes to a
+        parameter with ``getCached``. This is the one intended difference; tests/interop/test_core_api.py shows both.
+
+        Args:
+            kind: The kind of registration.
+            key: The topic, service or parameter; the latter ends in ``/``.
+            node: The node.
+            api: Its slave API.
+            detail: The type of a topic (that of a subscriber counts only while the topic has none), or the
+                ``rosrpc://`` URI of a service.
         """
-        retyped = False
-        if topic_type != ANY_TYPE or topic not in self._types:
-            retyped = self._types.get(topic) != topic_type
-            self._types[topic] = topic_type
-        self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
-        self.notify_subscribers(topic)
-
-    def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
-        """Add a subscriber; its type counts only while the topic has none."""
-        retyped = topic not in self._types and topic_type != ANY_TYPE
-        if retyped:
-            self._types[topic] = topic_type
-        self._register(RegistrationKind.SUBSCRIBER, topic, node, api, retyped=retyped)
-
-    def register_service(self, service: str, uri: str, node: str, api: str) -> None:
-        """Make this node the service's provider, in place of any other."""
+        if kind is RegistrationKind.PARAM and self._evicted.get(node) == api:
+            return
         self._claim_name(node, api)
-        retyped = self._service_uris.get(service) != uri
-        before = self.at(RegistrationKind.SERVICE, service)
-        if gone := [other for other in before if other != node]:
-            self._tables[RegistrationKind.SERVICE][service] = {n: its for n, its in before.items() if n == node}
-            for other in gone:
-                self._changed(RegistrationKind.SERVICE, service, other, before[other], added=False)
-        self._service_uris[service] = uri
-        self._services[service] = {node: uri}
-        self._register(RegistrationKind.SERVICE, service, node, api, retyped=retyped)
+        retyped, unknown, providers = False, key not in self._types, self.at(kind, key)
+        match kind:
+            case RegistrationKind.SERVICE:
+                retyped = self.service_uri(key) != detail
+                self._services[key] = {node: detail}
+                gone = {other: its for other, its in providers.items() if other != node}
+                self._tables[kind][key] = providers = {node: api} if node in providers else {}
+                for other, its in gone.items():
+                    del self._entries[other][kind, key]
+                    self._changed(kind, key, other, its, added=False)
+            case RegistrationKind.PUBLISHER if unknown or detail != ANY_TYPE:
+                retyped = self._types.get(key) != detail
+                self._types[key] = detail
+            case RegistrationKind.SUBSCRIBER if unknown and detail != ANY_TYPE:
+                retyped = True
+                self._types[key] = detail
+        if retyped or node not in providers:
+            self._entries[node][kind, key] = None
+            self._tables[kind][key] = {**providers, node: api}
+            self._changed(kind, key, node, api, added=True)
+        if kind is RegistrationKind.PUBLISHER:
+            self.notify_subscribers(key)
 
-    def subscribe_param(self, key: str, node: str, api: str) -> None:
-        """Notify this node of changes below ``key``, which ends in ``/``.
+    def unregister(self, kind: RegistrationKind, key: str, node: str, detail: str) -> bool:
+        """Remove a registration.
 
-        A node whose name another node has taken does not take it back by this call. With rosmaster it does, and the
-        new node is asked to end: roscpp logs the request to end, and its log subscribes to a parameter with
-        ``getCached``. This is the one intended difference; tests/interop/test_core_api.py shows both.
-        """
-        if self._evicted.get(node) != api:
-            self._register(RegistrationKind.PARAM, key, node, api)
-
-    def unregister(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Remove a publisher, subscriber or parameter subscriber, if ``api`` is still that node's.
+        Args:
+            kind: The kind of registration.
+            key: The topic, service or parameter.
+            node: The node.
+            detail: The node's slave API; of a service its ``rosrpc://`` URI. Another one removes nothing.
 
         Returns:
             Whether it was there.
         """
-        found = self._tables[kind].get(key, {}).get(node) == api
-        if found:
+        api = self.at(kind, key).get(node)
+        found = api is not None and detail == (self.service_uri(key) if kind is RegistrationKind.SERVICE else api)
+        if api is not None and found:
             self._remove(kind, key, node, api)
             if kind is RegistrationKind.PUBLISHER:
                 self.notify_subscribers(key)
-        self._forget_if_empty(node)
-        return found
-
-    def unregister_service(self, service: str, uri: str, node: str) -> bool:
-        """Remove a service, if its provider still is this node with this ``rosrpc://`` URI.
-
-        Returns:
-            Whether it was there.
-        """
-        api = self._tables[RegistrationKind.SERVICE].get(service, {}).get(node)
-        found = api is not None and self._service_uris.get(service) == uri
-        if api is not None and found:
-            self._remove(RegistrationKind.SERVICE, service, node, api)
-        self._forget_if_empty(node)
+        if self._entries.get(node) == {}:
+            self._forget(node)
         return found
 
     def purge(self, node: str, api: str) -> bool:
@@ -292,83 +204,64 @@ class Registrations:
         Returns:
             Whether there was such a node with this slave API.
         """
-        found = self._nodes.get(node)
-        if found is None or found.api != api:
+        if self._apis.get(node) != api:
             return False
-        topics = list(found.keys[RegistrationKind.PUBLISHER])
-        self._empty(node)
-        self._nodes.pop(node, None)
-        self._evicted.pop(node, None)
-        self.revision += 1
+        topics = self._empty(node)
+        self._forget(node)
         for topic in topics:
             self.notify_subscribers(topic)
         return True
 
     def notify_subscribers(self, topic: str) -> None:
         """Send the subscribers of a topic the list of its publishers."""
-        publishers = tuple(self.apis(RegistrationKind.PUBLISHER, topic))
+        publishers = list(self.at(RegistrationKind.PUBLISHER, topic).values())
         # Nodelets of one process share a slave API, which is notified once.
-        apis = dict.fromkeys(self.apis(RegistrationKind.SUBSCRIBER, topic))
-        self.effects += [PublisherUpdate(api, topic, publishers) for api in apis]
+        apis = dict.fromkeys(self.at(RegistrationKind.SUBSCRIBER, topic).values())
+        self.calls += [(api, "publisherUpdate", topic, publishers) for api in apis]
 
     # --- the tables -------------------------------------------------------------------------------------------
 
-    def _claim_name(self, node: str, api: str) -> _Node:
-        """Return the node's entry; a node of that name at another URI loses its registrations and is asked to end."""
-        found = self._nodes.get(node)
-        if found is not None and found.api != api:
-            self.effects.append(Shutdown(found.api, node, tuple(found.keys[RegistrationKind.PUBLISHER])))
-            self._empty(node)
-            self._evicted[node] = found.api
-            found = None
-            # The name keeps its place in the order of nodes, as in rosmaster.
-        if found is None:
-            found = self._nodes[node] = _Node(api)
-        return found
-
-    def _register(self, kind: RegistrationKind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
-        keys = self._claim_name(node, api).keys[kind]
-        if retyped or key not in keys:
-            keys[key] = None
-            self.revision += 1
-        providers = self.at(kind, key)
-        new = node not in providers
-        if providers.get(node) != api:
-            self._tables[kind][key] = {**providers, node: api}
-        self._state = None
-        if new or retyped:
-            self._changed(kind, key, node, api, added=True)
+    def _claim_name(self, node: str, api: str) -> None:
+        """Make the node's entry; a node of that name at another URI loses its registrations and is asked to end."""
+        before = self._apis.get(node)
+        if before == api:
+            return
+        self._apis[node] = api  # the name keeps its place in the order of nodes, as in rosmaster
+        if before is not None:
+            self._evicted[node] = before
+            self.calls.append((before, "shutdown", node, self._empty(node)))
+        self._entries[node] = {}
+        self._touch()
 
     def _remove(self, kind: RegistrationKind, key: str, node: str, api: str) -> None:
-        providers = self._tables[kind][key]
-        if len(providers) > 1:
-            self._tables[kind][key] = {other: its for other, its in providers.items() if other != node}
+        providers = {other: its for other, its in self._tables[kind][key].items() if other != node}
+        if providers:
+            self._tables[kind][key] = providers
         else:
             del self._tables[kind][key]
             if kind is RegistrationKind.SERVICE:
-                del self._service_uris[key]
                 del self._services[key]
-        self._nodes[node].keys[kind].pop(key, None)
-        self.revision += 1
+        del self._entries[node][kind, key]
         self._changed(kind, key, node, api, added=False)
 
-    def _empty(self, node: str) -> None:
-        for kind, keys in self._nodes[node].keys.items():
-            for key in list(keys):
-                api = self._tables[kind].get(key, {}).get(node)
-                if api is not None:
-                    self._remove(kind, key, node, api)
+    def _empty(self, node: str) -> list[str]:
+        """Remove all registrations of a node; return the topics that it published."""
+        entries = list(self._entries[node])
+        for kind, key in entries:
+            self._remove(kind, key, node, self._tables[kind][key][node])
+        return [key for kind, key in entries if kind is RegistrationKind.PUBLISHER]
 
-    def _forget_if_empty(self, node: str) -> None:
-        found = self._nodes.get(node)
-        if found is not None and found.empty:
-            del self._nodes[node]
-            self._evicted.pop(node, None)
-            self._state = None
-            self.revision += 1
+    def _forget(self, node: str) -> None:
+        del self._apis[node], self._entries[node]
+        self._evicted.pop(node, None)
+        self._touch()
 
     def _changed(self, kind: RegistrationKind, key: str, node: str, api: str, *, added: bool) -> None:
-        self._state = None
+        self._touch()
         if kind is not RegistrationKind.PARAM:
             topic_type = "" if kind is RegistrationKind.SERVICE else self._types.get(key, "")
             self.changes.append(GraphChange(kind, added, key, node, api, topic_type))
+
+    def _touch(self) -> None:
+        self._state = None
+        self.revision += 1

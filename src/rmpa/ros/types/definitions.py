@@ -20,6 +20,7 @@ from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.ros import limits
+from rmpa.ros.wire.tcpros import TopicDescription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -329,27 +330,16 @@ def known_specifications(name: str) -> Mapping[str, Specification]:
     return found
 
 
-# The text of ``std_msgs/Header`` in the full definition of a stamped message.
+def known_description(name: str) -> TopicDescription:
+    """The description of a type that rmpa brings, for a publisher's header.
 
+    Its text is that of ROS's own publishers: rosbag and others compute the md5 sum from it.
 
-HEADER_PART: Final = (
-    "================================================================================\n"
-    "MSG: std_msgs/Header\n"
-    "# Standard metadata for higher-level stamped data types.\n"
-    "# This is generally used to communicate timestamped data \n"
-    "# in a particular coordinate frame.\n"
-    "# \n"
-    "# sequence ID: consecutively increasing ID \n"
-    "uint32 seq\n"
-    "#Two-integer timestamp that is expressed as:\n"
-    "# * stamp.sec: seconds (stamp_secs) since epoch (in Python the variable is called 'secs')\n"
-    "# * stamp.nsec: nanoseconds since stamp_secs (in Python the variable is called 'nsecs')\n"
-    "# time-handling sugar is provided by the client library\n"
-    "time stamp\n"
-    "#Frame this data is associated with\n"
-    "string frame_id\n"
-)
-"""Equal to the byte to the text of ROS's publishers: rosbag and others compute md5 sums from definitions."""
+    Raises:
+        DefinitionError: The type is not one that rmpa brings.
+    """
+    known = known_specifications(name)
+    return TopicDescription(name, md5sum(name, known), full_text(name, known))
 
 
 # Serializes ``diagnostic_msgs/DiagnosticArray`` (REP 107), which an agent publishes on /diagnostics.
@@ -358,37 +348,6 @@ HEADER_PART: Final = (
 
 
 ARRAY_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
-ARRAY_MD5: Final = "60810da900de1dd6ddd437c3503511da"
-ARRAY_DEFINITION: Final = (
-    "# This message is used to send diagnostic information about the state of the robot\n"
-    "Header header #for timestamp\n"
-    "DiagnosticStatus[] status # an array of components being reported on\n"
-    f"{HEADER_PART}"
-    "\n"
-    "================================================================================\n"
-    "MSG: diagnostic_msgs/DiagnosticStatus\n"
-    "# This message holds the status of an individual component of the robot.\n"
-    "# \n"
-    "\n"
-    "# Possible levels of operations\n"
-    "byte OK=0\n"
-    "byte WARN=1\n"
-    "byte ERROR=2\n"
-    "byte STALE=3\n"
-    "\n"
-    "byte level # level of operation enumerated above \n"
-    "string name # a description of the test/component reporting\n"
-    "string message # a description of the status\n"
-    "string hardware_id # a hardware unique string\n"
-    "KeyValue[] values # an array of values associated with the status\n"
-    "\n"
-    "\n"
-    "================================================================================\n"
-    "MSG: diagnostic_msgs/KeyValue\n"
-    "string key # what to label this value when viewing\n"
-    "string value # a value to track over time\n"
-)
-"""The text that ROS's own publishers send: rosbag and others compute the md5 sum from it."""
 _LENGTH: Final = struct.Struct("<I")
 _ARRAY_HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000

@@ -23,7 +23,6 @@ from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettin
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.parameters import ParamUpdate
 from tests.bridge.services.io.test_calls import Wire
 
 if TYPE_CHECKING:
@@ -48,9 +47,9 @@ class FakeCore:
 
     def call(self, caller: str, method: str, *params: XmlRpcValue) -> RosReply:
         reply = self.api.call(method, (caller, *params))
-        for effect in self.api.take()[0]:
-            if isinstance(effect, ParamUpdate) and effect.api == OURS:
-                self.told(effect.key.rstrip("/"))
+        for api, what, key, _ in self.api.take()[0]:
+            if (api, what) == (OURS, "paramUpdate"):
+                self.told(key.rstrip("/"))
         return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
