@@ -14,7 +14,7 @@ from rmpa.bridge.nodes import NODES, Nodes
 from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.environment import NodeEnd, NodeFacts, NodePing, PeerNodes
+from rmpa.ros.environment import NodeFacts, NodePing, PeerNodes
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.service_client import ServiceConnection
@@ -88,13 +88,13 @@ async def test_nodes_of_a_peer_are_listed_described_and_pinged(settings: Callabl
         with pytest.raises(PeerRefused, match="b has no node /tolker; did you mean /talker"):
             await ask(a, NodePing, "node.ping", "/tolker")
         with pytest.raises(PeerRefused, match="/rmpa is no node of b: it is its agent"):
-            await ask(a, NodeEnd, "node.kill", "/rmpa")
+            await ask(a, dict[str, bool], "node.kill", "/rmpa")
         with pytest.raises(PeerRefused, match="names no node"):
-            await ask(a, NodeEnd, "node.kill", "no name")
+            await ask(a, dict[str, bool], "node.kill", "no name")
         with pytest.raises(UnreachableError, match="linked peer"):
-            await ask(a, NodeEnd, "node.kill", "/x", peer="c")
+            await ask(a, dict[str, bool], "node.kill", "/x", peer="c")
         with pytest.raises(RmpaError, match=r"did you mean node\.kill"):
-            await ask(a, NodeEnd, "node.kil", "/x")
+            await ask(a, dict[str, bool], "node.kil", "/x")
 
 
 async def test_an_older_agent_without_node_requests(settings: Callable[..., Settings]) -> None:
@@ -126,7 +126,7 @@ async def test_killing_a_proxy_ends_its_node(settings: Callable[..., Settings]) 
 async def test_a_node_is_ended_by_name(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
         await talker.advertise("/chatter", "std_msgs/String")
-        assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
+        assert (await ask(a, dict[str, bool], "node.kill", "/talker"))["gone"]
         await asyncio.wait_for(ended.wait(), 20)
         assert "/talker" not in b.core.state().nodes
 
@@ -140,10 +140,10 @@ async def test_a_node_is_not_ended_without_permission(settings: Callable[..., Se
         refusal = "no glob of nodes.kill in the rmpa.toml of b fits /talker"
         assert (reply.code, refusal in reply.status) == (0, True)
         with pytest.raises(PeerRefused, match=refusal):
-            await ask(a, NodeEnd, "node.kill", "/talker")
+            await ask(a, dict[str, bool], "node.kill", "/talker")
         assert not ended.is_set()
         b.apply_settings(replace(b_settings, nodes=NodeSettings()))
-        assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
+        assert (await ask(a, dict[str, bool], "node.kill", "/talker"))["gone"]
 
 
 async def test_a_node_that_does_not_end(settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +152,7 @@ async def test_a_node_that_does_not_end(settings: Callable[..., Settings], monke
         await stubborn.advertise("/chatter", "std_msgs/String")
         await until(lambda: proxy(a, "stubborn"))
         monkeypatch.setattr(stubborn._slave, "_on_shutdown", lambda _: None)
-        assert not (await ask(a, NodeEnd, "node.kill", "/stubborn")).gone
+        assert not (await ask(a, dict[str, bool], "node.kill", "/stubborn"))["gone"]
         reply = await call_api(proxy(a, "stubborn"), "shutdown", "/rosnode", "user request")
         assert reply == (0, "it was asked, and is still there after 0.3 s", 0)
 

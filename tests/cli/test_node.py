@@ -15,7 +15,7 @@ from rmpa.cli.main import main
 from rmpa.cli.node import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.observe.snapshot import UnreachableInfo
-from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, RosEnvironment
+from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node
 from tests.cli.conftest import with_core
 
@@ -91,7 +91,7 @@ def peer(core: RosCore, agent: Callable[..., None]) -> list[dict[str, Any]]:
             raise PeerRefused("joystick", f"joystick has no node {args['node']}")
         if args["what"] == "node.info":
             return NodeFacts(name="/joy", uri=JOY, pid=7, publications={"/joy": "*"}, services=("/joy/get_loggers",))
-        return NodePing(uri=JOY, time=0.0005, pid=7) if args["what"] == "node.ping" else NodeEnd(gone=True)
+        return NodePing(uri=JOY, time=0.0005, pid=7) if args["what"] == "node.ping" else {"gone": True}
 
     lost = UnreachableInfo(node="/talker", uri="http://nosuch:1/", problem="no such name", ago=3.0)
     agent("base", msgspec.structs.replace(with_core(core.uri), unreachable=(lost,)), node=node)

@@ -20,7 +20,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches, proxied_node
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import MASTER_ID, end_node, node_connections, ping_node
-from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
+from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, describe_node, list_nodes
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import GET
 from rmpa.ros.wire.tcpros import LENGTH
@@ -54,9 +54,14 @@ PING: Final = "node.ping"
 KILL: Final = "node.kill"
 """The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
 
-The response is a ``NodeEnd``.
+The response has ``gone``: whether nothing listens at the node's slave API any more.
 """
-REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
+REPLIES: Final[dict[str, object]] = {
+    LIST: tuple[NodeLine, ...],
+    INFO: NodeFacts,
+    PING: NodePing,
+    KILL: dict[str, bool],
+}
 """The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
 _VISIBLE: Final = Needs(
     (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
@@ -257,7 +262,7 @@ class Nodes(Part):
         node, uri = self._own(args, self._visible(asker.link.name))
         return await ping_node(node, uri, OWN_NODE)
 
-    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
+    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, bool]:
         peer, gate = asker.link.name, self._shared.context.gate
         named = str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
         if why := gate.why_not(Access.KILL, peer, named):
@@ -272,7 +277,7 @@ class Nodes(Part):
         _log.warning("= %s ends %s", who, node)
         gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
         self._core.suspect(node)  # roscpp does not unregister when it ends in a hurry
-        return NodeEnd(gone=gone)
+        return {"gone": gone}
 
     def _own(self, args: Mapping[str, object], told: Collection[str] | None) -> tuple[str, str]:
         """The node of this module that a request names, and its slave API.

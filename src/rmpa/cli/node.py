@@ -43,7 +43,7 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import end_node, ping_node
-from rmpa.ros.environment import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
+from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
 
@@ -297,7 +297,7 @@ def kill(nodes: tuple[str, ...], everything: bool, options: GraphOptions) -> int
 def _kill(master: Master, wanted: GraphName) -> _Killed:
     try:
         if wanted.peer is not None:
-            gone = ask_peer(master, wanted, "node.kill", NodeEnd).gone
+            gone = ask_peer(master, wanted, "node.kill", dict[str, bool]).get("gone", False)
         elif is_own(wanted.name):
             return _Killed(str(wanted), "it is the agent itself; end `rmpa up` instead")
         else:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -69,20 +71,33 @@ class RosEnvironment:
             ConfigError: A variable or an argument cannot be used.
         """
         special, remappings, parameters, rest = _split(arguments)
-        host = _first(
-            ("__hostname:=", special.get("__hostname", "")),
-            ("__ip:=", special.get("__ip", "")),
-            ("ROS_HOSTNAME", variables.get("ROS_HOSTNAME", "")),
-            ("ROS_IP", variables.get("ROS_IP", "")),
-        )
-        _check_host(*host)
+        values = {**variables, **special}
+
+        def given(*sources: str) -> tuple[str, str]:
+            return next(((source, values[source]) for source in sources if values.get(source)), ("", ""))
+
+        source, host = given("__hostname:=", "__ip:=", "ROS_HOSTNAME", "ROS_IP")
+        if "://" in host:
+            raise ConfigError(source, f"{host!r} is a URI", "write the host alone, without http://")
+        if host and not re.fullmatch(r"[A-Za-z0-9_.:-]+", host):
+            raise ConfigError(source, f"{host!r} is neither a host name nor an address")
+        source, uri = given("__master:=", "ROS_MASTER_URI")
+        match = _URI.fullmatch(uri.strip())
+        if uri and (match is None or not 0 < int(match["port"]) <= _PORT_MAX):
+            raise ConfigError(source, f"{uri!r} is not a master's URI", f"write it like {DEFAULT_MASTER_URI}")
+        source, namespace = given("__ns:=", "ROS_NAMESPACE")
+        if not is_legal_name(namespace) or namespace.startswith("~"):
+            raise ConfigError(source, f"{namespace!r} is not a namespace", "write it like /robot")
+        source, name = given("__name:=")
+        if not is_legal_name(name) or name.startswith("~") or "/" in name:
+            raise ConfigError(source, f"{name!r} is not a node's base name", "use letters, digits and _, and __ns:=")
         outer = next((address for address in addresses if not is_loopback(address)), "127.0.0.1")
         return cls(
-            master_uri=_master_uri(special, variables),
-            host=host[1] or outer,
-            host_given=bool(host[1]),
-            namespace=_namespace(special, variables),
-            name=_name(special),
+            master_uri=uri.strip() or DEFAULT_MASTER_URI,
+            host=host or outer,
+            host_given=bool(host),
+            namespace=resolve_name(namespace),
+            name=name,
             remappings=remappings,
             parameters=parameters,
             arguments=rest,
@@ -157,7 +172,7 @@ def _split(
         if not separator or not key or key.startswith("-"):
             rest.append(argument)
         elif key in _SPECIAL:
-            special[key] = value
+            special[f"{key}:="] = value
         elif key.startswith("__"):
             raise ConfigError(f"{key}:=", "is not an argument of ROS", f"use one of {', '.join(_SPECIAL)}")
         elif key.startswith("_"):
@@ -169,49 +184,10 @@ def _split(
     return special, remappings, parameters, tuple(rest)
 
 
-def _first(*candidates: tuple[str, str]) -> tuple[str, str]:
-    return next((candidate for candidate in candidates if candidate[1]), ("", ""))
-
-
-def _check_host(source: str, host: str) -> None:
-    if "://" in host:
-        raise ConfigError(source, f"{host!r} is a URI", "write the host alone, without http://")
-    if host and not re.fullmatch(r"[A-Za-z0-9_.:-]+", host):
-        raise ConfigError(source, f"{host!r} is neither a host name nor an address")
-
-
-def _master_uri(special: Mapping[str, str], variables: Mapping[str, str]) -> str:
-    source, uri = _first(
-        ("__master:=", special.get("__master", "")), ("ROS_MASTER_URI", variables.get("ROS_MASTER_URI", ""))
-    )
-    if not uri:
-        return DEFAULT_MASTER_URI
-    match = _URI.fullmatch(uri.strip())
-    if match is None or not 0 < int(match["port"]) <= _PORT_MAX:
-        raise ConfigError(source, f"{uri!r} is not a master's URI", f"write it like {DEFAULT_MASTER_URI}")
-    return uri.strip()
-
-
-def _namespace(special: Mapping[str, str], variables: Mapping[str, str]) -> str:
-    source, namespace = _first(
-        ("__ns:=", special.get("__ns", "")), ("ROS_NAMESPACE", variables.get("ROS_NAMESPACE", ""))
-    )
-    if not is_legal_name(namespace) or namespace.startswith("~"):
-        raise ConfigError(source, f"{namespace!r} is not a namespace", "write it like /robot")
-    return resolve_name(namespace)
-
-
-def _name(special: Mapping[str, str]) -> str:
-    name = special.get("__name", "")
-    if not is_legal_name(name) or name.startswith("~") or "/" in name:
-        raise ConfigError("__name:=", f"{name!r} is not a node's base name", "use letters, digits and _, and __ns:=")
-    return name
-
-
 # Records about nodes, as ``rmpa node`` shows them and agents send them to each other.
 
 
-class NodeLine(msgspec.Struct, kw_only=True, frozen=True):
+class NodeLine(msgspec.Struct, frozen=True):
     """One node in a list.
 
     Attributes:
@@ -247,7 +223,7 @@ class NodeConnection(msgspec.Struct, frozen=True):
     connected: bool = True
 
 
-class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
+class NodeFacts(msgspec.Struct, frozen=True):
     """Everything known of one node.
 
     Attributes:
@@ -271,7 +247,7 @@ class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
     connections: tuple[NodeConnection, ...] | None = None
 
 
-class NodePing(msgspec.Struct, kw_only=True, frozen=True):
+class NodePing(msgspec.Struct, frozen=True):
     """One answer of a node to a ping.
 
     Attributes:
@@ -285,17 +261,7 @@ class NodePing(msgspec.Struct, kw_only=True, frozen=True):
     pid: int
 
 
-class NodeEnd(msgspec.Struct, kw_only=True, frozen=True):
-    """The result of a request to shut a node down.
-
-    Attributes:
-        gone: Whether nothing listens at its slave API any more.
-    """
-
-    gone: bool
-
-
-class PeerNodes(msgspec.Struct, kw_only=True, frozen=True):
+class PeerNodes(msgspec.Struct, frozen=True):
     """One module's nodes.
 
     Attributes:
@@ -327,21 +293,11 @@ def list_nodes(
         problems: By node: why connecting to it fails.
         yielder: Iterates, and serves pending data in between, in graphs of thousands of topics.
     """
-    counts: dict[str, list[int]] = {}
-    for index, table in enumerate((publishers, subscribers, services)):
-        for nodes in yielder(list(table.values())):
-            for node in nodes:
-                counts.setdefault(node, [0, 0, 0])[index] += 1
+    tables = (publishers, subscribers, services)
+    topics, readers, servers = (Counter(chain.from_iterable(yielder(list(table.values())))) for table in tables)
     return tuple(
-        NodeLine(
-            name=node,
-            uri=uris.get(node, ""),
-            publications=counts[node][0],
-            subscriptions=counts[node][1],
-            services=counts[node][2],
-            problem=problems.get(node, ""),
-        )
-        for node in sorted(counts)
+        NodeLine(node, uris.get(node, ""), topics[node], readers[node], servers[node], problems.get(node, ""))
+        for node in sorted(topics.keys() | readers.keys() | servers.keys())
     )
 
 
@@ -364,8 +320,8 @@ def describe_node(
         types: Known types by topic.
     """
     return NodeFacts(
-        name=node,
-        uri=uri,
+        node,
+        uri,
         publications={topic: types.get(topic, "*") for topic in sorted(publishers) if node in publishers[topic]},
         subscriptions={topic: types.get(topic, "*") for topic in sorted(subscribers) if node in subscribers[topic]},
         services=tuple(service for service in sorted(services) if node in services[service]),

@@ -2,14 +2,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from rmpa.ros import limits
 from rmpa.ros.types import find as header_types
 from rmpa.ros.types import installed
-from rmpa.ros.types import installed as packages
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError
 from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, packages_below
@@ -230,13 +229,13 @@ class Looks:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.walks = 0
         self.now = 1000.0
-        run = packages._Search.run
+        read = installed._entries_of
 
-        def counted(search: packages._Search, root: Path) -> bool:
+        def counted(*args: Any) -> tuple[set[str], set[str]]:
             self.walks += 1
-            return run(search, root)
+            return read(*args)
 
-        monkeypatch.setattr(packages._Search, "run", counted)
+        monkeypatch.setattr(installed, "_entries_of", counted)
         monkeypatch.setattr(header_types, "monotonic", lambda: self.now)
 
 
@@ -250,7 +249,7 @@ def test_a_missing_type_is_not_looked_for_at_each_message(tmp_path: Path, monkey
     for _ in range(100):
         with pytest.raises(UnknownTypeError, match="new_msgs/B: is not in package new_msgs"):
             type_of_header(header)
-    assert looks.walks <= 2
+    assert looks.walks <= 6, "two walks through three folders"
     with pytest.raises(UnknownTypeError):
         type_of_header({"type": "new_msgs/C", "md5sum": sum_there})
     package(made, msg_B="int8 b")
@@ -299,11 +298,11 @@ def test_debians_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     path = installed.SearchPath.read({})
     for name in ("actionlib/TestGoal", "actionlib/TestActionGoal"):
-        found = list(installed.find_messages(name, path, sourced=False))
-        assert {each.where.suffix for each in found} == {".py", ".msg"}
-        for each in found:
-            assert each.text.rstrip() == MessageType(name).definition.partition(f"\n{SEPARATOR}")[0].rstrip()
-    found = list(installed.find_services("std_srvs/SetBool", path, sourced=False))
-    assert {ServiceType("std_srvs/SetBool", each.text).md5sum for each in found} == {
+        found = list(installed.find_definitions("msg", name, path, sourced=False))
+        assert {where.suffix for _, _, where in found} == {".py", ".msg"}
+        for text, _, _ in found:
+            assert text.rstrip() == MessageType(name).definition.partition(f"\n{SEPARATOR}")[0].rstrip()
+    found = list(installed.find_definitions("srv", "std_srvs/SetBool", path, sourced=False))
+    assert {ServiceType("std_srvs/SetBool", text).md5sum for text, _, _ in found} == {
         "09fb03525b03e7ea1fd3992bafd87e16"
     }

@@ -23,9 +23,9 @@ def fresh() -> Iterator[None]:
 
 
 def names(root: Path) -> dict[str, list[str]]:
-    found = packages_below(str(root))
-    assert found.whole
-    return {name: [str(folder.relative_to(root)) for folder in found.folders[name]] for name in sorted(found.folders)}
+    found, whole = packages_below(str(root))
+    assert whole
+    return {name: [str(folder.relative_to(root)) for folder in found[name]] for name in sorted(found)}
 
 
 def test_packages_in_nested_folders(tmp_path: Path) -> None:
@@ -62,8 +62,8 @@ def test_what_is_hidden(tmp_path: Path) -> None:
 def test_the_root_itself_may_be_a_package(tmp_path: Path) -> None:
     root = package(tmp_path / "my_msgs", msg_M="int8 m")
     assert list(package_folders("my_msgs", str(root))) == [root]
-    assert packages_below(str(tmp_path / "nothing")).folders == {}
-    assert packages_below(str(root / "package.xml")).folders == {}
+    assert packages_below(str(tmp_path / "nothing"))[0] == {}
+    assert packages_below(str(root / "package.xml"))[0] == {}
 
 
 def test_a_package_right_below_needs_no_search(tmp_path: Path) -> None:
@@ -91,10 +91,10 @@ def test_loops_and_what_cannot_be_read_are_passed_over(tmp_path: Path) -> None:
     locked = tmp_path / "src" / "locked"
     locked.mkdir(mode=0)
     (tmp_path / "linked").symlink_to(made)
-    found = packages_below(str(tmp_path))
-    assert found.whole
-    assert list(found.folders) == ["my_msgs"]
-    assert len(found.folders["my_msgs"]) == 1  # each folder once, by whichever name comes first
+    found, whole = packages_below(str(tmp_path))
+    assert whole
+    assert list(found) == ["my_msgs"]
+    assert len(found["my_msgs"]) == 1  # each folder once, by whichever name comes first
     locked.chmod(0o700)
 
 
@@ -104,17 +104,17 @@ def test_a_huge_tree_is_searched_as_far_as_the_limits_go(tmp_path: Path, monkeyp
         (tmp_path / "many" / str(number)).mkdir(parents=True)
     package(tmp_path / "many" / "9" / "x" / "far_msgs", msg_F="int8 f")
     monkeypatch.setattr(limits, "PACKAGE_FOLDERS_MAX", 10)
-    found = packages_below(str(tmp_path))
-    assert not found.whole
-    assert list(found.folders) == ["near_msgs"]
+    found, whole = packages_below(str(tmp_path))
+    assert not whole
+    assert list(found) == ["near_msgs"]
     packages_below.cache_clear()
     monkeypatch.setattr(limits, "PACKAGE_FOLDERS_MAX", 1000)
     monkeypatch.setattr(limits, "PACKAGE_DEPTH_MAX", 2)
-    assert not packages_below(str(tmp_path)).whole
+    assert not packages_below(str(tmp_path))[1]
     packages_below.cache_clear()
     monkeypatch.setattr(limits, "PACKAGE_DEPTH_MAX", 9)
     monkeypatch.setattr(limits, "PACKAGE_ENTRIES_MAX", 15)
-    assert not packages_below(str(tmp_path)).whole
+    assert not packages_below(str(tmp_path))[1]
 
 
 def test_only_regular_files_of_some_size_are_read(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ class Registrations:
                     record.publishers[key] = self._types.get(key, ANY_TYPE)
                 case RegistrationKind.SUBSCRIBER:
                     record.subscribers[key] = self._types.get(key, ANY_TYPE)
-                case RegistrationKind.SERVICE:
+                case RegistrationKind.SERVICE if node in self._services.get(key, _NONE):
                     record.services[key] = self._services[key][node]
                 case RegistrationKind.PARAM:
                     record.params.append(key)
@@ -161,7 +161,7 @@ class Registrations:
                 gone = {other: its for other, its in providers.items() if other != node}
                 self._tables[kind][key] = providers = {node: api} if node in providers else {}
                 for other, its in gone.items():
-                    del self._entries[other][kind, key]
+                    # As in rosmaster, the other node stays known by this service until it has ended.
                     self._changed(kind, key, other, its, added=False)
             case RegistrationKind.PUBLISHER if unknown or detail != ANY_TYPE:
                 retyped = self._types.get(key) != detail
@@ -248,7 +248,8 @@ class Registrations:
         """Remove all registrations of a node; return the topics that it published."""
         entries = list(self._entries[node])
         for kind, key in entries:
-            self._remove(kind, key, node, self._tables[kind][key][node])
+            if (api := self.at(kind, key).get(node)) is not None:
+                self._remove(kind, key, node, api)
         return [key for kind, key in entries if kind is RegistrationKind.PUBLISHER]
 
     def _forget(self, node: str) -> None:

@@ -26,20 +26,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
 SEPARATOR: Final = "=" * 80
-_NUMBERS: Final = (
-    "bool",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
+PRIMITIVES: Final = frozenset(
+    {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
+    | {"bool", "byte", "char", "float32", "float64", "string", "time", "duration"}
 )
-PRIMITIVES: Final = frozenset((*_NUMBERS, "string", "time", "duration", "char", "byte"))
 _HEADER: Final = "std_msgs/Header"
 _FIELD_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _FIELD_TYPE: Final = re.compile(r"(?P<base>[A-Za-z0-9_/]+)(?P<array>\[(?P<size>0|[1-9][0-9]{0,8})?\])?")
@@ -190,14 +180,11 @@ def parse_definition(name: str, text: str) -> dict[str, Specification]:
     return found
 
 
-def _walk(name: str, known: Mapping[str, Specification]) -> list[str]:
+def _walk(
+    name: str, known: Mapping[str, Specification], order: dict[str, None] | None = None, inside: tuple[str, ...] = ()
+) -> dict[str, None]:
     """All embedded types, each once, depth first: the order of ``gendeps``."""
-    order: dict[str, None] = {}
-    _visit(name, known, order, ())
-    return list(order)
-
-
-def _visit(name: str, known: Mapping[str, Specification], order: dict[str, None], inside: tuple[str, ...]) -> None:
+    order = {} if order is None else order
     if len(inside) > limits.DEFINITION_DEPTH_MAX:
         raise DefinitionError(name, f"is nested deeper than {limits.DEFINITION_DEPTH_MAX} types")
     if name not in known:
@@ -208,44 +195,29 @@ def _visit(name: str, known: Mapping[str, Specification], order: dict[str, None]
         # Each type is visited once: a hostile definition could make the walk exponential.
         if embedded not in order:
             order[embedded] = None
-            _visit(embedded, known, order, (*inside, name))
+            _walk(embedded, known, order, (*inside, name))
+    return order
 
 
-def md5sum(name: str, known: Mapping[str, Specification]) -> str:
-    """The MD5 sum of a message type.
+def md5sum(name: str, known: Mapping[str, Specification], response: str = "") -> str:
+    """The MD5 sum of a message type; with ``response`` that of the service type whose two halves they are.
 
     Raises:
         DefinitionError: An embedded type is missing, or a type contains itself.
     """
-    _walk(name, known)
-    return _md5sum(name, known, {})
-
-
-def service_md5sum(request: str, response: str, known: Mapping[str, Specification]) -> str:
-    """The MD5 sum of a service type, from the types of its request and its response.
-
-    Raises:
-        DefinitionError: As for ``md5sum``.
-    """
-    text = ""
-    for name in (request, response):
-        _walk(name, known)
-        text += _md5_text(name, known, {})
+    text, sums = "", dict[str, str]()
+    for half in filter(None, (name, response)):
+        _walk(half, known)
+        text += _md5_text(half, known, sums)
     return _hash(text)
-
-
-def _md5sum(name: str, known: Mapping[str, Specification], sums: dict[str, str]) -> str:
-    if name not in sums:
-        sums[name] = _hash(_md5_text(name, known, sums))
-    return sums[name]
 
 
 def _md5_text(name: str, known: Mapping[str, Specification], sums: dict[str, str]) -> str:
     lines = list(known[name].constants)
-    lines += [
-        f"{field if field.primitive else _md5sum(field.type, known, sums)} {field.name}"
-        for field in known[name].fields
-    ]
+    for field in known[name].fields:
+        if not field.primitive and field.type not in sums:
+            sums[field.type] = _hash(_md5_text(field.type, known, sums))
+        lines.append(f"{sums.get(field.type, field)} {field.name}")
     return "\n".join(lines).strip()
 
 
@@ -270,10 +242,6 @@ def packaged_texts(file: str) -> Mapping[str, str]:
     # Not by importlib.resources, which takes 10 ms of every start.
     texts: dict[str, str] = json.loads(Path(__file__).with_name(file).read_bytes())
     return texts
-
-
-def _texts() -> Mapping[str, str]:
-    return packaged_texts("definitions.json")
 
 
 def complete(known: dict[str, Specification], find: Callable[[str], str | None]) -> None:
@@ -306,12 +274,12 @@ def complete(known: dict[str, Specification], find: Callable[[str], str | None])
 
 def known_text(name: str) -> str | None:
     """The own text of a type that rmpa brings, or ``None``."""
-    return _texts().get(name)
+    return packaged_texts("definitions.json").get(name)
 
 
 def known_types() -> tuple[str, ...]:
     """The names of all types that rmpa brings."""
-    return tuple(_texts())
+    return tuple(packaged_texts("definitions.json"))
 
 
 @functools.lru_cache(maxsize=256)
@@ -321,11 +289,12 @@ def known_specifications(name: str) -> Mapping[str, Specification]:
     Raises:
         DefinitionError: The type is not one that rmpa brings.
     """
-    if name not in _texts():
+    text = known_text(name)
+    if text is None:
         raise UnknownTypeError(
             name, "is not one that comes with rmpa", "its definition is learnt from a publisher of that type"
         )
-    found = {name: Specification.parse(name, _texts()[name])}
+    found = {name: Specification.parse(name, text)}
     complete(found, known_text)
     return found
 

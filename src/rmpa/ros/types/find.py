@@ -13,7 +13,7 @@ import os
 import threading
 from collections import OrderedDict
 from time import monotonic
-from typing import TYPE_CHECKING, Final, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
@@ -33,8 +33,7 @@ from rmpa.ros.types.installed import (
     SearchPath,
     ServiceType,
     definitions_of,
-    find_messages,
-    find_services,
+    find_definitions,
     known_service,
     known_services,
     packages_below,
@@ -46,13 +45,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.types.installed import Found
 
-
-class _Versioned(Protocol):
-    md5sum: str
-    source: str
-
-
-_Type = TypeVar("_Type", bound=_Versioned)
+_Type = TypeVar("_Type", MessageType, ServiceType)
 EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"
 """The md5 sum of a message without fields, for which publishers send an empty definition."""
 _REMEDIES: Final = {
@@ -74,118 +67,82 @@ def find_message_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
         DefinitionError: The definition is malformed, or has another md5 sum.
         LimitExceeded: The definition is too long.
     """
-    return _again(_message, name, md5, SearchPath.read(os.environ if environ is None else environ))
+    return _search(_message, "msg", name, md5, SearchPath.read(os.environ if environ is None else environ))
 
 
 def find_service_type(name: str, md5: str = "", environ: Mapping[str, str] | None = None) -> ServiceType:
     """Find a service type; arguments and errors are those of ``find_message_type``."""
-    return _again(_service, name, md5, SearchPath.read(os.environ if environ is None else environ))
+    return _search(_service, "srv", name, md5, SearchPath.read(os.environ if environ is None else environ))
 
 
-# --- inside ---------------------------------------------------------------------------------------------------
-
-
-def _again(find: Callable[[str, str, SearchPath], _Type], name: str, md5: str, path: SearchPath) -> _Type:
+def _search(
+    make: Callable[[str, Found | None, SearchPath], _Type], kind: str, name: str, md5: str, path: SearchPath
+) -> _Type:
     """Find a type; if it is missing, search again without the cache, as it may have been built since."""
     fresh = packages_below.cache_info().currsize == 0
     try:
-        return find(name, md5, path)
+        return _choose(make, kind, name, md5, path)
     except UnknownTypeError:
         if fresh:
             raise
     packages_below.cache_clear()
-    return find(name, md5, path)
+    return _choose(make, kind, name, md5, path)
 
 
-@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
-def message_with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
-    """The message type of this name and md5 sum.
-
-    Raises:
-        DefinitionError: As for ``find_message_type``.
-    """
-    # Called for each message, so it is cached. With a sum the result stays valid when the files change.
-    return _again(_message, name, md5, path)
-
-
-def _message(name: str, md5: str, path: SearchPath) -> MessageType:
-    return _choose(name, md5, _messages(name, path)) or _unknown(name, path, "msg")
-
-
-def _service(name: str, md5: str, path: SearchPath) -> ServiceType:
-    return _choose(name, md5, _services(name, path)) or _unknown(name, path, "srv")
-
-
-def _choose(name: str, md5: str, versions: Iterator[Callable[[], _Type]]) -> _Type | None:
-    """The first valid version that has the sum; ``None`` if there is no version at all.
+def _choose(
+    make: Callable[[str, Found | None, SearchPath], _Type], kind: str, name: str, md5: str, path: SearchPath
+) -> _Type:
+    """The first valid version that has the sum.
 
     Raises:
+        UnknownTypeError: There is no version.
         RmpaError: There are versions, but none is valid and has the sum.
     """
     problem: RmpaError | None = None
-    for make in versions:
+    for found in _versions(kind, name, path):
         try:
-            kind = make()
+            made = make(name, found, path)
         except RmpaError as error:
             problem = problem or error
             continue
-        if not md5 or kind.md5sum == md5:
-            return kind
-        where = kind.source or "it comes with rmpa"
-        text = f"has the md5 sum {kind.md5sum} here ({where}), and {md5} there"
+        if not md5 or made.md5sum == md5:
+            return made
+        where = made.source or "it comes with rmpa"
+        text = f"has the md5 sum {made.md5sum} here ({where}), and {md5} there"
         problem = problem or DefinitionError(name, text, "source the workspace that the node over there was built in")
     if problem is not None:
         raise problem
-    return None
+    return _unknown(name, path, kind)
 
 
-def _messages(name: str, path: SearchPath) -> Iterator[Callable[[], MessageType]]:
-    """Factories of the versions of a message type, best first."""
-    for found in find_messages(name, path, sourced=True):
-        yield functools.partial(_make_message, name, found, path)
-    if known_text(name) is not None:
-        yield functools.partial(MessageType, name)
-    for found in find_messages(name, path, sourced=False):
-        yield functools.partial(_make_message, name, found, path)
+def _versions(kind: str, name: str, path: SearchPath) -> Iterator[Found | None]:
+    """The versions of a type, best first; ``None`` is the one that rmpa brings."""
+    yield from find_definitions(kind, name, path, sourced=True)
+    if name in (known_types() if kind == "msg" else known_services()):
+        yield None
+    yield from find_definitions(kind, name, path, sourced=False)
 
 
-def _services(name: str, path: SearchPath) -> Iterator[Callable[[], ServiceType]]:
-    for found in find_services(name, path, sourced=True):
-        yield functools.partial(_make_service, name, found, path)
-    if name in known_services():
-        yield functools.partial(_built_service, name, known_service(name))
-    for found in find_services(name, path, sourced=False):
-        yield functools.partial(_make_service, name, found, path)
-
-
-def _make_message(name: str, found: Found, path: SearchPath) -> MessageType:
-    known = {name: Specification.parse(name, found.text)}
-    try:
-        complete(known, functools.partial(_embedded, found, path))
-    except UnknownTypeError as error:
-        raise _embedding(name, error, "message type") from None
-    made = _built_message(name, full_text(name, known), str(found.where))
-    if known_text(name) is not None:
-        ours = MessageType(name)
-        if ours.md5sum == made.md5sum:
-            return ours  # its serialization code may be generated already
+def _message(name: str, found: Found | None, path: SearchPath) -> MessageType:
+    if found is None:
+        return MessageType(name)
+    text, embedded, where = found
+    known = {name: Specification.parse(name, text)}
+    _complete(name, known, embedded, path, "message type")
+    made = _built_message(name, full_text(name, known), str(where))
+    if known_text(name) is not None and (ours := MessageType(name)).md5sum == made.md5sum:
+        return ours  # its serialization code may be generated already
     return made
 
 
-def _make_service(name: str, found: Found, path: SearchPath) -> ServiceType:
-    embedded: dict[str, str] = {}
-
-    def find(inner: str) -> str | None:
-        text = _embedded(found, path, inner)
-        if text is not None:
-            embedded[inner] = text
-        return text
-
-    try:
-        ServiceType(name, found.text, find)
-    except UnknownTypeError as error:
-        raise _embedding(name, error, "service type") from None
-    return _built_service(name, found.text, tuple(embedded.items()), str(found.where))
+def _service(name: str, found: Found | None, path: SearchPath) -> ServiceType:
+    if found is None:
+        return _built_service(name, known_service(name))
+    text, embedded, where = found
+    known = ServiceType.halves(name, text)
+    _complete(name, known, embedded, path, "service type")
+    inner = tuple((each, its.text) for each, its in known.items())
+    return _built_service(name, text, inner, str(where))
 
 
 # Types are cached by their text, with their serialization code, which takes some 10 ms to generate.
@@ -201,26 +158,22 @@ def _built_service(
     return ServiceType(name, text, dict(embedded).get if embedded is not None else None, source)
 
 
-def _embedding(name: str, error: UnknownTypeError, what: str) -> UnknownTypeError:
-    return UnknownTypeError(name, f"embeds {error.type}, which {error.problem}", error.remedy, what)
+def _complete(
+    name: str, known: dict[str, Specification], embedded: Mapping[str, str], path: SearchPath, what: str
+) -> None:
+    """Add all types that a found definition embeds: those of its file, else as found by their names."""
 
+    def find(inner: str) -> str | None:
+        if inner in embedded:
+            return embedded[inner]
+        for found in _versions("msg", inner, path):
+            return found[0] if found is not None else known_text(inner)
+        return _unknown(inner, path, "msg")
 
-def _embedded(found: Found, path: SearchPath, name: str) -> str | None:
-    """The own text of a type that a found definition embeds.
-
-    Raises:
-        UnknownTypeError: No definition of the embedded type is found.
-    """
-    if name in found.embedded:
-        return found.embedded[name]
-    for each in find_messages(name, path, sourced=True):
-        return each.text
-    ours = known_text(name)
-    if ours is not None:
-        return ours
-    for each in find_messages(name, path, sourced=False):
-        return each.text
-    return _unknown(name, path, "msg")
+    try:
+        complete(known, find)
+    except UnknownTypeError as error:
+        raise UnknownTypeError(name, f"embeds {error.type}, which {error.problem}", error.remedy, what) from None
 
 
 def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
@@ -264,25 +217,10 @@ _missing: OrderedDict[tuple[str, str, SearchPath], tuple[float, RmpaError]] = Or
 _missing_lock: Final = threading.Lock()
 
 
-def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
-    """Find a message type with a sum; repeat the error of a search that failed within ``limits.TYPE_MISSING``."""
-    key = name, md5, path
-    with _missing_lock:
-        when, error = _missing.get(key, (0.0, None))
-        if error is not None and monotonic() - when >= limits.TYPE_MISSING:
-            del _missing[key]
-            error = None
-    if error is not None:
-        raise error.with_traceback(None)  # the traceback would grow with each message
-    try:
-        return message_with_sum(name, md5, path)
-    except RmpaError as problem:
-        with _missing_lock:
-            _missing[key] = monotonic(), problem
-            _missing.move_to_end(key)
-            while len(_missing) > limits.TYPES_MISSING_MAX:
-                _missing.popitem(last=False)
-        raise
+@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
+def _with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
+    # With a sum the result stays valid when the files change.
+    return _search(_message, "msg", name, md5, path)
 
 
 def type_of_header(fields: Mapping[str, str]) -> MessageType:
@@ -298,4 +236,17 @@ def type_of_header(fields: Mapping[str, str]) -> MessageType:
     definition = fields.get("message_definition", "")
     if definition or md5 == EMPTY_MD5:
         return MessageType.learn(name, definition, md5)
-    return _unless_missing(name, md5, SearchPath.read(os.environ))
+    key = name, md5, SearchPath.read(os.environ)
+    with _missing_lock:
+        when, error = _missing.get(key, (0.0, None))
+    if error is not None and monotonic() - when < limits.TYPE_MISSING:
+        raise error.with_traceback(None)  # the traceback would grow with each message
+    try:
+        return _with_sum(*key)
+    except RmpaError as problem:
+        with _missing_lock:
+            _missing[key] = monotonic(), problem
+            _missing.move_to_end(key)
+            while len(_missing) > limits.TYPES_MISSING_MAX:
+                _missing.popitem(last=False)
+        raise

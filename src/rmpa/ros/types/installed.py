@@ -7,6 +7,7 @@ Pure. A file has a goal, a result and a feedback, separated by lines ``---`` (wi
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -15,7 +16,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rmpa.core.identity import is_type_name
 from rmpa.ros import limits
@@ -25,8 +26,8 @@ from rmpa.ros.types.definitions import (
     UnknownTypeError,
     complete,
     known_text,
+    md5sum,
     packaged_texts,
-    service_md5sum,
 )
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ServiceDescription
@@ -69,17 +70,23 @@ def action_message(action: str, part: str, text: str) -> str | None:
     Returns:
         The message's own text; ``None`` if the file does not have three parts.
     """
+    pieces = _pieces(text)
+    if len(pieces) != len(_PIECES):
+        return None
+    if part in _WRAPPED:
+        return f"{_MADE}\n{_WRAPPED[part].format(action)}"
+    return _MADE + pieces[_PIECES.index(part)]
+
+
+def _pieces(text: str) -> list[str]:
+    """The parts of a definition that are separated by lines that begin with ``---``."""
     pieces = [""]
     for line in text.split("\n"):
         if line.startswith("---"):
             pieces.append("")
         else:
             pieces[-1] += line + "\n"
-    if len(pieces) != len(_PIECES):
-        return None
-    if part in _WRAPPED:
-        return f"{_MADE}\n{_WRAPPED[part].format(action)}"
-    return _MADE + pieces[_PIECES.index(part)]
+    return pieces
 
 
 # Service types: their definitions, MD5 sums, and requests and responses as Python objects.
@@ -89,9 +96,6 @@ def action_message(action: str, part: str, text: str) -> str | None:
 # of both halves and MD5 sum are equal to genmsg's to the byte. rmpa brings the
 # definitions of ROS's own packages; ``ros.types.find`` finds those of this machine's packages. Unlike publishers,
 # servers do not send their definitions.
-
-
-_MARK: Final = "---"
 
 
 class ServiceType:
@@ -117,41 +121,33 @@ class ServiceType:
     ) -> None:
         self.name = name
         self.source = source
-        text = text if text is not None else known_service(name)
-        halves = _halves(text)
-        parts = (f"{name}Request", f"{name}Response")
-        known = {part: Specification.parse(part, half) for part, half in zip(parts, halves, strict=True)}
+        known = self.halves(name, text if text is not None else known_service(name))
+        request, response = known
         complete(known, find if find is not None else known_text)
-        self.request, self.response = (MessageType(part, known) for part in parts)
-        self.md5sum = service_md5sum(*parts, known)
+        self.request, self.response = MessageType(request, known), MessageType(response, known)
+        self.md5sum = md5sum(request, known, response)
+
+    @staticmethod
+    def halves(name: str, text: str) -> dict[str, Specification]:
+        """The request and the response, as genmsg splits them: each line that begins with ``---`` is left out.
+
+        All is the request where there is no such line.
+
+        Raises:
+            DefinitionError: One is malformed.
+        """
+        request, *responses = _pieces(text)
+        halves = {f"{name}Request": request, f"{name}Response": "".join(responses)}
+        return {part: Specification.parse(part, half) for part, half in halves.items()}
 
     def describe(self) -> ServiceDescription:
         """The description for a server's header."""
         return ServiceDescription(self.name, self.md5sum, self.request.name, self.response.name)
 
 
-def _halves(text: str) -> tuple[str, str]:
-    """The texts of request and response, as genmsg splits them: each line that begins with ``---`` is left out.
-
-    All is the request where there is no such line.
-    """
-    halves: tuple[list[str], list[str]] = [], []
-    half = halves[0]
-    for line in text.split("\n"):
-        if line.startswith(_MARK):
-            half = halves[1]
-        else:
-            half.append(line + "\n")
-    return "".join(halves[0]), "".join(halves[1])
-
-
-def _texts() -> Mapping[str, str]:
-    return packaged_texts("service_definitions.json")
-
-
 def known_services() -> tuple[str, ...]:
     """The names of all service types that rmpa brings."""
-    return tuple(_texts())
+    return tuple(packaged_texts("service_definitions.json"))
 
 
 def known_service(name: str) -> str:
@@ -160,14 +156,11 @@ def known_service(name: str) -> str:
     Raises:
         DefinitionError: The type is not one that rmpa brings.
     """
-    if name not in _texts():
-        raise UnknownTypeError(
-            name,
-            "is not a service that comes with rmpa",
-            "rmpa.ros.types.find finds those of this machine's packages",
-            "service type",
-        )
-    return _texts()[name]
+    text = packaged_texts("service_definitions.json").get(name)
+    if text is None:
+        remedy = "rmpa.ros.types.find finds those of this machine's packages"
+        raise UnknownTypeError(name, "is not a service that comes with rmpa", remedy, "service type")
+    return text
 
 
 # Finds the ROS packages below a folder as rospack does (wiki.ros.org/rospack).
@@ -185,28 +178,56 @@ _COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 _NAME: Final = re.compile(r"<name(?:\s[^>]*)?>\s*([^<\s]+)\s*</name>")
 
 
-@dataclass(frozen=True, slots=True)
-class Packages:
-    """The packages with definitions below a folder.
-
-    Args:
-        folders: The folders of each package, by its name.
-        whole: Whether the search was complete; ``False`` if a limit ended it.
-    """
-
-    folders: Mapping[str, tuple[Path, ...]]
-    whole: bool
-
-
 @functools.lru_cache(maxsize=64)
-def packages_below(root: str) -> Packages:
-    """Search a folder for packages; ``packages_below.cache_clear()`` makes the next call search again."""
-    search = _Search()
-    whole = search.run(Path(root))
+def packages_below(root: str) -> tuple[dict[str, tuple[Path, ...]], bool]:
+    """Search a folder for packages; ``packages_below.cache_clear()`` makes the next call search again.
+
+    Returns:
+        The folders of each package by its name, first those with a manifest; and whether the search was complete:
+        ``False`` if a limit ended it.
+    """
+    packages: list[tuple[str, Path]] = []
+    loose: list[tuple[str, Path]] = []  # folders with definitions but without a manifest, no packages to ROS
+    seen: set[tuple[int, int]] = set()
+    waiting = deque([(Path(root), 0)])
+    room, whole = limits.PACKAGE_ENTRIES_MAX, True
+    for _ in range(limits.PACKAGE_FOLDERS_MAX):
+        if not waiting or room <= 0:
+            break
+        folder, depth = waiting.popleft()
+        files, inner = _entries_of(folder, seen, room)
+        room -= len(files) + len(inner)
+        if "CATKIN_IGNORE" in files:
+            continue
+        manifest = "package.xml" in files or "manifest.xml" in files
+        if not DEFINITIONS.isdisjoint(inner):
+            name = _declared_name(folder) if "package.xml" in files else folder.name
+            (packages if manifest else loose).append((name, folder))
+        if manifest or "rospack_nosubdirs" in files:
+            continue
+        below = sorted(name for name in inner - DEFINITIONS if not name.startswith("."))
+        if depth < limits.PACKAGE_DEPTH_MAX:
+            waiting += [(folder / name, depth + 1) for name in below]
+        else:
+            whole = whole and not below
     folders: dict[str, tuple[Path, ...]] = {}
-    for name, folder in (*search.packages, *search.loose):
+    for name, folder in (*packages, *loose):
         folders[name] = (*folders.get(name, ()), folder)
-    return Packages(folders, whole)
+    return folders, whole and not waiting
+
+
+def _entries_of(folder: Path, seen: set[tuple[int, int]], most: int) -> tuple[set[str], set[str]]:
+    """The names of a folder's files and folders; empty if it was searched before or cannot be read."""
+    files: set[str] = set()
+    folders: set[str] = set()
+    with contextlib.suppress(OSError):
+        about = folder.stat()
+        if (about.st_dev, about.st_ino) not in seen:
+            seen.add((about.st_dev, about.st_ino))
+            with os.scandir(folder) as entries:
+                for entry in islice(entries, most):
+                    (folders if _is_folder(entry) else files).add(entry.name)
+    return files, folders
 
 
 def package_folders(package: str, root: str) -> Iterator[Path]:
@@ -215,7 +236,7 @@ def package_folders(package: str, root: str) -> Iterator[Path]:
     is_direct = _is_package(direct, package)
     if is_direct:
         yield direct
-    for folder in packages_below(root).folders.get(package, ()):
+    for folder in packages_below(root)[0].get(package, ()):
         if not is_direct or folder != direct:
             yield folder
 
@@ -229,64 +250,6 @@ def _is_package(folder: Path, package: str) -> bool:
         return (folder / "manifest.xml").exists()
     except OSError:
         return False
-
-
-class _Search:
-    """One search, breadth first."""
-
-    def __init__(self) -> None:
-        self.packages: list[tuple[str, Path]] = []
-        self.loose: list[tuple[str, Path]] = []
-        """Folders with definitions but without a manifest, which ROS does not count as packages."""
-        self._seen: set[tuple[int, int]] = set()
-        self._entries = 0
-
-    def run(self, root: Path) -> bool:
-        """Search; return ``False`` if a limit ended the search."""
-        waiting = deque([(root, 0)])
-        whole = True
-        for _ in range(limits.PACKAGE_FOLDERS_MAX):
-            if not waiting or self._entries >= limits.PACKAGE_ENTRIES_MAX:
-                break
-            folder, depth = waiting.popleft()
-            below = self._look(folder)
-            if depth < limits.PACKAGE_DEPTH_MAX:
-                waiting += [(folder / name, depth + 1) for name in below]
-            else:
-                whole = whole and not below
-        return whole and not waiting
-
-    def _look(self, folder: Path) -> list[str]:
-        """Add a folder if it has definitions; return the names of the folders in it to search next."""
-        files, inner = self._entries_of(folder)
-        if "CATKIN_IGNORE" in files:
-            return []
-        manifest = "package.xml" in files or "manifest.xml" in files
-        if not DEFINITIONS.isdisjoint(inner):
-            name = _declared_name(folder) if "package.xml" in files else folder.name
-            (self.packages if manifest else self.loose).append((name, folder))
-        if manifest or "rospack_nosubdirs" in files:
-            return []
-        return sorted(name for name in inner - DEFINITIONS if not name.startswith("."))
-
-    def _entries_of(self, folder: Path) -> tuple[set[str], set[str]]:
-        """The names of a folder's files and folders; empty if it was searched before or cannot be read."""
-        files: set[str] = set()
-        folders: set[str] = set()
-        try:
-            about = folder.stat()
-            if (about.st_dev, about.st_ino) in self._seen:
-                return files, folders
-            self._seen.add((about.st_dev, about.st_ino))
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    self._entries += 1
-                    if self._entries >= limits.PACKAGE_ENTRIES_MAX:
-                        break
-                    (folders if _is_folder(entry) else files).add(entry.name)
-        except OSError:
-            pass
-        return files, folders
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
@@ -383,7 +346,7 @@ class SearchPath:
             ("CMAKE_PREFIX_PATH", self.prefixes),
             ("PYTHONPATH", self.python),
         )
-        cut = [root for root in self.packages if not packages_below(root).whole]
+        cut = [root for root in self.packages if not packages_below(root)[1]]
         shown = [f"{name} ({_shown(entries)})" for name, entries in variables]
         note = f"; of {_shown(cut)} only the first {limits.PACKAGE_FOLDERS_MAX} folders" if cut else ""
         return ", ".join([*shown, *self.system]) + note
@@ -395,61 +358,46 @@ def _shown(entries: tuple[str, ...] | list[str]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown or "not set"
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """One definition.
+# A definition: a message's own text, or a service's request, a line ``---`` and its response; the own texts of
+# embedded types, as far as the file has them; and the file.
+Found: TypeAlias = "tuple[str, Mapping[str, str], Path]"
+
+
+def find_definitions(kind: str, name: str, path: SearchPath, *, sourced: bool) -> Iterator[Found]:
+    """The definitions of a type, best first.
 
     Args:
-        text: A message's own text; or a service's request, a line ``---`` and its response.
-        embedded: The own texts of embedded types, as far as the file has them.
-        where: The file.
+        kind: ``msg`` or ``srv``.
+        name: ``package/Name``.
+        path: The places to search.
+        sourced: Whether to search the workspaces, or the system.
     """
-
-    text: str
-    embedded: Mapping[str, str]
-    where: Path
-
-
-def find_messages(name: str, path: SearchPath, *, sourced: bool) -> Iterator[Found]:
-    """The definitions of a message type, best first: of the workspaces (``sourced``) or of the system."""
     if not is_type_name(name):
         return
     package, _, base = name.partition("/")
     for generated, folder in _places(package, path, sourced=sourced):
+        where = folder / kind / (f"_{base}.py" if generated else f"{base}.{kind}")
         if generated:
-            where = folder / "msg" / f"_{base}.py"
-            text = _full_texts(where).get(base)
-            if text is not None:
-                yield Found(*_split(text), where)
-        elif (text := _read(folder / "msg" / f"{base}.msg")) is not None:
-            yield Found(text, {}, folder / "msg" / f"{base}.msg")
-        else:
+            yield from _of_module(kind, base, where)
+        elif (text := _read(where)) is not None:
+            yield text, {}, where
+        elif kind == "msg":
             yield from _of_action(folder, base)
 
 
-def find_services(name: str, path: SearchPath, *, sourced: bool) -> Iterator[Found]:
-    """The definitions of a service type, as for ``find_messages``."""
-    if not is_type_name(name):
-        return
-    package, _, base = name.partition("/")
-    for generated, folder in _places(package, path, sourced=sourced):
-        if not generated:
-            where = folder / "srv" / f"{base}.srv"
-            text = _read(where)
-            if text is not None:
-                yield Found(text, {}, where)
-            continue
-        where = folder / "srv" / f"_{base}.py"
-        texts = _full_texts(where)
-        if f"{base}Request" in texts and f"{base}Response" in texts:
-            request, inner = _split(texts[f"{base}Request"])
-            response, more = _split(texts[f"{base}Response"])
-            mark = "---\n" if request.endswith("\n") or not request else "\n---\n"
-            # genmsg has added a line feed to the last line of each half.
-            yield Found(f"{request}{mark}{response}".removesuffix("\n"), inner | more, where)
+def _of_module(kind: str, base: str, where: Path) -> Iterator[Found]:
+    texts = _full_texts(where)
+    if kind == "msg" and base in texts:
+        yield *_split(texts[base]), where
+    elif kind == "srv" and f"{base}Request" in texts and f"{base}Response" in texts:
+        request, inner = _split(texts[f"{base}Request"])
+        response, more = _split(texts[f"{base}Response"])
+        mark = "---\n" if request.endswith("\n") or not request else "\n---\n"
+        # genmsg has added a line feed to the last line of each half.
+        yield f"{request}{mark}{response}".removesuffix("\n"), inner | more, where
 
 
-def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path], list[str]]:
+def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path], set[str]]:
     """The folders of a package on this machine, and the names of its definitions.
 
     Args:
@@ -459,13 +407,11 @@ def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path
     """
     folders: list[Path] = []
     names: set[str] = set()
-    for sourced in (True, False):
-        for generated, folder in _places(package, path, sourced=sourced):
-            there = _names(folder / kind, ".py" if generated else f".{kind}")
-            if there:
-                folders.append(folder)
-                names |= {name.removeprefix("_") for name in there if not name.startswith("__")}
-    return folders, sorted(names)
+    for generated, folder in (*_places(package, path, sourced=True), *_places(package, path, sourced=False)):
+        if there := _names(folder / kind, ".py" if generated else f".{kind}"):
+            folders.append(folder)
+            names |= {name.removeprefix("_") for name in there if not name.startswith("__")}
+    return folders, names
 
 
 def _places(package: str, path: SearchPath, *, sourced: bool) -> Iterator[tuple[bool, Path]]:
@@ -497,7 +443,7 @@ def _of_action(folder: Path, base: str) -> Iterator[Found]:
         text = _read(where)
         message = action_message(action, part, text) if text is not None else None
         if message is not None:
-            yield Found(message, {}, where)
+            yield message, {}, where
 
 
 def _split(full_text: str) -> tuple[str, dict[str, str]]:

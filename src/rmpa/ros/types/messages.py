@@ -69,9 +69,10 @@ class MessageType:
         self.name = name
         self.source = source
         self._learnt = specifications is not None
-        self._specifications = specifications if specifications is not None else known_specifications(name)
-        self.md5sum = md5sum(name, self._specifications)
-        self.definition = full_text(name, self._specifications)
+        self.specifications = specifications if specifications is not None else known_specifications(name)
+        """The type and all that it embeds, by name."""
+        self.md5sum = md5sum(name, self.specifications)
+        self.definition = full_text(name, self.specifications)
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
@@ -98,12 +99,7 @@ class MessageType:
     @property
     def fields(self) -> tuple[Field, ...]:
         """The fields, in order."""
-        return self._specifications[self.name].fields
-
-    @property
-    def specifications(self) -> Mapping[str, Specification]:
-        """The type and all that it embeds, by name."""
-        return self._specifications
+        return self.specifications[self.name].fields
 
     def serialize(self, message: object) -> bytes:
         """Serialize a message object, without a length in front.
@@ -114,7 +110,7 @@ class MessageType:
         try:
             return bytes(self._store.serialize_ros1(message, _inner(self.name)))
         except Exception:  # noqa: BLE001 - rosbags does not check values: the exception depends on the field
-            checked = self.make(self._given(self.name, message, ""))
+            checked = self._make(self.name, self._attributes(self.name, message, ""), "")
             return bytes(self._store.serialize_ros1(checked, _inner(self.name)))
 
     def deserialize(self, raw: Buffer) -> Any:
@@ -166,16 +162,16 @@ class MessageType:
     def _store(self) -> Typestore:
         # rosbags has most of the types that rmpa brings, but not TFMessage.
         if self._learnt or _inner(self.name) not in _known_store().types:
-            return _learnt_store(self.name, self._specifications)
+            return _learnt_store(self.name, self.specifications)
         return _known_store()
 
-    def _class(self, name: str) -> Any:
-        return self._store.types[_inner(name)]
-
-    def _make(self, name: str, values: Plain | Mapping[str, object], path: str) -> object:
-        fields = self._specifications[name].fields
-        if values is None:
-            given: Mapping[str, object] = {}
+    def _make(self, name: str, values: Any, path: str) -> object:
+        """A message object from plain values, or from one whose values its program set: each value is checked."""
+        fields = self.specifications[name].fields
+        if getattr(values, "__msgtype__", None) == _inner(name):
+            given: Mapping[str, object] = self._attributes(name, values, path)
+        elif values is None:
+            given = {}
         elif isinstance(values, Mapping):
             given = values
         elif isinstance(values, list):
@@ -189,72 +185,49 @@ class MessageType:
         if given and (unknown := given.keys() - {field.name for field in fields}):
             raise MessageError(f"{path or name} has no field {min(map(_short, unknown))}; it has {_names(fields)}")
         within = f"{path}." if path else ""
-        made = {
+        made: dict[str, Any] = {
             _python_name(field.name): self._value(field, given.get(field.name), within + field.name)
             for field in fields
         }
         if not fields:
             made["structure_needs_at_least_one_member"] = 0
-        return self._class(name)(**made)
+        return self._store.types[_inner(name)](**made)
 
-    def _given(self, name: str, message: object, path: str) -> dict[str, object]:
+    def _attributes(self, name: str, message: object, path: str) -> dict[str, object]:
         """The values of a message object, as its program set them: lists in place of arrays, mappings in it."""
-        values: dict[str, object] = {}
-        for field in self._specifications[name].fields:
-            try:
-                value = getattr(message, _python_name(field.name))
-            except AttributeError:
-                raise MessageError(f"{path or name} is a message of {name}, not {_short(message)}") from None
-            within = f"{path}.{field.name}" if path else field.name
-            if field.primitive and field.type not in _TIMES:
-                values[field.name] = value
-            elif field.array and isinstance(value, list | tuple):
-                values[field.name] = [self._given_one(field, item, within) for item in value]
-            else:
-                values[field.name] = self._given_one(field, value, within)
-        return values
-
-    def _given_one(self, field: Field, value: Any, path: str) -> object:
-        if not hasattr(value, "__msgtype__"):
-            return value
-        if field.type in _TIMES:
-            return {"secs": value.sec, "nsecs": value.nanosec}
-        return self._given(field.type, value, path)
+        try:
+            return {
+                field.name: getattr(message, _python_name(field.name)) for field in self.specifications[name].fields
+            }
+        except AttributeError:
+            raise MessageError(f"{path or name} is a message of {name}, not {_short(message)}") from None
 
     def _value(self, field: Field, value: Any, path: str) -> object:
         if not field.array:
             return self._scalar(field, value, path)
         if isinstance(value, str) and field.type in ("uint8", "char"):
             value = list(_text(value, path).encode())
-        if not isinstance(value, list | str | None):
-            value = _sequence(field, value, path)
-            if not isinstance(value, list):
-                return value
-        items = value if value is not None else []
+        items = [] if value is None else value
+        if not isinstance(items, list | str):
+            items = _sequence(field, value, path)
+            if not isinstance(items, list):
+                return items
         if not isinstance(items, list):
             raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
-        if not items and (not field.size or value is None) and field.type in _NUMBERS:
-            return _zeros(field.type, field.size or 0)
-        if field.size and not items:
-            items = [None] * field.size
+        is_numbers = field.primitive and field.type not in ("string", *_TIMES)
+        if not items and is_numbers:
+            return _numbers(field, None, field.size or 0)
+        items = items or [None] * (field.size or 0)
         if field.size is not None and len(items) != field.size:
             raise MessageError(f"{path} has {field.size} elements, not {len(items)}")
         made = [self._scalar(field, item, path) for item in items]
-        if field.type in ("string", *_TIMES) or not field.primitive:
-            return made
-        import numpy as np  # noqa: PLC0415 - see the module's docstring
-
-        return np.array(made, dtype=_DTYPES.get(field.type, field.type))
+        return _numbers(field, made, len(made)) if is_numbers else made
 
     def _scalar(self, field: Field, value: Any, path: str) -> object:
         if field.type in _TIMES:
-            if getattr(value, "__msgtype__", None) == _TIMES[field.type]:
-                return value
             secs, nsecs = _time(field.type, value, path)
             return self._store.types[_TIMES[field.type]](sec=secs, nanosec=nsecs)
         if not field.primitive:
-            if getattr(value, "__msgtype__", None) == _inner(field.type):
-                return value
             return self._make(field.type, value, path)
         if not isinstance(value, bool | int | float | str | list | dict | None) and hasattr(value, "item"):
             value = value.item()  # numpy's
@@ -262,7 +235,7 @@ class MessageType:
 
     def _plain(self, name: str, message: object) -> dict[str, Plain]:
         plain: dict[str, Plain] = {}
-        for field in self._specifications[name].fields:
+        for field in self.specifications[name].fields:
             value = getattr(message, _python_name(field.name))
             if not field.array:
                 plain[field.name] = self._plain_scalar(field, value)
@@ -310,7 +283,6 @@ _RANGES: Final = {
     for bits in (8, 16, 32, 64)
 } | {"byte": (-128, 127), "char": (0, 255), "time": (0, (1 << 32) - 1), "duration": (-(1 << 31), (1 << 31) - 1)}
 """The integers of each type; of times the seconds, and the nanoseconds likewise."""
-_NUMBERS: Final = _FLOATS | _RANGES.keys() - _TIMES.keys()
 _FLOAT32: Final = struct.Struct("<f").pack
 
 
@@ -395,10 +367,12 @@ def _sequence(field: Field, value: Any, path: str) -> Any:
     return made
 
 
-def _zeros(kind: str, count: int) -> object:
+def _numbers(field: Field, values: list[object] | None, count: int) -> object:
+    """An array of the field's numbers; zeros without values."""
     import numpy as np  # noqa: PLC0415 - see the module's docstring
 
-    return np.zeros(count, dtype=_DTYPES.get(kind, kind))
+    dtype = _DTYPES.get(field.type, field.type)
+    return np.zeros(count, dtype) if values is None else np.array(values, dtype)
 
 
 def _short(value: object) -> str:
@@ -409,12 +383,14 @@ def _short(value: object) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def _time(kind: str, value: Plain, path: str) -> tuple[int, int]:
+def _time(kind: str, value: Any, path: str) -> tuple[int, int]:
     secs: Any = value
     nsecs: Any = 0
     if value is None:
         return 0, 0
-    if isinstance(value, Mapping) and value.keys() <= {"secs", "nsecs", "sec", "nanosec"}:
+    if getattr(value, "__msgtype__", None) == _TIMES[kind]:
+        secs, nsecs = value.sec, value.nanosec
+    elif isinstance(value, Mapping) and value.keys() <= {"secs", "nsecs", "sec", "nanosec"}:
         secs, nsecs = value.get("secs", value.get("sec", 0)), value.get("nsecs", value.get("nanosec", 0))
     elif isinstance(value, float) and math.isfinite(value * _NANO):
         secs, nsecs = divmod(round(value * _NANO), _NANO)
