@@ -422,6 +422,7 @@ def _relayed(route: RouteInfo) -> str:
 _log = logging.getLogger(__name__)
 
 TOPIC: Final = "/diagnostics"
+_ARRAY: Final = known_description(ARRAY_TYPE)
 """The topic of REP 107."""
 
 
@@ -446,7 +447,7 @@ class Diagnostics(PublicationEvents):
         self._publication = Publication(
             TOPIC,
             bridge.node.name,
-            known_description(ARRAY_TYPE),
+            _ARRAY,
             queue_messages=limits.DIAGNOSTICS_QUEUE,
             events=self,
         )

@@ -10,13 +10,12 @@ from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core import liveness as identify
-from rmpa.ros.core.embedded import AGGREGATED, LOG_TYPE, RosCore
+from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
 from rmpa.ros.http.rpc import XmlRpcServer, call, call_api
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
-from rmpa.ros.types.definitions import known_description
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 DEADLINE: Final = 10.0
 STRING: Final = "std_msgs/String"
-LOG: Final = known_description(LOG_TYPE)
 
 
 class Slave:
@@ -242,7 +240,7 @@ async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> Non
 async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     node = SlaveNode("/like_roscpp", "127.0.0.1", "http://127.0.0.1:11311/")
     await node.start()
-    node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG_TYPE, LOG.md5sum, "")))
+    node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG.type, LOG.md5sum, "")))
 
     async def no_get_name(uri: str, method: str, *params: XmlRpcValue, use: Use) -> object:
         if method == "getName":
@@ -372,7 +370,7 @@ class Logs:
         self.heard: list[bytes] = []
         self.speaker = SlaveNode("/speaker", "127.0.0.1", core.uri)
         self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
-        self.log = Publication("/rosout", "/speaker", TopicDescription(LOG_TYPE, LOG.md5sum, "any"))
+        self.log = Publication("/rosout", "/speaker", TopicDescription(LOG.type, LOG.md5sum, "any"))
         self.aggregated = Subscription(
             AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
         )
@@ -381,9 +379,9 @@ class Logs:
         await self.speaker.start()
         await self.reader.start()
         self.speaker.add_publication(self.log)
-        self.core.call("registerPublisher", "/speaker", "/rosout", LOG_TYPE, self.speaker.uri)
+        self.core.call("registerPublisher", "/speaker", "/rosout", LOG.type, self.speaker.uri)
         self.reader.add_subscription(self.aggregated)
-        uris = self.core.call("registerSubscriber", "/reader", AGGREGATED, LOG_TYPE, self.reader.uri).value
+        uris = self.core.call("registerSubscriber", "/reader", AGGREGATED, LOG.type, self.reader.uri).value
         assert isinstance(uris, list)
         self.aggregated.update([str(uri) for uri in uris])
         return self
@@ -410,7 +408,7 @@ async def test_rosout_is_aggregated_byte_for_byte() -> None:
     await core.start()
     async with Logs(core) as logs:
         published = core.call("getPublishedTopics", "/x", "").value
-        assert published == [[AGGREGATED, LOG_TYPE], ["/rosout", LOG_TYPE]]
+        assert published == [[AGGREGATED, LOG.type], ["/rosout", LOG.type]]
         await until(lambda: logs.log.subscribers == 1 and logs.aggregated.publishers == 1)
         logs.log.publish_framed(frame_message(b"not decoded"))
         await until(lambda: bool(logs.heard))
@@ -457,7 +455,7 @@ async def test_rosout_yields_its_name_and_takes_it_back(monkeypatch: pytest.Monk
     await core.start()
     async with Slave("/rosout") as other, Logs(core) as logs:
         first = rosout_at(core)
-        core.call("registerPublisher", "/rosout", AGGREGATED, LOG_TYPE, other.uri)
+        core.call("registerPublisher", "/rosout", AGGREGATED, LOG.type, other.uri)
         core.call("subscribeParam", "/rosout", other.uri, "/p")
         assert rosout_at(core) == other.uri
         await until(lambda: core._rosout is not None and not core._rosout.uri)
@@ -499,7 +497,7 @@ async def test_a_core_ends_while_another_rosout_has_the_name() -> None:
     core = RosCore(port=0)
     await core.start()
     async with Slave("/rosout") as other:
-        core.call("registerSubscriber", "/rosout", "/rosout", LOG_TYPE, other.uri)
+        core.call("registerSubscriber", "/rosout", "/rosout", LOG.type, other.uri)
         assert core.state().nodes == {"/rosout": other.uri}
         await until(lambda: core._rosout is not None and not core._rosout.uri)
         await core.close()

@@ -42,7 +42,7 @@ TOPIC: Final = "/rosout"
 AGGREGATED: Final = "/rosout_agg"
 _LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.embedded"}
 """Python's loggers, by the names that the rosout of a roscore gives to its own."""
-LOG_TYPE: Final = "rosgraph_msgs/Log"
+LOG: Final = known_description("rosgraph_msgs/Log")
 DEFAULT_PORT: Final = 11311
 CALLER_ID: Final = "/rmpa_core"
 ROS_DISTRO: Final = "noetic\n"
@@ -156,8 +156,7 @@ class Rosout:
         )
         await node.start()
         self._node = node
-        log = known_description(LOG_TYPE)
-        aggregated = Publication(AGGREGATED, NODE, log, queue_messages=limits.ROSOUT_QUEUE)
+        aggregated = Publication(AGGREGATED, NODE, LOG, queue_messages=limits.ROSOUT_QUEUE)
         node.add_publication(aggregated)
 
         def pass_on(_publisher: PublisherConnection, framed: memoryview) -> None:
@@ -169,14 +168,14 @@ class Rosout:
             on_message=pass_on,
             on_refused=_refused,
             own_uri=node.uri,
-            type_name=log.type,
-            md5sum=log.md5sum,
-            definition=log.definition,
+            type_name=LOG.type,
+            md5sum=LOG.md5sum,
+            definition=LOG.definition,
             number=node.next_number,
         )
         node.add_subscription(subscription)
-        core.call("registerPublisher", NODE, AGGREGATED, LOG_TYPE, node.uri)
-        core.call("registerSubscriber", NODE, TOPIC, LOG_TYPE, node.uri)
+        core.call("registerPublisher", NODE, AGGREGATED, LOG.type, node.uri)
+        core.call("registerSubscriber", NODE, TOPIC, LOG.type, node.uri)
         subscription.update(list(core.publishers(TOPIC).values()))
         self._loggers = LoggerServices(node, core.call, _LOGGERS)
         self._loggers.start()

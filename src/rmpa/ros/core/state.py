@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Name, NodeRecord  # noqa: TC001 - msgspec reads the annotations
-from rmpa.ros.wire.xmlrpc import RosFault, brief, legal_text
+from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import yielding_to_data
 
@@ -100,31 +99,21 @@ def parse(data: bytes) -> StoredState:
     """
     try:
         state = msgspec.msgpack.decode(data, type=StoredState, ext_hook=_unpacked_ext)
-    except (msgspec.MsgspecError, TypeError, RecursionError) as error:
+        serialize_response([msgspec.to_builtins(state.nodes), state.params])
+    except (msgspec.MsgspecError, TypeError, RecursionError, RmpaError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
-    _check(msgspec.to_builtins(state.nodes))
-    _check(state.params)
+    if _depth(state.params) > limits.CORE_STATE_DEPTH_MAX:
+        raise ValueError("its parameters are nested deeper than a parameter can be")
     return state
 
 
-def _check(value: Any, depth: int = 0) -> None:
-    """Raise ``ValueError`` for what ``setParam`` could not have set."""
+def _depth(value: Any) -> int:
     match value:
-        case bool() | float() | bytes() | datetime():
-            return
-        case str() if legal_text(value) == value:
-            return
-        case int() if INT32_MIN <= value <= INT32_MAX:
-            return
-        case dict() if depth < limits.CORE_STATE_DEPTH_MAX and all(isinstance(name, str) for name in value):
-            _check("".join(value))
-            for part in value.values():
-                _check(part, depth + 1)
-        case list() if depth < limits.CORE_STATE_DEPTH_MAX:
-            for part in value:
-                _check(part, depth + 1)
-        case _:
-            raise ValueError(f"{brief(value)} is nothing that a parameter can be")
+        case dict():
+            return 1 + max(map(_depth, value.values()), default=0)
+        case list():
+            return 1 + max(map(_depth, value), default=0)
+    return 0
 
 
 class CoreState:
@@ -154,7 +143,7 @@ class CoreState:
         self._temporary = temporary
         self._carry_out = carry_out
         self._boot = ""
-        # What was restored: the nodes of the file with their slave APIs, each moved once its address has answered.
+        # The nodes of the file and their slave APIs, until their addresses have answered.
         self._asked: dict[str, str] = {}
         self._up = self._gone = self._params = 0
         self._dropped = ""
@@ -272,40 +261,40 @@ class CoreState:
 
     # --- what people see --------------------------------------------------------------------------------------
 
-    @property
-    def problem(self) -> str:
+    def restored(self) -> str:
+        """What became of the file's content at the start; empty if there was none."""
+        parts = [self._dropped]
+        if nodes := self._up + self._gone + len(self._asked):
+            parts.append(f"{self._up} of {nodes} nodes of the run before are taken up")
+            if self._gone:
+                parts[-1] += f", {self._gone} {'is' if self._gone == 1 else 'are'} gone"
+            if self._asked:
+                parts[-1] += f", {_first(list(self._asked))} did not answer"
+        if self._params:
+            some = "1 parameter of it was" if self._params == 1 else f"{self._params} parameters of it were"
+            parts.append(f"{some} taken up")
+        return "; ".join(filter(None, parts))
+
+    def _problem_now(self) -> str:
         """Why nothing is stored at present, or empty."""
         late = asyncio.get_running_loop().time() - self._began > limits.CORE_STATE_WRITE
         return f"{self.path}: the disk does not answer" if late else self._problem
 
-    def restored(self) -> str:
-        """What became of the file's content at the start; empty if there was none."""
-        parts = [self._dropped] if self._dropped else []
-        if nodes := self._up + self._gone + len(self._asked):
-            text = f"{self._up} of {nodes} nodes of the run before are taken up"
-            if self._gone:
-                text += f", {self._gone} {'is' if self._gone == 1 else 'are'} gone"
-            if self._asked:
-                text += f", {_first(list(self._asked))} did not answer"
-            parts.append(text)
-        if self._params:
-            some = "1 parameter of it was" if self._params == 1 else f"{self._params} parameters of it were"
-            parts.append(f"{some} taken up")
-        return "; ".join(parts)
-
     def summary(self) -> str:
         """The file and what was restored from it, for people."""
-        kept = f"kept in {self.path}" if not self.problem else "nothing is kept"
+        kept = "nothing is kept" if self._problem_now() else f"kept in {self.path}"
         return "; ".join(filter(None, (kept, self.restored())))
 
     def notes(self) -> tuple[str, ...]:
         """Problems that the user should know of."""
-        notes = [f"nothing of the core is kept over a restart: {self.problem}"] if self.problem else []
-        notes += [
-            f"{node} at {api}, of the run before, does not answer and is not shown: start it again"
-            for node, api in list(self._asked.items())[:_SHOWN]
-            if not self._asking and self._api.registrations.node_api(node) is None
-        ]
+        problem = self._problem_now()
+        notes = [f"nothing of the core is kept over a restart: {problem}"] if problem else []
+        if not self._asking:
+            notes += [
+                f"{node} at {api}, of the run before, does not answer and is not shown: start it again"
+                for node, api in list(self._asked.items())[:_SHOWN]
+                if self._api.registrations.node_api(node) is None
+            ]
         return tuple(notes)
 
     # --- writing ----------------------------------------------------------------------------------------------
