@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Reliability
+from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
@@ -81,6 +82,9 @@ class _Subscribers(Any):  # type: ignore[misc] # a double of what is much larger
         was, self.got = self.got, -1
         return int(was >= 0)
 
+    def mark(self, kind: FrameKind, route: int, sequence: int) -> None:
+        """Of the link: an acknowledgement."""
+
     def _check(self, size: int, head: bytes) -> None:
         if len(head) < 4 or int.from_bytes(head, "little") != size - 4:
             raise AssertionError("what a subscriber reads is not one message")
@@ -93,11 +97,10 @@ def fuzz(data: bytes) -> None:
 
 def _fuzz(data: bytes) -> None:
     subscribers = _Subscribers()
-    acknowledged: list[int] = []
     reliable = data[:1] == b"R"
     contract = Contract(reliability=Reliability.RELIABLE if reliable else Reliability.BEST_EFFORT)
-    flow = ImportFlow(subscribers, contract, LinkTime(), on_ack=acknowledged.append)
-    flow.begin_epoch(int(reliable), 1)
+    flow = ImportFlow(subscribers, contract, LinkTime(), Counters(), lambda _: None, lambda: None)
+    flow.bind(subscribers, 1, int(reliable), 1)
 
     def on_event(event: ConnectionEvent) -> None:
         if isinstance(event, HelloReceived):

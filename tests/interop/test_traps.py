@@ -19,8 +19,9 @@ from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
-from rmpa.bridge.topics.peer_topics import PeerTopics
+from rmpa.bridge.topics.peer_topics import PeerTopics, TopicEvents
 from rmpa.core.contract import Contract
+from rmpa.core.counters import Counters
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
+    from rmpa.bridge.context import Shared
     from rmpa.mesh.io.link import PeerLink
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
@@ -219,13 +221,9 @@ async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> 
     """A peer's side with one source, and a listener of that source that is connected to its proxy."""
     proxies = PeerProxies("/rmpa/peer", ProxyNodes(core))
     closing.push_async_callback(proxies.close)
-    inbound = PeerTopics(
-        core,
-        PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies),
-        on_demand=lambda _s, _w: None,
-        on_mismatch=lambda _s, _c, _t: None,
-        on_occurred=lambda _s, _o: None,
-    )
+    shared = SimpleNamespace(core=core, counters=Counters())
+    session = PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies)
+    inbound = PeerTopics(cast("Shared", shared), TopicEvents(), session, {})
     closing.callback(inbound.close)
     inbound.publish(Publish(1, SOURCE, BYTES))
     await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
@@ -236,7 +234,7 @@ def describe(inbound: PeerTopics, route: int, *, latching: bool = False) -> None
     """A route of the source is open."""
     kind = MessageType(BYTES)
     about = About(BYTES, kind.md5sum, kind.definition, latching)
-    inbound.describe(Describe(1, SOURCE, route, about, Contract()), lambda _sequence: None)
+    inbound.describe(Describe(1, SOURCE, route, about, Contract()))
 
 
 async def heard(

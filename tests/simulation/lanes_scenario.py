@@ -91,12 +91,12 @@ class LanesScenario(MeshScenario):
         if source.contract.reliability is Reliability.RELIABLE:
             self.breaks += inbox.breaks
             assert not (self.calm and inbox.breaks), who
-            assert not inbox.flow.lost, f"{who}: {inbox.flow.lost} lost"
+            assert not inbox.flow.counts["lost"], f"{who}: {inbox.flow.counts['lost']} lost"
             assert not missing, f"{who}: {len(missing)} of {len(wanted)} are missing: {missing[:5]}"
         elif self.calm:
             link = source.mesh.link(peer.identity.guid)
             assert link is not None
             left_out = link.expired + link.dropped
-            lost = inbox.flow.lost
+            lost, stale = inbox.flow.counts["lost"], inbox.flow.counts["stale"]
             assert left_out <= lost <= left_out + source.aborted, f"{who}: {lost} lost, {left_out} left out"
-            assert len(missing) == left_out + inbox.flow.stale, f"{who}: {len(missing)} are missing: {missing[:5]}"
+            assert len(missing) == left_out + stale, f"{who}: {len(missing)} are missing: {missing[:5]}"

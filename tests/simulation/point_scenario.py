@@ -118,7 +118,7 @@ class PointScenario(LanesScenario):
         if not self.trouble or (reliable and self.trouble in ("break", "swallow", "part")):
             assert earlier == sender.published[:1], "it was lost, or came twice"
             assert inbox.flow is not None
-            assert not inbox.flow.lost
+            assert not inbox.flow.counts["lost"]
         else:
             assert earlier in ([], sender.published[:1])
         for peer in self.peers:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Priority, Reliability
+from rmpa.core.counters import Counters
 from rmpa.mesh.frames import FrameKind
 from tests.simulation.mesh_peer import MeshPeer
 
@@ -274,13 +275,11 @@ class TrafficPeer(MeshPeer):
         inbox.contract = Contract(
             reliability=Reliability(said["reliability"]), priority=Priority(said["priority"]), depth=1000
         )
-
-        def acknowledge(sequence: int) -> None:
-            link.mark(FrameKind.ACK, 1, sequence)
-
-        if inbox.flow is not None:
-            inbox.flow.rebind(acknowledge)
-        else:
-            inbox.flow = ImportFlow(cast("Any", inbox), inbox.contract, self.times[link], on_ack=acknowledge)
-        inbox.breaks += not inbox.flow.begin_epoch(said["epoch"], said["first"])
+        if inbox.flow is None:
+            output = cast("Any", inbox)
+            inbox.flow = ImportFlow(
+                output, inbox.contract, self.times[link], Counters(), lambda _: None, lambda: None
+            )
+        known = inbox.flow.position is not None
+        inbox.breaks += not inbox.flow.bind(link, 1, said["epoch"], said["first"]) and known
         self.flows[link, 1] = link.routes[1] = inbox.flow

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from rmpa.bridge.data.export import ReliableRouteSender
-from rmpa.bridge.data.quality import PeerClockHistory, shown_seconds
+from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_seconds
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
-    from rmpa.bridge.data.route import ReceptionHistory
     from rmpa.bridge.direct.conditions import Interruption
     from rmpa.bridge.direct.paths import Path
     from rmpa.bridge.sessions import PeerSession
@@ -338,9 +337,8 @@ class TopicsSection:
 
     def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClockHistory) -> RouteInfo:
         topics = self._bridge.topics.of(at)
-        flow = topics.flow(source, entry.route)
+        flow, watch = topics.flow(source), topics.watch(source)
         publication = topics.publication(source)
-        past = topics.past(source) if flow is None else None
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
         problem = at.proxies.problems.get(source.node, "")
@@ -355,12 +353,12 @@ class TopicsSection:
             type=entry.type,
             md5=about.md5 if about is not None else "",
             dropped=publication.dropped if publication is not None else 0,
-            lost=past.lost if past is not None else 0,
+            lost=watch.counts[QosEventKind.MESSAGES_LOST] if watch is not None else 0,
             latched=latched,
             contract=_contract(entry.contract or self._bridge.context.contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
             limit="nodes" if entry.crowded else "",
-            **_events(flow.watch if flow is not None else past, now),
+            **_events(watch, now),
         )
         own = self._bridge.context.contracts.of(entry.topic, entry.type)
         info = self._direct.inbound(info, at.peer, source, own, now)
@@ -368,11 +366,10 @@ class TopicsSection:
             return info
         return msgspec.structs.replace(
             info,
-            lost=flow.lost,
             oversized=flow.oversized,
             oversized_bytes=flow.oversized_bytes,
-            late=flow.late + flow.stale,
-            expired=flow.expired,
+            late=flow.counts["late"] + flow.counts["stale"],
+            expired=flow.counts["expired"],
             lane=flow.lane,
             **_figures(flow.quality.summary(clock, now, latching=latched)),
         )
@@ -460,7 +457,7 @@ def _figures(quality: QualitySummary) -> dict[str, Any]:
     }
 
 
-def _events(watch: QosWatch | ReceptionHistory | None, now: float) -> dict[str, Any]:
+def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:
     """The fields of a route that its contract's events give."""
     if watch is None:
         return {}

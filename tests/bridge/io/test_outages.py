@@ -42,17 +42,14 @@ def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], *
 def lost_at_receiver(side: Side) -> int:
     """What the receiving module says is lost."""
     (attached,) = side.attached
-    entry = side.bridge.topics.imports.get(attached.peer, SURE)
-    topics = side.bridge.topics.of(attached)
-    flow = topics.flow(SURE, entry.route if entry is not None else 0)
-    past = topics.past(SURE)
-    return flow.lost if flow is not None else past.lost if past is not None else 0
+    watch = side.bridge.topics.of(attached).watch(SURE)
+    return watch.counts[QosEventKind.MESSAGES_LOST] if watch is not None else 0
 
 
 def unknown_at_receiver(side: Side) -> int:
     """How often it says that nobody knows how many."""
     (attached,) = side.attached
-    flow = side.bridge.topics.of(attached).flow(SURE, 0)
+    flow = side.bridge.topics.of(attached).flow(SURE)
     return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
 
 

@@ -84,7 +84,7 @@ class Side:
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
         for attached in self.attached:
-            for published in self.bridge.topics.of(attached)._published.values():
+            for published in self.bridge.topics.of(attached).topics.values():
                 if published.publication.topic == topic and self.core.publishers(topic).get(published.node.name):
                     yield published.publication
 
@@ -301,8 +301,7 @@ class World:
             for attached in side.attached:
                 topics = bridge.topics.of(attached)
                 assert not topics.flows
-                assert not topics._latest
-                assert not topics._watches
+                assert not any(topic.flow for topic in topics.topics.values())
                 assert not any(attached.link.routes), "but route 0, which every link has"
         for end in self._ends:
             for lane in (end.express, end.bulk):

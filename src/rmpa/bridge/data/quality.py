@@ -92,15 +92,16 @@ class QosWatch:
     Args:
         contract: The contract of the route.
         now: Monotonic seconds, as in all calls.
+        past: The watch of the source's route before this one, whose events count on.
     """
 
-    def __init__(self, contract: Contract, now: float) -> None:
+    def __init__(self, contract: Contract, now: float, past: QosWatch | None = None) -> None:
         self._contract = contract
         self.last = now
         """When the last message came (before the first one: the start), monotonic seconds; set by the data path."""
-        self.counts: Counter[QosEventKind] = Counter()
+        self.counts: Counter[QosEventKind] = Counter(past.counts if past is not None else ())
         """The sum of the counts of each kind of event since the start."""
-        self.recent: deque[QosEvent] = deque(maxlen=limits.WATCH_RECENT)
+        self.recent: deque[QosEvent] = deque(past.recent if past is not None else (), maxlen=limits.WATCH_RECENT)
         """The last events, oldest first; an event that repeats is kept once, with the sum of its counts."""
         self._seen = now  # the message from which the present deadline counts
         self._missed = 0  # deadlines since then
@@ -295,6 +296,11 @@ class Quality:
     def messages(self) -> int:
         """Messages that arrived."""
         return self._before + self._slot
+
+    @property
+    def last_size(self) -> int:
+        """Bytes of the last message; 0 if none arrived."""
+        return self._sizes[self._slot - 1]
 
     def arrived(self, now: float, wall_ns: int, stamp_ns: int, size: int) -> None:
         """Store the arrival of one message.

@@ -16,7 +16,6 @@ A new route begins on the express lane, after the control frame that opens it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.contract import Priority
@@ -24,9 +23,6 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
-    from collections import Counter
-
-    from rmpa.bridge.data.quality import QosEvent, QosEventKind
     from rmpa.core.contract import Contract
 
 EXPRESS: Final = Lane.EXPRESS
@@ -131,25 +127,3 @@ class Downsampler:
         if self.due < now + self._period / 2:
             self.due = now + self._period
         return True
-
-
-# What a receiver remembers of a reliable source whose route has ended.
-
-
-@dataclass(slots=True)
-class ReceptionHistory:
-    """What is known of a reliable source from before its present route.
-
-    Args:
-        topic: Its topic in the local graph.
-        missed: Whether there were subscribers when the route ended, so that later messages are missed.
-        lost: Messages that never came.
-        counts: Events of its contract, by kind.
-        recent: The last events.
-    """
-
-    topic: str
-    missed: bool
-    lost: int
-    counts: Counter[QosEventKind]
-    recent: tuple[QosEvent, ...]

@@ -24,32 +24,31 @@ from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
-from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics
+from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
 from rmpa.bridge.topics.subscribers import MismatchReports, RemoteSubscribers
 from rmpa.core.contract import Priority
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.frames import FrameKind
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.context import Shared
     from rmpa.bridge.data.export import ExportFlow
-    from rmpa.bridge.data.quality import QosEvent
-    from rmpa.bridge.data.route import ReceptionHistory
+    from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import Message
     from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.node.publication import Publication
+    from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
 
 
-class Topics(Part):
+class Topics(Part, TopicEvents):
     """The topics of all peers, in both directions.
 
     Args:
@@ -61,12 +60,13 @@ class Topics(Part):
 
     def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
         self._shared = shared
-        core, sessions, rpc, counters = shared.core, shared.sessions, shared.rpc, shared.counters
+        core, sessions, counters = shared.core, shared.sessions, shared.counters
         context = shared.context
         policy, contracts, names, gate = context.policy, context.contracts, context.names, context.gate
         self._core = core
         self._counters = counters
-        self._peers: dict[int, PeerTopics] = {}
+        self.peers: dict[int, PeerTopics] = {}
+        """The topics of each peer in the local graph, by the number of its session."""
         self.imports = Imports(policy, shared.rng, contracts, self._position, names, context.settings.limits, gate)
         """The inbound plan."""
         self.outbound = LocalSubscriptions(
@@ -100,16 +100,16 @@ class Topics(Part):
             on_idle=self._settled,
         )
         self._act = self._driver.act
-        self._pasts: OrderedDict[str, dict[Source, ReceptionHistory]] = OrderedDict()
+        self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
         """By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``."""
         self._unchanged = UnchangedGraph()
         self._mismatches = MismatchReports(self.exports, self.imports, self._act, self._driver.warn)
-        self.losses = LossReports(self.exports, sessions, self._peers, rpc, counters, refusals)
+        self.losses = LossReports(shared, self.exports, self.peers, refusals)
         """Reports messages that do not reach their listeners."""
-        self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self._peers, refusals, gate)
+        self._subscribers = RemoteSubscribers(self.exports, self.imports, sessions, self.peers, refusals, gate)
         self.direct_exports = TopicGrants(shared, self.exports)
         """Direct connections of peers' nodes to local publishers."""
-        self.direct_imports = TopicPaths(shared, self._driver.warn, self.imports, self._peers)
+        self.direct_imports = TopicPaths(shared, self._driver.warn, self.imports, self.peers)
         """Direct connections of local nodes to peers' publishers."""
         self._local = LocalSources(core, shared.relay, lambda source: self.exports.description(source) is not None)
         self._ticker: asyncio.TimerHandle | None = None
@@ -117,7 +117,7 @@ class Topics(Part):
 
     def of(self, session: PeerSession) -> PeerTopics:
         """The topics of a peer in the local graph."""
-        return self._peers[session.peer]
+        return self.peers[session.peer]
 
     def mismatches(self, source: Source) -> tuple[str, ...]:
         """Texts about subscribers, here or at peers, whose definition does not fit a source's."""
@@ -162,7 +162,7 @@ class Topics(Part):
     def link_up(self, session: PeerSession) -> None:
         """Begins the advertisement to a peer, and waits for the peer's own; suspended routes may go on."""
         peer, identity = session.peer, session.link.identity
-        if peer in self._peers:
+        if peer in self.peers:
             _log.info("= %s is back: reliable topics go on", session.link.name)
             self.outbound.back(peer)
         else:
@@ -180,24 +180,14 @@ class Topics(Part):
         pasts = self._pasts[name] = self._pasts.pop(name, {})
         if len(self._pasts) > mesh_limits.ABSENT_PEERS_MAX:
             self._pasts.popitem(last=False)
-        self._peers[peer] = PeerTopics(
-            self._core,
-            session,
-            counters=self._counters,
-            on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
-            on_mismatch=lambda source, subscriber, text: self._mismatches.refused(peer, source, subscriber, text),
-            on_occurred=lambda source, occurred: self._occurred(session, source, occurred),
-            on_listeners=lambda source: self._listeners_changed(peer, source),
-            on_request=lambda source, caller: self.direct_imports.request(peer, source, caller),
-            pasts=pasts,
-        )
+        self.peers[peer] = PeerTopics(self._shared, self, session, pasts)
 
     def link_down(self, session: PeerSession) -> None:
         """Suspends the peer's routes; after silence its sources stay in the local graph for ``SILENT_GRACE``."""
         peer = session.peer
         self.direct_imports.link_down(session)
         self.direct_exports.link_down(session)
-        interrupted = self._peers[peer].link_down()
+        interrupted = self.peers[peer].link_down()
         if interrupted:
             # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
             self._counters.add("route.interrupted", interrupted)
@@ -235,7 +225,7 @@ class Topics(Part):
         self.direct_imports.gone(session)
         self.direct_exports.gone(session)
         self.outbound.gone(peer)
-        topics = self._peers.pop(peer)
+        topics = self.peers.pop(peer)
         self._mismatches.peer_gone(session.link.name)
         for action in self.exports.link_down(peer):
             self._act([action])
@@ -252,7 +242,7 @@ class Topics(Part):
 
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
-        for flow in self._peers[session.peer].flows.values():
+        for flow in self.peers[session.peer].flows.values():
             if flow.contract.priority is not Priority.HIGH:
                 flow.torn()
         self.outbound.lane_lost(session.peer)
@@ -299,7 +289,7 @@ class Topics(Part):
     # --- reliable routes ----------------------------------------------------------------------------------------
 
     def _position(self, peer: int, source: Source) -> tuple[int, int] | None:
-        topics = self._peers.get(peer)
+        topics = self.peers.get(peer)
         return topics.position(source) if topics is not None else None
 
     def _missed(self, source: Source, peer: int, count: int) -> None:
@@ -341,22 +331,35 @@ class Topics(Part):
         if compared:
             self._look_at_all()
 
-        for past in (past for pasts in self._pasts.values() for past in pasts.values() if past.missed):
-            past.missed = any(not is_own(node) for node in state.subscribers.get(past.topic, ()))
+        for pasts in self._pasts.values():
+            for source, (watch, missed_at) in pasts.items():
+                if all(map(is_own, state.subscribers.get(missed_at, ()))):
+                    pasts[source] = watch, ""
         self.direct_exports.reconcile(state.subscribers)
-        for topics in list(self._peers.values()):
+        for topics in list(self.peers.values()):
             yield_to_data()
             if compared:
                 topics.reconcile(state.publishers)
 
-    def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+    def demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+        """Begin or end to want a peer's source."""
         self._act(self.imports.demand(peer, source, asyncio.get_running_loop().time(), wanted=wanted))
 
-    def _occurred(self, session: PeerSession, source: Source, occurred: QosEvent) -> None:
-        text = f"{session.link.name}: {source}: {occurred.text}"
-        self._driver.warn(f"contract.{occurred.kind.value}", f"{session.peer} {source}", text)
+    def occurred(self, peer: int, source: Source, event: QosEvent) -> None:
+        """Warn of an event of a contract."""
+        text = f"{self.peers[peer].session.link.name}: {source}: {event.text}"
+        self._driver.warn(f"contract.{event.kind.value}", f"{peer} {source}", text)
 
-    def _listeners_changed(self, peer: int, source: Source) -> None:
+    def request(self, peer: int, source: Source, caller: str) -> Awaitable[RosReply | None] | None:
+        """Answer a subscriber, perhaps with the publisher's own address."""
+        return self.direct_imports.request(peer, source, caller)
+
+    def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
+        """Tell the peer of a subscriber here whose definition does not fit its source."""
+        self._mismatches.refused(peer, source, subscriber, text)
+
+    def listeners_changed(self, peer: int, source: Source) -> None:
+        """Follow the local subscribers of a peer's source."""
         self._subscribers.changed(peer, source)
         self.direct_imports.listeners_changed(peer, source)
 
@@ -403,7 +406,7 @@ class Topics(Part):
                 self._act(self.exports.given_up(action.source, action.peer))
 
     def _do_inbound(self, action: act.Incoming) -> None:
-        session, topics = self._shared.sessions.get(action.peer), self._peers.get(action.peer)
+        session, topics = self._shared.sessions.get(action.peer), self.peers.get(action.peer)
         if session is None or topics is None:
             return
         match action:
@@ -417,13 +420,11 @@ class Topics(Part):
             case act.Retract():
                 self._shared.relay.gone(action.peer, action.source)
                 self.direct_imports.hidden(action.peer, action.source)
-                topics.retract(action)
+                topics.retract(action.source)
             case act.Describe():
-                # Bound to this link: on the next one the same route id may belong to another source.
-                route, link = action.route, session.link
                 if self._ticker is None:
                     self._tick_later()
-                topics.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
+                topics.describe(action)
                 self._subscribers.changed(action.peer, action.source)
             case act.Detach():
                 topics.detach(action)
@@ -434,5 +435,5 @@ class Topics(Part):
     def _tick(self) -> None:
         """Wakes up regularly while routes are open, to distinguish a silent link from an agent that slept."""
         self._ticker = None
-        if not self._closed and any(topics.flows for topics in self._peers.values()):
+        if not self._closed and any(topics.flows for topics in self.peers.values()):
             self._tick_later()

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Describe, Detach, Publish, Retract
+from rmpa.bridge.actions import Describe, Detach, Publish
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.peer_topics import PeerTopics
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
+from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
 from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
@@ -39,6 +40,11 @@ TOLD: list[tuple[dict[str, Any], int, list[QosEventKind]]] = [
 ]
 """What a peer says when its route is open again, and what is made of it."""
 ALIVE = Contract(liveliness_lease=5.0)
+
+
+def lost(flow: ImportFlow) -> int:
+    """What the source has lost, over all its flows."""
+    return flow.watch.counts[QosEventKind.MESSAGES_LOST]
 
 
 def framed(text: str, size: int = 0) -> memoryview:
@@ -75,13 +81,18 @@ class Proxied:
         self.core = Core(cast("Any", SimpleNamespace(name="a", named=self.named.append)))
         core = cast("RosCore", self.core)
         self.proxies = PeerProxies("/rmpa/b", ProxyNodes(core))
-        self.topics = PeerTopics(
-            core,
-            PeerSession(1, cast("Any", SimpleNamespace(routes={})), self.proxies),
-            on_demand=lambda _source, wanted: self.demands.append(wanted),
-            on_mismatch=lambda _source, _who, text: pytest.fail(text),
-            on_occurred=lambda _source, occurred: self.occurred.append((self.loop.time(), occurred)),
+        link = SimpleNamespace(routes={}, mark=lambda _kind, _route, sequence: self.acks.append(sequence))
+        self.link = link
+        part = SimpleNamespace(
+            demand=lambda _peer, _source, wanted: self.demands.append(wanted),
+            mismatched=lambda _peer, _source, _who, text: pytest.fail(text),
+            occurred=lambda _peer, _source, occurred: self.occurred.append((self.loop.time(), occurred)),
+            listeners_changed=lambda _peer, _source: None,
+            request=lambda *_: None,
         )
+        shared = SimpleNamespace(core=core, counters=Counters())
+        session = PeerSession(1, cast("Any", link), self.proxies)
+        self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, {})
 
     async def publish(self) -> Publication:
         self.topics.publish(Publish(1, CMD, "a/B"))
@@ -102,7 +113,7 @@ class Proxied:
         **told: Any,
     ) -> ImportFlow:
         about = Description("a/B", MD5, definition, latching)
-        self.topics.describe(Describe(1, CMD, route, about, contract, epoch, first, **told), self.acks.append)
+        self.topics.describe(Describe(1, CMD, route, about, contract, epoch, first, **told))
         return self.topics.flows[route]
 
     def kinds(self) -> list[QosEventKind]:
@@ -134,7 +145,7 @@ def test_a_source_appears_flows_and_disappears() -> None:
         flow.message(1, 0, framed("one"))
         proxied.topics.detach(Detach(1, CMD, 1))
         assert proxied.topics.flows == {}
-        proxied.topics.retract(Retract(1, CMD))
+        proxied.topics.retract(CMD)
         await asyncio.sleep(0.01)
         assert listener.texts == ["one"]
         assert listener.closed
@@ -146,7 +157,7 @@ def test_a_source_appears_flows_and_disappears() -> None:
 def test_a_description_without_a_proxy_has_no_effect() -> None:
     async def scene(proxied: Proxied) -> None:
         about = Description("a/B", MD5, "", False)
-        proxied.topics.describe(Describe(1, CMD, 1, about, Contract()), proxied.acks.append)
+        proxied.topics.describe(Describe(1, CMD, 1, about, Contract()))
         assert proxied.topics.flows == {}
 
     play(scene)
@@ -214,12 +225,12 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
         proxied.topics.link_down()
         proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         assert proxied.topics.position(CMD) == (5, 1)
-        assert proxied.topics.flow(CMD, 1) is flow
+        assert proxied.topics.flow(CMD) is flow
         assert proxied.describe(SURE, route=4, epoch=5) is flow
         flow.message(2, 0, framed("two"))
         flow.message(5, 0, framed("five"))
         assert listener.texts == ["one", "two", "five"]
-        assert (flow.quality.messages, flow.lost) == (3, 2)
+        assert (flow.quality.messages, lost(flow)) == (3, 2)
         assert not listener.closed
         await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
         assert proxied.acks[-1] == 5
@@ -243,9 +254,9 @@ def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
     play(scene)
 
 
-@pytest.mark.parametrize(("told", "lost", "kinds"), TOLD)
+@pytest.mark.parametrize(("told", "count", "kinds"), TOLD)
 def test_what_a_sender_says_that_it_has_given_up_is_lost(
-    told: dict[str, Any], lost: int, kinds: list[QosEventKind]
+    told: dict[str, Any], count: int, kinds: list[QosEventKind]
 ) -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
@@ -254,7 +265,7 @@ def test_what_a_sender_says_that_it_has_given_up_is_lost(
         proxied.topics.link_down()
         proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         assert proxied.describe(SURE, route=2, **told) is flow
-        assert (flow.lost, proxied.kinds()) == (lost, kinds)
+        assert (lost(flow), proxied.kinds()) == (count, kinds)
 
     play(scene)
 
@@ -265,12 +276,15 @@ def test_after_a_new_numbering_messages_may_be_lost_and_the_count_goes_on() -> N
         flow = proxied.describe(SURE, epoch=5)
         flow.message(1, 0, framed("one"))
         flow.message(4, 0, framed("four"))
-        proxied.topics.retract(Retract(1, CMD))
+        proxied.topics.retract(CMD)
         await asyncio.sleep(1.0)
         await proxied.publish()
         new = proxied.describe(SURE, route=2, epoch=6)
         assert new is not flow
-        assert (new.lost, proxied.kinds()) == (2, [QosEventKind.MESSAGES_LOST, QosEventKind.LOSS_UNKNOWN])
+        assert (lost(new), proxied.kinds()) == (
+            2,
+            [QosEventKind.MESSAGES_LOST, QosEventKind.LOSS_UNKNOWN],
+        )
 
     play(scene)
 
@@ -291,7 +305,10 @@ def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(last: int) -> No
         proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
         proxied.topics.detach(Detach(1, CMD, 1, missed=True, last=last))
         new = proxied.describe(SURE, route=2, epoch=6)
-        assert (new.lost, proxied.kinds()) == (last - 1, [QosEventKind.MESSAGES_LOST] if last > 1 else [])
+        assert (lost(new), proxied.kinds()) == (
+            last - 1,
+            [QosEventKind.MESSAGES_LOST] if last > 1 else [],
+        )
 
     play(scene)
 
@@ -320,7 +337,7 @@ def test_a_changed_contract_makes_a_new_flow() -> None:
         assert new is not old
         new.message(1, 0, framed("two"))
         assert listener.texts == ["one", "two"]
-        assert (new.lost, proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
+        assert (lost(new), proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
 
     play(scene)
 
@@ -337,12 +354,12 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
             proxied.topics.detach(Detach(1, CMD, 0))
             assert publication.latched == ()
         else:
-            proxied.topics.retract(Retract(1, CMD))
+            proxied.topics.retract(CMD)
         # A source that leaves the graph while its peer is away is still missed.
-        past = proxied.topics.past(CMD)
-        assert (past is not None and past.missed) == (how == "retract")
+        _, missed_at = proxied.topics.pasts.get(CMD, (None, ""))
+        assert missed_at == ("/cmd" if how == "retract" else "")
         assert proxied.topics.position(CMD) is None
-        assert proxied.topics._latest == {}
+        assert proxied.topics.flow(CMD) is None
         await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
         assert proxied.acks == []
 
@@ -396,7 +413,7 @@ def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
         proxied.topics.detach(Detach(1, CMD, 1, keep=True))
         await asyncio.sleep(0.5)
         assert proxied.kinds() == [QosEventKind.DEADLINE_MISSED] * 2
-        proxied.topics.retract(Retract(1, CMD))
+        proxied.topics.retract(CMD)
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 2
 
@@ -415,7 +432,7 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> Non
             assert proxied.occurred == []
         else:
             proxied.topics.detach(Detach(1, CMD, 1))
-        proxied.topics.retract(Retract(1, CMD))
+        proxied.topics.retract(CMD)
         assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 1
