@@ -23,7 +23,8 @@ SEEDS: list[bytes] = [
     _UNTIL + b'{"op":"answer","number":1,"ok":true,"value":{}}\n<?xml',
     _UNTIL + b'{"op":"answer","number":1,"ok":true,"value":{"text":"a","count":1}}',
     _UNTIL + b'{"op":"answer","number":1,"ok":true,"value":5}\n\xff',
-    _UNTIL + b'{"op":"tell","what":"param.value"}',
+    _UNTIL + b'{"op":"tell","what":"names.taken"}',
+    _UNTIL + b'{"op":"ask","number":1,"what":"param.value","args":{"key":"/a","text":null}}',
     _UNTIL + b'{"op":"ask","number":1,"what":"x","args":{"a":{"b":[1,{"c":2}]},"":{"/x":null}}}',
     b"\xff" * 5,
 ]

@@ -6,20 +6,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, replaced
-from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
+from rmpa.bridge.params.rules import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
+from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-POLICY = ParamPolicy(
-    ParamSettings(
+SETTINGS = Settings(
+    params=ParamSettings(
         ("/open/**", "/followed/**"),
         ("/open/**", "/roslaunch/**", "/followed/**"),
         (FollowRule("/x", "arm", "/followed"),),
-    ),
-    TimeSettings(),
+    )
 )
 
 
@@ -39,18 +38,19 @@ POLICY = ParamPolicy(
 )
 def test_policy(key: str, get: str, put: str, follow: str) -> None:
     for why, expected in (
-        (POLICY.why_not_get(key), get),
-        (POLICY.why_not_set(key), put),
-        (POLICY.why_not_follow(key), follow),
+        (why_not_get(SETTINGS, key), get),
+        (why_not_set(SETTINGS, key), put),
+        (why_not_follow(SETTINGS, key), follow),
     ):
         assert (expected in why) if expected else why == ""
 
 
 def test_time_is_followed_where_it_is_shared() -> None:
-    assert ParamPolicy(ParamSettings(remote_get=()), TimeSettings(share=True)).why_not_follow("/use_sim_time") == ""
-    chained = ParamPolicy(ParamSettings(), TimeSettings("sim", share=True))
-    assert "time comes from sim here" in chained.why_not_follow("/use_sim_time")
-    rules = follow_rules(ParamSettings(), TimeSettings("sim"))
+    shared = Settings(params=ParamSettings(remote_get=()), time=TimeSettings(share=True))
+    assert why_not_follow(shared, "/use_sim_time") == ""
+    chained = Settings(time=TimeSettings("sim", share=True))
+    assert "time comes from sim here" in why_not_follow(chained, "/use_sim_time")
+    rules = follow_rules(chained)
     assert rules == (FollowRule("/use_sim_time", "sim", "/use_sim_time"),)
 
 

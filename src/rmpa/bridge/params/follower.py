@@ -1,28 +1,28 @@
-"""Keeps the parameters that this module follows equal to their owners' values (``[[param]]``, ``[time]``)."""
+"""The part of the bridge for parameters: answers peers, and keeps what is followed equal to its owners' values.
+
+``[[param]]`` and ``[time]`` say what is followed.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
-from rmpa.bridge.params.rules import Following, ParamPolicy, follow_rules, learn
+from rmpa.bridge.params.rules import follow_rules
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
-from rmpa.config.rules import SIM_TIME
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.config.rules import SIM_TIME, overlap
+from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from rmpa.bridge.context import Shared
-    from rmpa.bridge.params.rules import Followed
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -30,103 +30,227 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class ParamFollower:
-    """The follower's side: parameters that other modules own.
+@dataclass(slots=True)
+class Followed:
+    """One followed parameter.
 
     Args:
-        core: The local core.
-        rpc: Carries requests to the owners, and their notifications.
-        linked: Returns the sessions of the peers that are linked now.
-        rules: What is followed.
-        counters: Counts ``param.put_back``, ``param.refused``, ``param.failed`` and ``param.two_owners``.
+        rule: Its owner, the owner's key, and the key here.
+        peer: The number of the peer that it is followed from; ``None`` while its owner is not linked.
+        last: ``peer`` of the last link: another run of the owner has another number.
+        text: The owner's value as XML-RPC text; ``None`` if the owner has none, or it is unknown.
+        known: Whether the owner's value, or its absence, is known.
+        had: Whether this run of the owner has had a value. Before that, an absent value does not delete the one here.
+        due: Whether the local core is to be compared with the owner's value, and set.
+        doubted: Whether the local core has reported a change of it since the last comparison.
+        problem: Why it is not followed, or empty.
     """
 
-    def __init__(
-        self,
-        core: ParamCore,
-        rpc: PeerRpc,
-        linked: Callable[[], Iterable[PeerSession]],
-        rules: Iterable[FollowRule],
-        counters: Counters,
-    ) -> None:
-        self._core = core
-        self._rpc = rpc
-        self._linked = linked
-        self.following = Following(rules)
-        self._refusals = RefusalLog(_log, counters)
-        self._working: asyncio.Task[None] | None = None
-        self._asking: dict[int, asyncio.Task[None]] = {}
-        self.subscribed: set[str] = set()
-        """The keys of which the local core notifies the agent's node."""
+    rule: FollowRule
+    peer: int | None = None
+    last: int | None = None
+    text: str | None = None
+    known: bool = False
+    had: bool = False
+    due: bool = False
+    doubted: bool = False
+    problem: str = ""
+
+    @property
+    def state(self) -> str:
+        """The state for the user: ``followed``, ``waiting`` (for the owner) or ``refused``."""
+        if self.peer is None:
+            return "waiting"
+        return "refused" if self.problem else "followed" if self.known else "waiting"
+
+
+class Params(Part):
+    """The part of the bridge for parameters.
+
+    Args:
+        shared: The core, the peers and the rules.
+    """
+
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        self._core = ParamCore(shared.core, shared.node)
+        self.owner = ParamOwner(self._core, shared)
+        """This module's own parameters, for peers."""
+        self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
+        """The parameters that this module follows, in the order of the rules."""
+        self._refusals = RefusalLog(_log, shared.counters)
+        self._subscribed: set[str] = set()
         self._time_before: list[str | None] = []
         """What ``/use_sim_time`` was here before it was followed; empty if it was not followed."""
-        self._left: set[str] = set()
-        rpc.on_notification(transfer.VALUE, self._told, Needs((), "what `[[param]]` follows from this very peer"))
+        self._asking: dict[int, asyncio.Task[None]] = {}
+        self._working: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._run: XmlRpcValue = None
+        own = Needs((), "what `[[param]]` follows from this very peer")
+        shared.rpc.on_request(transfer.VALUE, self._told, own)
 
-    # --- events from the part ------------------------------------------------------------------------------------
+    def notes(self) -> tuple[str, ...]:
+        """Messages to the user about parameters that are not followed although their owner is linked."""
+        found = (entry for entry in self.followed if entry.problem and entry.peer is not None)
+        return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
+
+    # --- the bridge's part ---------------------------------------------------------------------------------------
+
+    def reload(self) -> None:
+        """Apply other settings; parameters that they do not affect are not touched."""
+        self.owner.judge_again()
+        before = {entry.rule: entry for entry in self.followed}
+        rules = follow_rules(self._shared.context.settings)
+        self.followed = [before.pop(rule, Followed(rule)) for rule in rules]
+        gone = {rule.owner for rule in before}
+        for session in self._shared.sessions.linked():
+            if self._claim(session) or session.link.name in gone:
+                self._ask(session)
 
     def link_up(self, session: PeerSession) -> None:
         """Follow the parameters that a linked peer owns."""
-        mine, others = self.following.linked(session.peer, session.link.name)
-        if others:
-            text = (
-                f"two peers are named {session.link.name}; its parameters are followed from the one that came first"
-            )
-            self._refuse("param.two_owners", session.link.name, text)
-        if mine:
+        if self._claim(session):
             self._ask(session)
 
-    def link_down(self, peer: int) -> None:
-        """Keep a peer's parameters as they are; if another linked peer has its name, that one owns them now."""
-        task = self._asking.pop(peer, None)
-        if task is not None:
-            task.cancel()
-        owners = {entry.rule.owner for entry in self.following.unlinked(peer)}
-        for session in self._linked():
-            if session.peer != peer and session.link.name in owners:
-                self.link_up(session)
+    def link_down(self, session: PeerSession) -> None:
+        """Forget what the peer follows; the values of parameters that it owns stay.
 
-    def touched(self, key: str) -> bool:
-        """Note a change of a local parameter, to be compared by ``look``.
-
-        Returns:
-            Whether it is a followed parameter, inside one, or a namespace around one.
+        If another linked peer has its name, that one owns them now.
         """
-        found = self.following.touched(key)
+        self.owner.link_down(session.peer)
+        if (task := self._asking.pop(session.peer, None)) is not None:
+            task.cancel()
+        mine = [entry for entry in self.followed if entry.peer == session.peer]
+        for entry in mine:
+            entry.peer, entry.problem = None, ""
+        for other in list(self._shared.sessions.linked()):
+            if other.peer != session.peer and any(entry.rule.owner == other.link.name for entry in mine):
+                self.link_up(other)
+
+    def param_update(self, key: str) -> bool:
+        """Handle a notification of the local core that a parameter has changed; return whether it concerns us."""
+        found = [entry for entry in self.followed if overlap(entry.rule.to, key)]
         for entry in found:
             entry.doubted = True
-        return bool(found)
+        return self.owner.touched(key) or bool(found)
 
-    def change(self, rules: Iterable[FollowRule]) -> None:
-        """Replace the rules, and send the new sets of keys to the owners that they concern."""
-        gone, _ = self.following.change(rules)
-        self._left |= {entry.rule.to for entry in gone}
-        for session in self._linked():
-            self.following.linked(session.peer, session.link.name)
-            if any(session.link.name in (e.rule.owner for e in entries) for entries in (gone, self.following)):
-                self._ask(session)
+    def reconcile(self) -> None:
+        """Compare the values in the background, and mend differences."""
+        if self._looking is None:
+            self._looking = asyncio.create_task(self._look(), name="look at parameters")
 
-    async def look(self, *, restarted: bool) -> None:
+    async def close(self) -> None:
+        """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
+        tasks = [task for task in (self._looking, self._working, *self._asking.values()) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self.owner.close()
+        with contextlib.suppress(RmpaError, TimeoutError):
+            async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
+                for key in self.owner.subscribed | self._subscribed:
+                    await self._core.leave(key)
+
+    async def _look(self) -> None:
+        try:
+            run = (await self._core.get("/run_id"))[1]
+            restarted, self._run = self._run not in (None, run), run
+            await self.owner.look(restarted=restarted)
+            await self._compare_all(restarted=restarted)
+        except UnreachableError:
+            pass  # reported by the core itself
+        except RmpaError as error:
+            _log.warning("! parameters cannot be looked at: %s", error)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! looking at parameters failed")
+        finally:
+            self._looking = None
+
+    # --- the owners ----------------------------------------------------------------------------------------------
+
+    def _claim(self, session: PeerSession) -> bool:
+        """Follow from a linked peer what nobody else of its name owns; return whether there is anything."""
+        owned = [entry for entry in self.followed if entry.rule.owner == session.link.name]
+        mine = [entry for entry in owned if entry.peer in (None, session.peer)]
+        for entry in mine:
+            entry.peer, entry.problem = session.peer, ""
+            entry.had = entry.had and entry.last == session.peer
+            entry.last = session.peer
+        if len(mine) < len(owned):
+            name = session.link.name
+            text = f"two peers are named {name}; its parameters are followed from the one that came first"
+            self._refuse("param.two_owners", name, text)
+        return bool(mine)
+
+    def _ask(self, session: PeerSession) -> None:
+        if session.peer not in self._asking:
+            name = f"follow parameters of {session.link.name}"
+            self._asking[session.peer] = asyncio.create_task(self._follow(session), name=name)
+
+    async def _follow(self, session: PeerSession) -> None:
+        mine = [entry for entry in self.followed if entry.peer == session.peer]
+        keys = [entry.rule.key for entry in mine]
+        try:
+            answer = await self._shared.rpc.request(session, transfer.FOLLOW, {"keys": keys})
+            refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
+        except RmpaError as error:
+            refused = dict.fromkeys(keys, str(error))
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! following parameters of %s failed", session.link.name)
+            refused = {}
+        finally:
+            if self._asking.get(session.peer) is asyncio.current_task():
+                del self._asking[session.peer]
+        for entry in mine:
+            if entry.peer == session.peer and entry.rule.key in refused:
+                self._refused(entry, str(refused[entry.rule.key]))
+
+    def _refused(self, entry: Followed, why: str) -> None:
+        entry.problem = why[: limits.CONTROL_TEXT_MAX]
+        entry.known = False
+        self._refuse("param.refused", str(entry.rule), f"{entry.rule} is not followed: {entry.problem}")
+
+    def _told(self, session: PeerSession, args: dict[str, Any]) -> None:
+        """Take the owner's value.
+
+        If this run of the owner has never had one, the value here is kept; else the local core is to be set.
+        """
+        text, refused = args.get("text"), args.get("refused")
+        if text is not None:
+            transfer.text_of(args)
+        for entry in self.followed:
+            if (entry.peer, entry.rule.key) != (session.peer, args.get("key")):
+                continue
+            if refused is not None:
+                self._refused(entry, str(refused))
+                continue
+            entry.problem, entry.text, entry.known = "", text, True
+            entry.had = entry.had or text is not None
+            entry.due = entry.had
+        self._work_soon()
+
+    # --- the local core ------------------------------------------------------------------------------------------
+
+    async def _compare_all(self, *, restarted: bool) -> None:
         """Put back what was changed here, and ask again for what was refused.
 
         Args:
             restarted: Whether the core was restarted: it has none of the values and subscriptions.
         """
-        for key in [key for key in self._left if all(key != entry.rule.to for entry in self.following)]:
+        for key in self._subscribed - {entry.rule.to for entry in self.followed}:
             await self._core.leave(key)
-            self.subscribed.discard(key)
+            self._subscribed.discard(key)
             if key == SIM_TIME and self._time_before:
                 await self._reset_time(self._time_before.pop())
-        self._left.clear()
         if restarted:
-            self.subscribed.clear()
-        for entry in self.following:
+            self._subscribed.clear()
+        for entry in list(self.followed):
             if restarted:
-                entry.due = entry.known and (entry.text is not None or entry.had)
+                entry.due = entry.known and entry.had
             elif entry.known and not entry.due and (entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL):
                 await self._compare(entry)
-        refused = {entry.peer for entry in self.following if entry.peer is not None and not entry.known}
-        for session in self._linked():
+        refused = {entry.peer for entry in self.followed if not entry.known}
+        for session in self._shared.sessions.linked():
             if session.peer in refused:
                 self._ask(session)
         self._work_soon()
@@ -139,76 +263,18 @@ class ParamFollower:
             await self._core.set(SIM_TIME, await read_text(text))
         _log.info("= %s is no longer followed, and as before: %s", SIM_TIME, "not set" if text is None else "set")
 
-    async def close(self) -> None:
-        """Stop following; the values stay."""
-        tasks = [*self._asking.values(), *([self._working] if self._working is not None else [])]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    # --- the owners ----------------------------------------------------------------------------------------------
-
-    def _ask(self, session: PeerSession) -> None:
-        if session.peer in self._asking:
-            return
-        task = asyncio.create_task(self._follow(session), name=f"follow parameters of {session.link.name}")
-        self._asking[session.peer] = task
-        task.add_done_callback(lambda done: self._asked(session.peer, done))
-
-    def _asked(self, peer: int, task: asyncio.Task[None]) -> None:
-        if self._asking.get(peer) is task:
-            del self._asking[peer]
-
-    async def _follow(self, session: PeerSession) -> None:
-        peer, name = session.peer, session.link.name
-        keys = [entry.rule.key for entry in self.following if entry.peer == peer]
-        try:
-            answer = await self._rpc.request(session, transfer.FOLLOW, {"keys": keys})
-            refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
-        except RmpaError as error:
-            refused = dict.fromkeys(keys, str(error))
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! following parameters of %s failed", name)
-            return
-        for entry in self.following:
-            if entry.peer == peer and entry.rule.key in refused:
-                self._refused(entry, str(refused[entry.rule.key]))
-
-    def _refused(self, entry: Followed, why: str) -> None:
-        entry.problem = why[: limits.CONTROL_TEXT_MAX]
-        entry.known = False
-        self._refuse("param.refused", str(entry.rule), f"{entry.rule} is not followed: {entry.problem}")
-
-    def _told(self, session: PeerSession, args: dict[str, Any]) -> None:
-        key, exists, text, refused = (args.get(name) for name in ("key", "exists", "text", "refused"))
-        if not isinstance(key, str) or not (text is None or isinstance(text, str)):
-            raise RemoteProtocolError("news of a parameter without its key, or with a value that is no text")
-        if refused is not None:
-            for entry in self.following:
-                if entry.peer == session.peer and entry.rule.key == key:
-                    self._refused(entry, str(refused))
-            return
-        for entry in self.following.told(session.peer, key, exists=bool(exists), text=text):
-            entry.problem = ""
-        self._work_soon()
-
-    # --- the local core ------------------------------------------------------------------------------------------
-
     def _work_soon(self) -> None:
-        if self._working is None and any(entry.ask or entry.due for entry in self.following):
+        if self._working is None and any(entry.due for entry in self.followed):
             self._working = asyncio.create_task(self._work(), name="follow parameters")
 
     async def _work(self) -> None:
-        """Request large values, and set the values that are due; ``look`` tries again what failed."""
+        """Set the values that are due; ``look`` tries again what failed."""
         failed: set[FollowRule] = set()
         try:
-            while todo := [e for e in self.following if (e.ask or e.due) and e.rule not in failed]:
+            while todo := [entry for entry in self.followed if entry.due and entry.rule not in failed]:
                 for entry in todo:
                     try:
-                        if entry.ask:
-                            await self._read(entry)
-                        if entry.due:
-                            await self._apply(entry)
+                        await self._apply(entry)
                     except RmpaError as error:
                         failed.add(entry.rule)
                         entry.problem = str(error)
@@ -218,34 +284,18 @@ class ParamFollower:
         finally:
             self._working = None
 
-    async def _read(self, entry: Followed) -> None:
-        session = next((one for one in self._linked() if one.peer == entry.peer), None)
-        entry.ask = False
-        if session is None:
-            return
-        args, news = {"key": entry.rule.key}, entry.news
-        try:
-            answer = await self._rpc.request(session, transfer.GET, args, limits.PARAM_ASK_TIMEOUT)
-            text = transfer.text_of(answer)
-        except RmpaError:
-            entry.ask = entry.peer is not None  # if its owner has deleted it meanwhile, a notification follows
-            raise
-        if entry.news != news or entry.peer != session.peer:
-            return  # it has changed again since
-        learn(entry, text)
-
     async def _apply(self, entry: Followed) -> None:
         """Set a value here, unless it is there already; a malformed text changes nothing."""
         text, key = entry.text, entry.rule.to
         entry.due = False
-        if self.following.size > limits.FOLLOWED_BYTES_MAX:
+        if sum(len(each.text or "") for each in self.followed) > limits.FOLLOWED_BYTES_MAX:
             entry.text, entry.known = None, False
             raise RemoteProtocolError(f"more than {limits.FOLLOWED_BYTES_MAX >> 20} MiB of parameters are followed")
         try:
             value = await read_text(text) if text is not None else None
-            if key not in self.subscribed:
+            if key not in self._subscribed:
                 await self._core.follow(key)
-                self.subscribed.add(key)
+                self._subscribed.add(key)
             await self._bring(entry, value)
         except RemoteProtocolError:
             entry.text, entry.known = None, False
@@ -288,89 +338,3 @@ class ParamFollower:
 
     def _refuse(self, kind: str, who: str, text: str) -> None:
         self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)
-
-
-# The part of the bridge for parameters across modules: requests, changes and followed values.
-
-
-class Params(Part):
-    """The part of the bridge for parameters.
-
-    Args:
-        shared: The core, the peers and the rules.
-    """
-
-    def __init__(self, shared: Shared) -> None:
-        self._shared = shared
-        settings, rpc = shared.context.settings, shared.rpc
-        params, time, most, gate = settings.params, settings.time, settings.limits.params, shared.context.gate
-        self._core = ParamCore(shared.core, shared.node)
-        self._server = ParamOwner(self._core, ParamPolicy(params, time), rpc, most, gate)
-        rules = follow_rules(params, time)
-        self._follower = ParamFollower(self._core, rpc, shared.sessions.linked, rules, shared.counters)
-        self._looking: asyncio.Task[None] | None = None
-        self._run: XmlRpcValue = None
-
-    @property
-    def followed(self) -> Iterable[Followed]:
-        """The parameters that this module follows, with the state of each."""
-        return self._follower.following
-
-    def notes(self) -> tuple[str, ...]:
-        """Messages to the user about parameters that are not followed although their owner is linked."""
-        found = (e for e in self._follower.following if e.problem and e.peer is not None)
-        return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
-
-    def reload(self) -> None:
-        """Apply other settings; parameters that they do not affect are not touched."""
-        settings = self._shared.context.settings
-        params, time = settings.params, settings.time
-        self._server.policy = ParamPolicy(params, time)
-        self._server.followed_max = settings.limits.params
-        self._server.judge_again()
-        self._follower.change(follow_rules(params, time))
-
-    def link_up(self, session: PeerSession) -> None:
-        """Follow the parameters that a linked peer owns."""
-        self._follower.link_up(session)
-
-    def link_down(self, session: PeerSession) -> None:
-        """Forget what the peer follows; the values of parameters that it owns stay."""
-        self._server.link_down(session.peer)
-        self._follower.link_down(session.peer)
-
-    def param_update(self, key: str) -> bool:
-        """Handle a notification of the local core that a parameter has changed."""
-        return any((self._server.touched(key), self._follower.touched(key)))
-
-    def reconcile(self) -> None:
-        """Compare the values in the background, and mend differences."""
-        if self._looking is None:
-            self._looking = asyncio.create_task(self._look(), name="look at parameters")
-
-    async def close(self) -> None:
-        """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
-        if self._looking is not None:
-            self._looking.cancel()
-            await asyncio.gather(self._looking, return_exceptions=True)
-        await self._server.close()
-        await self._follower.close()
-        with contextlib.suppress(RmpaError, TimeoutError):
-            async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
-                for key in {*self._server.followed, *self._follower.subscribed}:
-                    await self._core.leave(key)
-
-    async def _look(self) -> None:
-        try:
-            run = await self._core.run_id()
-            restarted, self._run = self._run not in (None, run), run
-            await self._server.look(restarted=restarted)
-            await self._follower.look(restarted=restarted)
-        except UnreachableError:
-            pass  # reported by the core itself
-        except RmpaError as error:
-            _log.warning("! parameters cannot be looked at: %s", error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! looking at parameters failed")
-        finally:
-            self._looking = None

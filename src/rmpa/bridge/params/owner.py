@@ -8,13 +8,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
-from rmpa.bridge.params.rules import key_problem, replaced, too_large
-from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
+from rmpa.bridge.params.rules import (
+    key_problem,
+    replaced,
+    too_large,
+    why_not_follow,
+    why_not_get,
+    why_not_set,
+)
+from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import overlap
@@ -27,19 +34,22 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
-    from rmpa.bridge.params.rules import ParamPolicy
-    from rmpa.bridge.rpc import PeerRpc
+    from rmpa.bridge.context import Shared
+    from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import PermissionDecision
 
 PEERS: Final = f"{OWN_NODE}/peers"
 """The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
 agent's node has to be notified of these."""
+_ALL: Final = frozenset({"/**", "**"})
+"""The globs that every parameter fits."""
 _PIECES: Final = 16
 """Pieces, of some KiB each, that are written before the event loop goes on with other tasks."""
 
@@ -90,12 +100,12 @@ class ParamCore:
     """
 
     def __init__(self, core: Core, node: SlaveNode) -> None:
-        self._core = core
+        self.ask = core.ask
         self._node = node
 
     async def get(self, key: str) -> tuple[bool, XmlRpcValue]:
         """Whether a parameter or namespace exists, and its value, which must not be modified."""
-        reply = await self._ask("getParam", OWN_NODE, key)
+        reply = await self.ask("getParam", OWN_NODE, key)
         return reply.code == 1, reply.value
 
     async def get_text(self, key: str) -> str | None:
@@ -113,33 +123,21 @@ class ParamCore:
         Raises:
             PeerRefused: The core does not accept it.
         """
-        reply = await self._ask("setParam", caller, key, value)
+        reply = await self.ask("setParam", caller, key, value)
         if reply.code != 1:
             raise PeerRefused("the ROS core", f"{key}: {reply.status}")
 
     async def delete(self, key: str, caller: str = OWN_NODE) -> bool:
         """Delete a parameter or namespace; return whether it existed."""
-        return (await self._ask("deleteParam", caller, key)).code == 1
-
-    async def names(self) -> list[str]:
-        """The names of all parameters."""
-        reply = await self._ask("getParamNames", OWN_NODE)
-        return [str(name) for name in reply.value] if isinstance(reply.value, list) else []
+        return (await self.ask("deleteParam", caller, key)).code == 1
 
     async def follow(self, key: str) -> None:
         """Have the core notify the agent's node of changes; a repeated call has no further effect."""
-        await self._ask("subscribeParam", OWN_NODE, self._node.uri, key)
+        await self.ask("subscribeParam", OWN_NODE, self._node.uri, key)
 
     async def leave(self, key: str) -> None:
         """End these notifications."""
-        await self._ask("unsubscribeParam", OWN_NODE, self._node.uri, key)
-
-    async def run_id(self) -> XmlRpcValue:
-        """The id of this run of the core; another run has none of the values and subscriptions of the one before."""
-        return (await self.get("/run_id"))[1]
-
-    async def _ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        return await self._core.ask(method, *params)
+        await self.ask("unsubscribeParam", OWN_NODE, self._node.uri, key)
 
 
 # Answers the peers' requests about this module's parameters, and notifies them of changes of those they follow.
@@ -186,98 +184,110 @@ class _Asker:
         return self.peer if self.site is None else self.site or "a program without a site"
 
 
+@dataclass(slots=True, eq=False)
+class _Follower:
+    """A peer that follows parameters of this module.
+
+    Args:
+        session: The peer.
+        keys: What it follows.
+        told: The text that it was told last of each key: ``None`` if there was no value, empty if it is above
+            ``limits.PARAM_SMALL``.
+        changed: The keys of which it is to be told.
+        task: Tells it.
+    """
+
+    session: PeerSession
+    keys: set[str] = field(default_factory=set)
+    told: dict[str, str | None] = field(default_factory=dict)
+    changed: set[str] = field(default_factory=set)
+    task: asyncio.Task[None] | None = None
+
+
 class ParamOwner:
     """The owner's side: this module's parameters, for peers.
 
     Args:
         core: The local core.
-        policy: What peers may do.
-        rpc: Carries the peers' requests, and notifications to them.
-        followed_max: How many parameters one peer may follow.
-        gate: Decides which parameters each peer may read and set.
+        shared: The peers and the rules.
     """
 
-    def __init__(
-        self,
-        core: ParamCore,
-        policy: ParamPolicy,
-        rpc: PeerRpc,
-        followed_max: int = config_limits.FOLLOWED_MAX,
-        gate: PermissionGate = OPEN_GATE,
-    ) -> None:
-        self._gate = gate
+    def __init__(self, core: ParamCore, shared: Shared) -> None:
         self._core = core
-        self.followed_max = followed_max
-        self.policy = policy
-        self._rpc = rpc
-        self._followers: dict[int, tuple[PeerSession, set[str]]] = {}
-        self._last: dict[str, str | None] = {}
-        """The text that was last sent of each followed key: ``None`` if there was no value, empty if it is above
-        ``limits.PARAM_SMALL`` or nothing was sent yet."""
-        self._left: set[str] = set()
-        self._changed: dict[str, None] = {}
-        self._telling: asyncio.Task[None] | None = None
+        self._shared = shared
+        self._followers: dict[int, _Follower] = {}
+        self.subscribed: set[str] = set()
+        """The keys of which the local core notifies the agent's node."""
+        rpc = shared.rpc
         rpc.on_request(transfer.GET, self._get, _EACH)
         rpc.on_request(transfer.NAMES, self._names, _LISTED)
         rpc.on_request(transfer.SET, self._set, _EACH)
         rpc.on_request(transfer.DELETE, self._delete, _EACH)
         rpc.on_request(transfer.FOLLOW, self._follow, _FOLLOWED)
 
+    @property
+    def _settings(self) -> Settings:
+        return self._shared.context.settings
+
+    @property
+    def _gate(self) -> PermissionGate:
+        return self._shared.context.gate
+
     # --- events from the part ------------------------------------------------------------------------------------
 
     def link_down(self, peer: int) -> None:
         """Forget what a peer follows."""
-        if self._followers.pop(peer, None) is not None:
-            self._forget_unfollowed()
+        follower = self._followers.pop(peer, None)
+        if follower is not None and follower.task is not None:
+            follower.task.cancel()
 
     def touched(self, key: str) -> bool:
-        """Notify the followers of a parameter that has changed.
+        """Tell the followers of a parameter that has changed.
 
         Returns:
             Whether a peer follows it, a namespace around it, or something inside it.
         """
-        found = [followed for followed in self._last if overlap(followed, key)]
-        self._tell_soon(found)
-        return bool(found)
+        found = False
+        for follower in self._followers.values():
+            keys = {followed for followed in follower.keys if overlap(followed, key)}
+            self._tell_soon(follower, keys)
+            found = found or bool(keys)
+        return found
 
     async def look(self, *, restarted: bool) -> None:
-        """Compare the values with those that were sent, and subscribe again: a core may have lost a notification.
+        """Compare the values with those that were told, and subscribe again: a core may have lost a notification.
 
         Args:
             restarted: Whether the core was restarted: it has none of the subscriptions.
         """
-        for key in [key for key in self._left if key not in self._last]:
+        followed = set().union(*(follower.keys for follower in self._followers.values()))
+        for key in self.subscribed - followed:
             await self._core.leave(key)
-        self._left.clear()
-        for key, last in list(self._last.items()):
-            if restarted:
-                await self._core.follow(key)
-                self._tell_soon([key])
-            elif last != "":
-                await self._core.follow(key)
-                with contextlib.suppress(LocalProtocolError):  # too large, which was reported when it was sent
-                    if await self._small_text(key) != last:
-                        self._tell_soon([key])
+        self.subscribed = followed
+        for key in followed:
+            followers = [one for one in self._followers.values() if key in one.keys]
+            await self._core.follow(key)
+            changed = followers if restarted else []
+            if not restarted and {one.told.get(key, "") for one in followers} != {""}:
+                with contextlib.suppress(LocalProtocolError):  # too large, which was reported when it was told
+                    text = _small(await self._core.get_text(key))
+                    changed = [one for one in followers if one.told.get(key, "") not in {"", text}]
+            for one in changed:
+                self._tell_soon(one, {key})
+        for one in self._followers.values():
+            self._tell_soon(one, set())  # what could not be told
 
     def judge_again(self) -> None:
-        """Notify the peers of parameters that the new rules no longer let them follow."""
-        for session, keys in self._followers.values():
-            for key in list(keys):
-                if why := self.policy.why_not_follow(key) or self._why_denied(_Asker.read(session, {}), key):
-                    keys.discard(key)
-                    self._rpc.notify(session, transfer.VALUE, _refusal(key, why))
-        self._forget_unfollowed()
+        """Tell the peers of parameters that the new rules no longer let them follow."""
+        for one in self._followers.values():
+            self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one, key)})
 
     async def close(self) -> None:
-        """Stop the notifications to peers."""
-        if self._telling is not None:
-            self._telling.cancel()
-            await asyncio.gather(self._telling, return_exceptions=True)
-
-    @property
-    def followed(self) -> Iterator[str]:
-        """The keys that at least one peer follows."""
-        return iter(self._last)
+        """Stop telling peers."""
+        tasks = [one.task for one in self._followers.values() if one.task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     # --- requests -----------------------------------------------------------------------------------------------
 
@@ -292,10 +302,11 @@ class ParamOwner:
 
     async def _names(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asker = _Asker.read(session, args)
+        known = (await self._core.ask("getParamNames", OWN_NODE)).value
         names = [
             name
-            for name in yielding_to_data(await self._core.names())
-            if not self.policy.why_not_get(name) and self._judge(asker, name)[0].allowed
+            for name in yielding_to_data(map(str, known) if isinstance(known, list) else ())
+            if not why_not_get(self._settings, name) and self._judge(asker, name)[0].allowed
         ]
         return {"text": await write_text("the list of parameters", names)}
 
@@ -310,7 +321,7 @@ class ParamOwner:
                 await asyncio.sleep(0)
             # A member may be named "" or "a/": the core drops the slash at the end, so the name is judged without it.
             name = given.rstrip("/") or "/"
-            self._refuse(key_problem(given) or self.policy.why_not_set(name) or self._why_denied(asker, name))
+            self._refuse(key_problem(given) or why_not_set(self._settings, name) or self._why_denied(asker, name))
             parameters.append((name, one))
         await self._keep_others(asker, key, [name for name, _ in parameters])
         for number, (name, one) in enumerate(parameters):
@@ -323,7 +334,7 @@ class ParamOwner:
 
     async def _delete(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key, asker = self._key(args.get("key")), _Asker.read(session, args)
-        self._refuse(self.policy.why_not_set(key))
+        self._refuse(why_not_set(self._settings, key))
         if self._gate.on:
             # All of a namespace, and the namespace itself: a rule may name either.
             _, value = await self._core.get(key)
@@ -338,36 +349,38 @@ class ParamOwner:
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
             raise RmpaError(f"keys is not a list of at most {config_limits.FOLLOW_RULES_MAX} parameters")
-        asker = _Asker.read(session, args)
+        asker, most = _Asker.read(session, args), self._settings.limits.params
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
             problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
-            why = problem or self.policy.why_not_follow(key) or self._why_denied(asker, key)
-            if not why and key not in wanted and len(wanted) >= self.followed_max:
-                text = f"more parameters than limits.params = {self.followed_max} over there"
-                why = f"{text}; raise it, or follow a namespace"
+            why = problem or why_not_follow(self._settings, key) or self._why_denied(asker, key)
+            if not why and key not in wanted and len(wanted) >= most:
+                why = f"more parameters than limits.params = {most} over there; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:
                 wanted.add(key)
-        self._followers[session.peer] = (session, wanted)
-        self._forget_unfollowed()
+        follower = self._followers.setdefault(session.peer, _Follower(session))
+        follower.keys = wanted
         for key in wanted:
-            self._last.setdefault(key, "")
+            self.subscribed.add(key)
             await self._core.follow(key)
-        self._tell_soon(wanted)
+        self._tell_soon(follower, wanted)
         return {"refused": refused}
 
     def _why_not_get(self, key: str, value: XmlRpcValue) -> str:
-        if not isinstance(value, dict):
-            return self.policy.why_not_get(key)
-        if self.policy.all_get or not value:
-            return "" if self.policy.all_get else self.policy.why_not_get(key)
-        return next(
-            (why for name, _ in yielding_to_data(leaves(key, value)) if (why := self.policy.why_not_get(name))), ""
-        )
+        names: Iterable[str] = (key,)
+        if isinstance(value, dict):
+            if _ALL & {*self._settings.params.remote_get}:
+                return ""
+            names = (name for name, _ in yielding_to_data(leaves(key, value))) if value else names
+        return next((why for name in names if (why := why_not_get(self._settings, name))), "")
+
+    def _why_not_follow(self, follower: _Follower, key: str) -> str:
+        asker = _Asker.read(follower.session, {})
+        return why_not_follow(self._settings, key) or self._why_denied(asker, key)
 
     def _judge(self, asker: _Asker, name: str) -> tuple[PermissionDecision, str]:
         """Decide whether a parameter may be had by the peer and by the site for which it asks, and name those judged.
@@ -414,63 +427,53 @@ class ParamOwner:
         if why:
             raise RmpaError(why)
 
-    # --- notifications -------------------------------------------------------------------------------------------
+    # --- telling the followers -----------------------------------------------------------------------------------
 
-    def _tell_soon(self, keys: Iterable[str]) -> None:
-        self._changed |= dict.fromkeys(keys)
-        if self._changed and self._telling is None:
-            self._telling = asyncio.create_task(self._tell(), name="tell of parameters")
+    def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
+        follower.changed |= keys
+        if follower.changed and follower.task is None:
+            name = f"tell {follower.session.link.name} of parameters"
+            follower.task = asyncio.create_task(self._tell(follower), name=name)
 
-    async def _tell(self) -> None:
+    async def _tell(self, follower: _Follower) -> None:
+        """Tell a peer the present values of what has changed, one after the other; what fails is left to ``look``."""
         try:
-            while self._changed:
+            while follower.changed:
                 await asyncio.sleep(limits.PARAM_GATHER)
-                changed, self._changed = self._changed, {}
-                for key in changed:
-                    if key in self._last:
-                        await self._tell_one(key)
+                for key in list(follower.changed):
+                    follower.changed.discard(key)  # before it is read: it may change meanwhile
+                    if key in follower.keys and not await self._tell_one(follower, key):
+                        follower.changed.add(key)
+                        return
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! telling peers of parameters failed")
         finally:
-            self._telling = None
+            follower.task = None
 
-    async def _tell_one(self, key: str) -> None:
-        args: dict[str, object] = {"key": key, "exists": False, "size": 0}
-        value: XmlRpcValue = None
+    async def _tell_one(self, follower: _Follower, key: str) -> bool:
+        """Tell a peer a parameter's present value, or why it may not follow it; return whether that has arrived."""
+        asker, text = _Asker.read(follower.session, {}), None
+        if why := self._why_not_follow(follower, key):
+            follower.keys.discard(key)
+        else:
+            try:
+                found, value = await self._core.get(key)
+                if found:
+                    why = self._why_denied(asker, key, value) or self._why_not_get(key, value)
+                    text = None if why else await write_text(key, value)
+            except RmpaError as error:  # the core does not answer, or the value is too large to cross
+                _log.warning("! peers are not told of %s: %s", key, error)
+                why = str(error)
+        args = {"key": key, "refused": why} if why else {"key": key, "text": text}
         try:
-            found, value = await self._core.get(key)
-            why = self._why_not_get(key, value) if found and isinstance(value, dict) else ""
-            if why:
-                args["refused"] = why
-                found = False
-            text = await write_text(key, value) if found else None
+            await self._shared.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
         except RmpaError as error:
-            # The core does not answer, or the value is too large to cross; ``look`` sends it when that has changed.
-            _log.warning("! peers are not told of %s: %s", key, error)
-            args["refused"] = str(error)
-            text = None
-        if text is not None:
-            args |= {"exists": True, "size": len(text)}
-            if len(text) <= limits.ASK_EXPRESS_MAX:
-                args["text"] = text
-        if key in self._last:
-            self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
-        for session, keys in list(self._followers.values()):
-            if key in keys:
-                why = self._why_denied(_Asker.read(session, {}), key, value)
-                self._rpc.notify(session, transfer.VALUE, _refusal(key, why) if why else args)
-
-    async def _small_text(self, key: str) -> str | None:
-        text = await self._core.get_text(key)
-        return text if text is None or len(text) <= limits.PARAM_SMALL else ""
-
-    def _forget_unfollowed(self) -> None:
-        kept = set().union(*(keys for _, keys in self._followers.values())) if self._followers else set()
-        for key in [key for key in self._last if key not in kept]:
-            del self._last[key]
-            self._left.add(key)
+            _log.warning("! %s is not told of %s: %s", follower.session.link.name, key, error)
+            return False
+        follower.told[key] = _small(text)
+        return True
 
 
-def _refusal(key: str, why: str) -> dict[str, object]:
-    """The notification that a peer may not follow a parameter."""
-    return {"key": key, "exists": False, "size": 0, "refused": why}
+def _small(text: str | None) -> str | None:
+    """A text that is kept for comparison; empty in place of a large one."""
+    return text if text is None or len(text) <= limits.PARAM_SMALL else ""

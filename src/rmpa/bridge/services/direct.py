@@ -77,7 +77,8 @@ class ServicePaths(Paths):
         path = self.answers.get(service)
         if path is None or path.task is not None or self._proxy_uri(path.peer, service) != uri:
             return ""
-        nearby = self._is_nearby(path)
+        session = self._shared.sessions.get(path.peer)
+        nearby = session is not None and session.same_machine  # clients that are bound to loopback reach it too
         local_only = not nearby and is_loopback(host_of(api))
         if not api or local_only or is_own(caller) or caller.startswith(_OWN_TOOLS):
             self._shared.counters.add("direct.lookup_relayed")
@@ -87,11 +88,6 @@ class ServicePaths(Paths):
             self._looked.add(service)
             self._look_later()
         return self.address(path.peer, service)
-
-    @staticmethod
-    def _is_nearby(path: Path) -> bool:
-        """Whether the server runs on this machine, so that clients that are bound to loopback reach it too."""
-        return path.endpoint is not None and is_loopback(path.endpoint[0])
 
     def address(self, peer: int, service: str) -> str:
         """What lookups of a peer's service are answered; empty: the proxy's address."""
@@ -161,12 +157,12 @@ class ServicePaths(Paths):
             node: The node that provides it.
             end: End these connections, too: the peer may not serve it here any more.
         """
-        path = self.get(peer, Want(service, node))
+        path, session = self.get(peer, Want(service, node)), self._shared.sessions.get(peer)
         if path is not None:
             endpoint = path.endpoint
             self.forget(path)
-            if end and endpoint is not None:
-                self._end(self._imports.peer_name(peer), (endpoint,))
+            if end and endpoint is not None and session is not None:
+                self._end(session, (endpoint,))
 
     def forget(self, path: Path) -> None:
         """As of ``Paths``; lookups are answered with the proxy's address again."""
@@ -203,7 +199,7 @@ class ServicePaths(Paths):
         """Stop direct calls to a peer that cannot be reached, those under way too; unless only its agent has died."""
         super().link_down(session)
         if not session.link.crashed:
-            self._end(session.link.name, self._used.pop(session.link.name, ()))
+            self._end(session, self._used.pop(session.link.name, ()))
 
     def called(self, peer: int) -> set[str]:
         """The services of a peer that are called directly."""
@@ -214,15 +210,13 @@ class ServicePaths(Paths):
         super().gone(session)
         self._used.pop(session.link.name, None)
 
-    def _end(self, name: str, endpoints: Iterable[tuple[str, int]]) -> None:
+    def _end(self, session: PeerSession, endpoints: Iterable[tuple[str, int]]) -> None:
         """End the connections of clients; over loopback nothing can hang, and others use the same address."""
-        for endpoint in endpoints:
-            if is_loopback(endpoint[0]):
-                continue
+        for endpoint in () if session.same_machine else endpoints:
             self._shared.counters.add("direct.service_stopped")
             if problem := end_all(connections(remote=endpoint)):
                 text = "! %s: calls under way to %s:%d may hang: they cannot be ended (%s); see rmpa doctor"
-                _log.warning(text, name, *endpoint, problem)
+                _log.warning(text, session.link.name, *endpoint, problem)
 
     # --- carrying out --------------------------------------------------------------------------------------------
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.slave_node import SlaveNode
 
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
@@ -172,6 +173,13 @@ class TopicPaths(Paths):
         topics = self._topics.get(path.peer)
         return topics.publication(_source(path)) if topics is not None else None
 
+    def _session(self, path: Path) -> PeerSession | None:
+        return self._shared.sessions.get(path.peer)
+
+    def _proxy(self, path: Path) -> SlaveNode | None:
+        session = self._session(path)
+        return session.proxies.get(path.want.node) if session is not None else None
+
     def _uri(self, path: Path) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
         return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
@@ -192,7 +200,7 @@ class TopicPaths(Paths):
     async def _answer(self, path: Path) -> RosReply | None:
         await self.decision(path)
         direct = self.target(path) if path.task is None else None
-        stays = await self._end_earlier(path, direct)
+        stays = await self._end_direct(path, keep=direct)
         if stays is not None:
             self._put(path, stays)
             return RosReply(0, "connected to the publisher already", [])
@@ -200,36 +208,6 @@ class TopicPaths(Paths):
             direct = None  # it is moved if it is direct by now
         self._put(path, direct or AGENTS)
         return RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, *direct]) if direct is not None else None
-
-    async def _end_earlier(self, path: Path, direct: tuple[str, int] | None) -> tuple[str, int] | None:
-        """End connections of a subscriber to a peer's nodes from an earlier answer, or an earlier run of an agent.
-
-        A second connection would double messages.
-
-        Returns:
-            The other end of one that stays: it is the decided one, or cannot be ended; then ``stuck`` says why.
-        """
-        session, uri, topic = self._shared.sessions.get(path.peer), self._uri(path), path.want.name
-        if session is None or not uri or not standing(session.address):
-            return None
-        proxy = session.proxies.get(path.want.node)
-        own = proxy.address_of(topic) if proxy is not None else None
-        others = {one for one in self._shared.core.publishers(topic).values() if proxy is None or one != proxy.uri}
-        known = {one.place for one in self if one is not path and one.want.user == path.want.user}
-        for link in await bus_links(uri, topic) or ():
-            end = link.remote
-            if not link.connected or end is None or end[0] != session.address or link.other in others or end in known:
-                continue
-            if own is not None and own[1] == end[1]:
-                continue  # the proxy itself, on this machine
-            if link.local_port not in standing(*end).get(end[1], ()):
-                continue
-            if end == direct:
-                return end
-            if problem := await end_links(end, [link]):
-                self._warn_stuck(path, end, problem)
-                return end
-        return None
 
     def _put(self, path: Path, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
@@ -290,7 +268,12 @@ class TopicPaths(Paths):
         """Make a subscriber leave its direct connection; it is not called back."""
         if path.endpoint is not None and not self._closed:
             self._shared.counters.add("direct.hung_up")
-            self._spawn(self._leave(path, path.endpoint), f"hang up {path.want.user}")
+            self._spawn(self._leave(path), f"hang up {path.want.user}")
+
+    async def _leave(self, path: Path) -> None:
+        proxy = self._proxy(path)
+        await self._list(path, without=proxy.uri if proxy is not None else "")
+        await self._end_direct(path)
 
     # --- carrying out -----------------------------------------------------------------------------------------------
 
@@ -332,38 +315,55 @@ class TopicPaths(Paths):
 
     async def _renew(self, path: Path) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
-        uri, publication, session = self._uri(path), self._publication(path), self._shared.sessions.get(path.peer)
-        proxy = session.proxies.get(path.want.node) if session is not None else None
+        uri, publication, proxy = self._uri(path), self._publication(path), self._proxy(path)
         if not uri or proxy is None or publication is None:
             return False
-        if path.endpoint is not None:
-            if not await self._leave(path, path.endpoint):
-                return False
-        elif (stays := await self._end_earlier(path, self.target(path))) is not None:
+        await self._list(path, without=proxy.uri)
+        publication.hang_up(path.want.user)
+        stays = await self._end_direct(path)
+        if stays is not None:
             self._put(path, stays)
             return False
-        else:
-            await self._list(path, without=proxy.uri)
-            publication.hang_up(path.want.user)
         await forgotten(uri, path.want.name, proxy.uri)
         self._put(path, LOST)
         await self._list(path)
         asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
         return True
 
-    async def _leave(self, path: Path, endpoint: tuple[str, int]) -> bool:
-        """End the direct connection of a subscriber; return whether it has none any more."""
-        uri, session = self._uri(path), self._shared.sessions.get(path.peer)
-        links = await bus_links(uri, path.want.name) if uri else None
-        if links is None and standing(*endpoint):
-            return False  # the node is stopped: ``_check`` tries again
-        proxy = session.proxies.get(path.want.node) if session is not None else None
-        await self._list(path, without=proxy.uri if proxy is not None else "")
-        if problem := await end_links(endpoint, [one for one in links or () if one.remote == endpoint]):
-            if endpoint != self.target(path):  # it may be allowed again meanwhile
-                self._warn_stuck(path, endpoint, problem)
-            return False
-        return True
+    async def _end_direct(self, path: Path, *, keep: tuple[str, int] | None = None) -> tuple[str, int] | None:
+        """End connections of a subscriber to a peer's nodes: of an earlier answer, or an earlier run of an agent.
+
+        A second connection would double messages.
+
+        Returns:
+            The other end of one that stays: it is ``keep``, its node is stopped, or it cannot be ended (``stuck``).
+        """
+        session, uri, topic, proxy = self._session(path), self._uri(path), path.want.name, self._proxy(path)
+        address = path.endpoint[0] if path.endpoint is not None else session.address if session is not None else ""
+        stand = standing(address) if address and uri else {}
+        if not stand:
+            return None
+        links = await bus_links(uri, topic)
+        if links is None:
+            return path.endpoint  # ``_check`` tries again
+        own = proxy.address_of(topic) if proxy is not None else None
+        others = {one for one in self._shared.core.publishers(topic).values() if proxy is None or one != proxy.uri}
+        known = {one.place for one in self if one is not path and one.want.user == path.want.user}
+        for link in links:
+            end = link.remote
+            if not link.connected or end is None or end[0] != address or end in known:
+                continue
+            if link.other in others and end != path.endpoint:
+                continue
+            if link.local_port not in stand.get(end[1], ()) or (own is not None and own[1] == end[1]):
+                continue  # it has ended already, or leads to the proxy, on this machine
+            if end == keep:
+                return end
+            if problem := await end_links(end, [link]):
+                if end != self.target(path):  # it may be allowed again meanwhile
+                    self._warn_stuck(path, end, problem)
+                return end
+        return None
 
     async def _list(self, path: Path, *, without: str = "") -> None:
         """Tell a subscriber the publishers of its topic, as its master does."""

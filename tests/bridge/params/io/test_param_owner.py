@@ -91,7 +91,7 @@ async def test_a_peer_that_names_other_sites_is_refused_and_logged_by_its_own_na
         for number in range(20):
             with pytest.raises(PeerRefused, match="permissions there do not let"):
                 await peer.ask(transfer.GET, {"key": "/door", "site": f"site{number}", "askers": ["base"]})
-        assert owner.params._server._gate._counters["permission.param"] == 20
+        assert owner.params.owner._gate._counters["permission.param"] == 20
     lines = [record.getMessage() for record in caplog.records if "may not" in record.getMessage()]
     assert [line[: len("! pad may not")] for line in lines] == ["! pad may not"]
 

@@ -314,10 +314,11 @@ async def test_a_large_value_does_not_replace_one_that_was_told_after_it(sides: 
     base.up(1)
     await until(lambda: lane.kept)
     base.core.set("/robot_description", "small")
-    await until(lambda: next(iter(pad.params.followed)).known)
+    await base.look()
     for deliver in lane.kept:
         deliver()
-    await until(lambda: not pad.params._follower._working)
+    await until(lambda: pad.core.get("/base/robot_description") == "small")
+    await until(lambda: base.params.owner._followers[1].task is None)
     assert pad.core.get("/base/robot_description") == "small"
 
 
@@ -339,7 +340,7 @@ async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
     assert pad.core.get("/robot_description") is None
-    base.core.set("/robot_description", "two" * 3000)  # not told: asked for
+    base.core.set("/robot_description", "two" * 3000)  # it crosses as a body
     await until(lambda: pad.core.get("/base/robot_description") == "two" * 3000)
     base.core.set("/arm", {"p": 1, "q": {"r": 2.5}})
     await until(lambda: pad.core.get("/arm") == {"p": 1, "q": {"r": 2.5}})
@@ -364,7 +365,7 @@ async def test_what_is_set_here_is_put_back(sides: Any, size: int, caplog: pytes
     base.core.set("/robot_description", "x" * size)
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "x" * size)
-    await until(lambda: not pad.params._follower._working)
+    await until(lambda: not pad.params._working)
     pad.core.set("/base", {"robot_description": "mine"})
     await pad.look()
     assert pad.core.get("/base/robot_description") == "x" * size
@@ -390,9 +391,10 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     again = Side("base")
     sides(again)
     join(again, pad, 2)
-    await until(lambda: again.params._server._last == {"/robot_description": None})
-    await pad.ask(transfer.NAMES, {}, 2)  # its answer comes behind what was told
-    await until(lambda: not pad.params._follower._working)
+    await until(
+        lambda: [one.told for one in again.params.owner._followers.values()] == [{"/robot_description": None}]
+    )
+    await until(lambda: not pad.params._working)
     await again.look()
     await pad.look()
     assert pad.core.get("/base/robot_description") == "one"
@@ -507,7 +509,7 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     await pad.look()
     await base.look()
     assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
-    assert list(base.params._server.followed) == ["/arm"]
+    assert base.params.owner.subscribed == {"/arm"}
 
 
 @pytest.mark.parametrize("before", [None, False])
@@ -542,7 +544,7 @@ async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytes
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
-    base.asks.notify(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
+    await base.ask(transfer.VALUE, {"key": "/arm", "text": "<x>"})
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
     assert "/arm is not as over there" in caplog.text
