@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.counters import SampleRing, SampleSummary
+from rmpa.core.counters import SampleSummary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -125,15 +125,15 @@ class View:
 
 @dataclass(slots=True)
 class _Samples:
-    recent: SampleRing = field(default_factory=lambda: SampleRing(RECENT))
-    whole: SampleRing = field(default_factory=lambda: SampleRing(WHOLE))
+    recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    whole: deque[float] = field(default_factory=lambda: deque(maxlen=WHOLE))
 
     def add(self, sample: float) -> None:
-        self.recent.add(sample)
-        self.whole.add(sample)
+        self.recent.append(sample)
+        self.whole.append(sample)
 
     def summary(self, *, whole: bool) -> SampleSummary:
-        return (self.whole if whole else self.recent).summary()
+        return SampleSummary.of(self.whole if whole else self.recent)
 
 
 @dataclass(slots=True)

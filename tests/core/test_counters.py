@@ -60,5 +60,4 @@ def test_memory_is_bounded() -> None:
     logging.getLogger("rmpa.silent").setLevel(logging.CRITICAL)
     for number in range(limits.LOG_KINDS_MAX + 100):
         log.refuse(float(number), "x", str(number), "text")
-    assert log._memory is not None
-    assert len(log._memory.last) == limits.LOG_KINDS_MAX
+    assert len(log._last) == limits.LOG_KINDS_MAX

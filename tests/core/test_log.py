@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.counters import configure_logging, room_of
+from rmpa.core.counters import _room_of, configure_logging
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,7 +29,7 @@ def stream() -> Iterator[io.StringIO]:
 
 
 def test_rooms() -> None:
-    assert [room_of(n) for n in ("rmpa.mesh.io.mesh", "rmpa", "asyncio")] == ["mesh", "rmpa", "asyncio"]
+    assert [_room_of(n) for n in ("rmpa.mesh.io.mesh", "rmpa", "asyncio")] == ["mesh", "rmpa", "asyncio"]
 
 
 def test_text(stream: io.StringIO) -> None:

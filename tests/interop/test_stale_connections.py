@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.runtime.tcp_connections import connections, end_connections, may_end_connections
+from rmpa.runtime.kernel_tcp import connections, end_connections, may_end_connections
 from tests.interop.test_probe import publisher_at
 from tests.interop.test_realtime import Prefixed, runs
 from tests.interop.test_service_nodes import core, ros

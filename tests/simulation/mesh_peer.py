@@ -10,6 +10,7 @@ from rmpa.core.counters import Counters
 from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.runtime.loop import SystemClock
 from tests.simulation.process import Process
 from tests.simulation.roster_peer import RosterPeer
 from tests.simulation.sockets import SimListener, SimSocket, connect
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from tests.simulation.network import Address, World
 
 
-class SimClock:
+class SimClock(SystemClock):
     """The world's time as the mesh asks for it."""
 
     def __init__(self, world: World) -> None:

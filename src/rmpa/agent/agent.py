@@ -41,8 +41,8 @@ from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
+from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
-from rmpa.runtime.tcp_connections import may_end_connections
 from rmpa.trust.permissions import Permissions, host_names, page_hosts
 
 if TYPE_CHECKING:

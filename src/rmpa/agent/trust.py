@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.counters import Clock
     from rmpa.core.identity import Identity
+    from rmpa.runtime.loop import SystemClock
     from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.certificates import DocumentKind
     from rmpa.trust.joining import JoinServer
@@ -59,7 +59,7 @@ def trust_store(settings: Settings) -> TrustStore | None:
     return TrustStore(place, settings.name) if place is not None else None
 
 
-def open_membership(settings: Settings, clock: Clock) -> Membership | None:
+def open_membership(settings: Settings, clock: SystemClock) -> Membership | None:
     """What this module has as a member of a secured mesh; ``None``: trust is off.
 
     Raises:
@@ -101,7 +101,7 @@ class AgentTrust(Part):
         self,
         membership: Membership,
         bridge: Bridge,
-        clock: Clock,
+        clock: SystemClock,
         rng: Callable[[], float],
         hosts: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import asyncio
 import csv
 import io
+import math
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -20,7 +22,7 @@ from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Graph, GraphName, print_json, read_graph, read_name, require_peer, size, warn_unpublished
 from rmpa.cli.resource import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic import arriving, bandwidth_text, latency_text, origin, rate_text
-from rmpa.core.counters import ArrivalStats, SampleRing, SampleSummary
+from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
 
@@ -162,18 +164,23 @@ class _Figures:
     """
 
     def __init__(self, window: int) -> None:
-        self._shown = 0
-        self.flow = ArrivalStats(window)
+        self._shown = self.messages = 0
+        self._last: float | None = None
+        self._periods: deque[float] = deque(maxlen=window)
+        self._sizes: deque[int] = deque(maxlen=window)
 
     def add(self, received: Received, now: float) -> None:
         """One message, at ``now`` (monotonic seconds)."""
-        self.flow.arrived(now, len(received.raw))
+        if self._last is not None:
+            self._periods.append(now - self._last)
+        self._last = now
+        self._sizes.append(len(received.raw))
+        self.messages += 1
 
     def fresh(self) -> bool:
         """Whether a message came since the last call."""
-        fresh = self.flow.messages > self._shown
-        self._shown = self.flow.messages
-        return fresh
+        shown, self._shown = self._shown, self.messages
+        return self.messages > shown
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
         """For JSON, in base units; ``source`` is what measured them, ``routes`` the agent's figures."""
@@ -196,8 +203,9 @@ class _Rate(_Figures):
     """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
 
     def own(self) -> dict[str, float]:
-        p = self.flow.periods()
-        return {"rate": self.flow.rate(), "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
+        p = SampleSummary.of(self._periods)
+        rate = 1 / p.mean if p.mean > 0 else math.nan
+        return {"rate": rate, "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
 
     def text(self) -> str:
         v = self.own()
@@ -213,17 +221,10 @@ class _Rate(_Figures):
 class _Bandwidth(_Figures):
     """Bytes a second, in the format of ``rostopic bw``."""
 
-    def __init__(self, window: int) -> None:
-        super().__init__(window)
-        self._sizes = SampleRing(window)
-
-    def add(self, received: Received, now: float) -> None:
-        super().add(received, now)
-        self._sizes.add(len(received.raw))
-
     def own(self) -> dict[str, float]:
-        s = self._sizes.summary()
-        rate = self.flow.bandwidth()
+        s, elapsed = SampleSummary.of(self._sizes), math.fsum(self._periods)
+        first = self._sizes[0] if len(self._sizes) > len(self._periods) else 0  # came before the first period
+        rate = (sum(self._sizes) - first) / elapsed if elapsed > 0 else math.nan
         return {"bandwidth": rate, "mean": s.mean, "min": s.minimum, "max": s.maximum, "window": s.count}
 
     def text(self) -> str:
@@ -248,7 +249,7 @@ class _Delay(_Figures):
 
     def __init__(self, window: int, *, by_link: bool) -> None:
         super().__init__(window)
-        self._delays = SampleRing(window)
+        self._delays: deque[float] = deque(maxlen=window)
         self._by_link = by_link
         from rmpa.ros.types.messages import MessageType
 
@@ -264,13 +265,13 @@ class _Delay(_Figures):
         super().add(received, now)
         if _has_header(received.kind):
             stamp = received.message.header.stamp
-            self._delays.add((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
+            self._delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
         elif not self._by_link or proxied_peer(received.caller_id) is None:
             raise RmpaError(f"{received.kind.name} has no header, and so no stamp to tell its age by")
 
     def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
         """Seconds; without headers those of the agent, if there is one remote source."""
-        if self._delays.total:
+        if self._delays:
             return {"source": "header", "error": None, **self.own(), "routes": routes}
         latency = routes[0].latency if len(routes) == 1 else None
         if latency is None:
@@ -279,12 +280,12 @@ class _Delay(_Figures):
         return {"source": "link", "error": latency.error, **spread, "window": latency.count, "routes": routes}
 
     def own(self) -> dict[str, float]:
-        s: SampleSummary = self._delays.summary()
+        s = SampleSummary.of(self._delays)
         return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
 
     def text(self) -> str:
         """As ``rostopic delay``, with a digit more."""
-        if not self._delays.total:
+        if not self._delays:
             return "no header, and so no stamp to tell the whole age by"
         v = self.own()
         spread = f"min: {v['min']:.4f}s max: {v['max']:.4f}s std dev: {v['sd']:.5f}s window: {v['window']}"
@@ -325,10 +326,10 @@ def _watch(topic: str, make: Callable[[Master], _Figures], count: int | None, op
         await _show(figures, master, wanted, as_json=as_json)
 
     def take(received: Received) -> None:
-        if figures.flow.messages == count:
+        if figures.messages == count:
             return  # further messages arrived before the node was closed
         figures.add(received, time.monotonic())
-        if figures.flow.messages == count:
+        if figures.messages == count:
             raise Enough
 
     async def run() -> None:

@@ -1,6 +1,7 @@
-"""What all rooms count and time with: counters, logs, rings of figures, timers, back-off, token buckets.
+"""What all rooms count and time with: counters, logs, figures, timers, back-off, token buckets.
 
-Counters of refused and dropped things, and a log of refusals that is limited in rate.
+Protocol machines get ``now`` and never read a clock: seconds (float) of a monotonic clock with an arbitrary zero.
+Stamps on the wire are nanoseconds (int) of the sender's wall clock.
 """
 
 from __future__ import annotations
@@ -9,13 +10,12 @@ import codecs
 import json
 import logging
 import math
-from array import array
-from collections import Counter, OrderedDict
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from heapq import heapify, heappop, heappush
-from typing import TYPE_CHECKING, Final, Generic, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 from rmpa.core import limits
 
@@ -43,17 +43,6 @@ class Counters:
         return dict(sorted(self._counts.items()))
 
 
-class _RefusalMemory:
-    """When a refusal of each kind was logged last, and the lines of each name."""
-
-    __slots__ = ("last", "lines")
-
-    def __init__(self) -> None:
-        self.last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
-        # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
-        self.lines: dict[str, tuple[float, int, int]] = {}
-
-
 class RefusalLog:
     """Counts each refusal, and logs each kind (name and address) at most once in ``limits.LOG_INTERVAL`` seconds.
 
@@ -64,12 +53,15 @@ class RefusalLog:
         counters: Counts every refusal, logged or not.
     """
 
-    __slots__ = ("_counters", "_logger", "_memory")
+    __slots__ = ("_counters", "_last", "_lines", "_logger")
 
     def __init__(self, logger: logging.Logger, counters: Counters) -> None:
         self._logger = logger
         self._counters = counters
-        self._memory: _RefusalMemory | None = None
+        self._last: dict[tuple[str, str], tuple[float, int]] = {}
+        """By kind: when it was logged last, and how many are suppressed since then; the oldest line first."""
+        self._lines: dict[str, tuple[float, int, int]] = {}
+        """By name: the start of the interval, the lines written in it, and the lines suppressed in it."""
 
     def count(self, name: str) -> None:
         """Count ``name`` without a line in the log."""
@@ -85,29 +77,24 @@ class RefusalLog:
             text: What happened and what to do, for the user.
         """
         self._counters.add(name)
-        if self._memory is None:  # most logs of an agent with thousands of proxies never have a line
-            self._memory = _RefusalMemory()
-        memory, kind = self._memory, (name, who)
-        last, suppressed = memory.last.get(kind, (float("-inf"), 0))
+        kind = name, who
+        last, suppressed = self._last.get(kind, (float("-inf"), 0))
         if now - last < limits.LOG_INTERVAL:
-            memory.last[kind] = (last, suppressed + 1)
+            self._last[kind] = (last, suppressed + 1)
             return
-        since, lines, hidden = memory.lines.get(name, (now, 0, 0))
+        since, lines, hidden = self._lines.get(name, (now, 0, 0))
         if now - since >= limits.LOG_INTERVAL:
             since, lines = now, 0
         if lines >= limits.LOG_LINES_MAX:
-            memory.lines[name] = (since, lines, hidden + 1)
+            self._lines[name] = (since, lines, hidden + 1)
             return
-        memory.lines[name] = (since, lines + 1, 0)
-        suppressed += hidden
-        memory.last[kind] = (now, 0)
-        memory.last.move_to_end(kind)
-        if len(memory.last) > limits.LOG_KINDS_MAX:
-            memory.last.popitem(last=False)
-        if suppressed:
-            self._logger.warning("! %s (%d more like this since the last line)", text, suppressed)
-        else:
-            self._logger.warning("! %s", text)
+        self._lines[name] = (since, lines + 1, 0)
+        self._last.pop(kind, None)
+        self._last[kind] = (now, 0)
+        if len(self._last) > limits.LOG_KINDS_MAX:
+            del self._last[next(iter(self._last))]
+        more = f" ({suppressed + hidden} more like this since the last line)" if suppressed + hidden else ""
+        self._logger.warning("! %s%s", text, more)
 
 
 # The formats of log records: one line of text, or one JSON object a line; and failures that are only logged.
@@ -117,7 +104,7 @@ class RefusalLog:
 _ESCAPE: Final = codecs.getencoder("unicode_escape")
 
 
-def room_of(logger: str) -> str:
+def _room_of(logger: str) -> str:
     """The room that a logger belongs to: ``rmpa.mesh.io.mesh`` gives ``mesh``."""
     parts = logger.split(".")
     return parts[1] if parts[0] == "rmpa" and len(parts) > 1 else parts[0]
@@ -147,34 +134,30 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\t" else _ESCAPE(c)[0].decode("ascii") for c in text)
 
 
-class TextFormatter(logging.Formatter):
-    """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the following lines."""
+class _Formatter(logging.Formatter):
+    """One record as text, or as one JSON object a line; ``configure_logging`` says which."""
+
+    as_json = False
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record."""
-        when = datetime.fromtimestamp(record.created).astimezone()
-        clock = f"{when:%H:%M:%S}.{int(record.msecs):03d}"
-        line = f"{clock} {record.levelname.lower():<7} {room_of(record.name):<9} {_one_line(record.getMessage())}"
-        if record.exc_info:
-            line += "\n" + self.formatException(record.exc_info)
-        return line
+        """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the following lines.
 
-
-class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time (ISO 8601, UTC), level, room, logger, text, and traceback if there is one."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """One record."""
+        In JSON: time (ISO 8601, UTC), level, room, logger, text, and traceback if there is one.
+        """
+        level, room = record.levelname.lower(), _room_of(record.name)
+        trace = self.formatException(record.exc_info) if record.exc_info else ""
+        if not self.as_json:
+            clock = f"{datetime.fromtimestamp(record.created).astimezone():%H:%M:%S}.{int(record.msecs):03d}"
+            line = f"{clock} {level:<7} {room:<9} {_one_line(record.getMessage())}"
+            return f"{line}\n{trace}" if trace else line
         fields = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(),
-            "room": room_of(record.name),
+            "level": level,
+            "room": room,
             "logger": record.name,
             "text": record.getMessage(),
         }
-        if record.exc_info:
-            fields["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(fields, ensure_ascii=False)
+        return json.dumps(fields | {"traceback": trace} if trace else fields, ensure_ascii=False)
 
 
 def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) -> None:
@@ -186,17 +169,17 @@ def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) 
         as_json: JSON lines instead of text.
     """
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(JsonFormatter() if as_json else TextFormatter())
+    formatter = _Formatter()
+    formatter.as_json = as_json
+    handler.setFormatter(formatter)
     root = logging.getLogger()
-    for old in root.handlers[:]:
-        root.removeHandler(old)
-    root.addHandler(handler)
+    root.handlers[:] = [handler]
     root.setLevel(level.upper())
     # A lost log line (the reader of a pipe is gone) must not print a traceback for every further line.
     logging.raiseExceptions = False
 
 
-# Statistics over rings of fixed size: periods, latencies, rates. Plain Python: numpy would cost the agent 15 MB.
+# Statistics of periods and latencies. Plain Python: numpy would cost the agent 15 MB.
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,16 +204,7 @@ class SampleSummary:
         mean = math.fsum(data) / len(data)
         # Computed as the distance between two points: ``math.dist`` sums in C, ten times as fast as a loop.
         sd = math.dist(data, [mean] * len(data)) / math.sqrt(len(data))
-        return cls(
-            len(data),
-            mean,
-            sd,
-            data[0],
-            data[-1],
-            percentile(data, 50),
-            percentile(data, 95),
-            percentile(data, 99),
-        )
+        return cls(len(data), mean, sd, data[0], data[-1], *(percentile(data, percent) for percent in (50, 95, 99)))
 
 
 def percentile(ordered: list[float], percent: float) -> float:
@@ -243,94 +217,6 @@ def percentile(ordered: list[float], percent: float) -> float:
     return ordered[low] + (ordered[high] - ordered[low]) * (position - low)
 
 
-class SampleRing:
-    """The last ``size`` samples; adding one takes constant time.
-
-    Args:
-        size: How many samples are kept, at least 1.
-
-    Raises:
-        ValueError: ``size`` is below 1.
-    """
-
-    def __init__(self, size: int) -> None:
-        if size < 1:
-            raise ValueError(f"a ring holds at least one sample, not {size}")
-        self._data = array("d", bytes(8 * size))
-        self._next = 0
-        self.total = 0
-        """The number of samples ever added."""
-
-    def add(self, sample: float) -> None:
-        """Add one sample; it replaces the oldest when the ring is full."""
-        self._data[self._next] = sample
-        self._next = (self._next + 1) % len(self._data)
-        self.total += 1
-
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._next = 0
-        self.total = 0
-
-    def __len__(self) -> int:
-        return min(self.total, len(self._data))
-
-    def __iter__(self) -> Iterator[float]:
-        """Oldest first."""
-        if self.total >= len(self._data):
-            yield from self._data[self._next :]
-        yield from self._data[: self._next]
-
-    def summary(self) -> SampleSummary:
-        """The summary of the samples in the ring."""
-        return SampleSummary.of(self)
-
-
-class ArrivalStats:
-    """Arrivals of one stream of messages: their periods and bytes, over the last ``window`` messages.
-
-    Args:
-        window: How many periods are kept.
-    """
-
-    def __init__(self, window: int = 1000) -> None:
-        self._periods = SampleRing(window)
-        self._sizes = SampleRing(window)
-        self._last: float | None = None
-        self.messages = 0
-        """Messages ever seen."""
-        self.bytes = 0
-        """Bytes ever seen."""
-
-    def arrived(self, now: float, size: int) -> None:
-        """Count one message of ``size`` bytes at ``now`` (monotonic seconds)."""
-        if self._last is not None:
-            self._periods.add(now - self._last)
-            self._sizes.add(size)
-        self._last = now
-        self.messages += 1
-        self.bytes += size
-
-    @property
-    def last(self) -> float | None:
-        """When the last message arrived, in monotonic seconds; ``None`` before the first."""
-        return self._last
-
-    def periods(self) -> SampleSummary:
-        """Seconds between messages."""
-        return self._periods.summary()
-
-    def rate(self) -> float:
-        """Messages per second over the window; ``nan`` before the second message."""
-        summary = self.periods()
-        return 1 / summary.mean if summary.count and summary.mean > 0 else math.nan
-
-    def bandwidth(self) -> float:
-        """Bytes per second over the window; ``nan`` before the second message."""
-        elapsed = math.fsum(self._periods)
-        return math.fsum(self._sizes) / elapsed if elapsed > 0 else math.nan
-
-
 # Many timers of one protocol machine in a heap.
 
 
@@ -338,21 +224,14 @@ _SPARE: Final = 64
 """The heap, which also holds moved and cancelled entries, is rebuilt above this plus twice the live entries."""
 
 
-class _Key(Protocol):
-    """Hashable and ordered: of keys that are due at the same time the lower one comes first."""
-
-    def __hash__(self) -> int: ...
-
-    def __lt__(self, other: Self, /) -> bool: ...
-
-
-_K = TypeVar("_K", bound=_Key)
+_K = TypeVar("_K")
 
 
 class TimerQueue(Generic[_K]):
     """When each of many keys is due: a machine with hundreds of peers must not scan all of them for one event.
 
-    ``set`` and ``pop`` cost O(log n) on average, ``next`` O(1). Times are seconds on the machine's clock.
+    ``set`` and ``pop`` cost O(log n) on average, ``next`` O(1). Times are seconds on the machine's clock. Keys are
+    ordered: of those that are due at the same time the lower one comes first.
     """
 
     def __init__(self) -> None:
@@ -430,32 +309,9 @@ class Backoff:
         self._next = self._first
 
 
-# Time is an argument: protocol machines get ``now`` and never read a clock.
-#
-# ``now`` is seconds (float) of a monotonic clock with an arbitrary zero; stamps on the wire are nanoseconds (int)
-# of
-# the sender's wall clock.
-
-
-class Clock(Protocol):
-    """A source of time for the I/O parts; tests pass a simulated one."""
-
-    def now(self) -> float:
-        """Monotonic seconds."""
-        ...
-
-    def wall_ns(self) -> int:
-        """Wall clock, in nanoseconds since the epoch."""
-        ...
-
-
 def earliest(*timers: float | None) -> float | None:
     """The first of several timers; ``None`` means never."""
-    first = None
-    for timer in timers:
-        if timer is not None and (first is None or timer < first):
-            first = timer
-    return first
+    return min((timer for timer in timers if timer is not None), default=None)
 
 
 # A token bucket: limits the rate of an action.

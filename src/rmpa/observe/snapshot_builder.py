@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 import rmpa
+from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits
 from rmpa.observe.control import GraphHistory, GraphRevision
@@ -178,7 +179,7 @@ def _figures(stats: CallStats | None) -> dict[str, Any]:
         "calls": stats.calls,
         "failed": stats.failed,
         "active": stats.active,
-        "latency": SampleSpread.of(stats.latencies.summary()) if stats.latencies.total else None,
+        "latency": SampleSpread.of(SampleSummary.of(stats.latencies)) if stats.latencies else None,
         "problem": stats.problem,
     }
 

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Collection
 
-    from rmpa.core.counters import Clock, Counters
+    from rmpa.core.counters import Counters
+    from rmpa.runtime.loop import SystemClock
     from rmpa.runtime.tls import TlsHandshake
     from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.membership import Membership
@@ -70,7 +71,7 @@ class JoinServer:
         self,
         authority: MeshAuthority,
         membership: Membership,
-        clock: Clock,
+        clock: SystemClock,
         is_linked: Callable[[str], bool],
         counters: Counters,
     ) -> None:

@@ -25,7 +25,7 @@ from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, member_context
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.core.counters import Clock
+    from rmpa.runtime.loop import SystemClock
     from rmpa.trust.store import MemberFiles, TrustStore
 
 
@@ -83,7 +83,7 @@ class Membership:
         StartError: A file is broken, or they do not belong together.
     """
 
-    def __init__(self, store: TrustStore, files: MemberFiles, clock: Clock, wall: Callable[[], float]) -> None:
+    def __init__(self, store: TrustStore, files: MemberFiles, clock: SystemClock, wall: Callable[[], float]) -> None:
         self.store = store
         self.files = files
         self._clock = clock
@@ -105,7 +105,7 @@ class Membership:
         self._make_contexts()
 
     @classmethod
-    def load(cls, store: TrustStore, clock: Clock, wall: Callable[[], float]) -> Membership:
+    def load(cls, store: TrustStore, clock: SystemClock, wall: Callable[[], float]) -> Membership:
         """Read the files of a member; arguments and errors as for the class."""
         return cls(store, store.load(), clock, wall)
 

@@ -32,6 +32,7 @@ from rmpa.gateway.ros2.mapping import (
 from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.loop import SystemClock
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
@@ -136,7 +137,7 @@ class Query:
 
 
 @dataclass
-class Out:
+class Out(SystemClock):
     """What the goals do, and their clock."""
 
     time: float = 0.0

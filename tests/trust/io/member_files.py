@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives import serialization
 
+from rmpa.runtime.loop import SystemClock
 from rmpa.trust.certificates import DenyList, KeyList, sign
 from rmpa.trust.membership import Membership
 from rmpa.trust.packets import GroupKey
@@ -22,7 +23,7 @@ KEYS = KeyList.of(1, [GroupKey(1, b"k" * 32)])
 
 
 @dataclass
-class HandClock:
+class HandClock(SystemClock):
     """Monotonic seconds and wall clock, both set by a test."""
 
     seconds: float = 100.0

@@ -36,7 +36,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.tcpros import ANY, parse_service_uri
-from rmpa.runtime.tcp_connections import connections
+from rmpa.runtime.kernel_tcp import connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

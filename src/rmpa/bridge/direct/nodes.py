@@ -13,14 +13,14 @@ from rmpa.ros.environment import is_loopback
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault
-from rmpa.runtime.tcp_connections import connections, end_connections, listening_addresses
+from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.wire.slave_api import BusLink
-    from rmpa.runtime.tcp_connections import TcpConnection
+    from rmpa.runtime.kernel_tcp import TcpSocket
 
 MASTER: Final = "/master"
 """The caller id of ``publisherUpdate``, as rosmaster has it."""
@@ -125,7 +125,7 @@ async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
     return ""
 
 
-def end_all(found: list[TcpConnection] | None) -> str:
+def end_all(found: list[TcpSocket] | None) -> str:
     """End connections; return why it failed, or empty. ``None``: the kernel did not list them."""
     if found is None:
         return "the kernel does not say which connections there are"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -22,15 +22,14 @@ from rmpa.bridge.services.bodies import (
     ServiceAbout,
     ServicePool,
 )
-from rmpa.core.counters import SampleRing
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import SERIAL_MASK, is_type_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.http.rpc import is_own_name
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
+from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
-from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping
@@ -81,7 +80,7 @@ class CallStats:
         self.active = 0
         self.problem = ""
         """The error of the last call that failed, or empty."""
-        self.latencies = SampleRing(limits.SERVICE_LATENCIES)
+        self.latencies: deque[float] = deque(maxlen=limits.SERVICE_LATENCIES)
         """Seconds from request to reply, of calls that succeeded."""
 
     def fail(self, problem: str) -> None:
@@ -154,7 +153,7 @@ class Caller(BodyReceiver):
         ok = body[:1] == _OK
         self._ended(call)
         if ok:
-            self._stats.latencies.add(now - began)
+            self._stats.latencies.append(now - began)
         else:
             self._stats.fail(_text(memoryview(body)[1:]))
         if isinstance(body, bytearray):
@@ -293,7 +292,7 @@ class Server(BodyReceiver):
         stats = self._stats
         stats.active -= 1
         if ok:
-            stats.latencies.add(self._loop.time() - began)
+            stats.latencies.append(self._loop.time() - began)
         else:
             stats.fail(_text(body))
         if not self._outgoing.take(len(body)):

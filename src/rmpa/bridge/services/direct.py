@@ -18,7 +18,7 @@ from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.tcp_connections import connections
+from rmpa.runtime.kernel_tcp import connections
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -63,7 +63,7 @@ class ServicePaths(Paths):
         """How many lookups of each were answered so."""
         self._looked: set[str] = set()
         """Those looked up since ``_look``, or to whose servers clients were connecting then."""
-        self._waiting: set[tuple[int, int]] = set()
+        self._waiting: set[bytes] = set()
         """The sockets that were connecting then, by their cookies."""
         self._looking: asyncio.TimerHandle | None = None
         self._used: dict[str, set[tuple[str, int]]] = {}
@@ -114,10 +114,10 @@ class ServicePaths(Paths):
             if path is None or path.endpoint is None:
                 continue
             connecting = [one for one in connections(remote=path.endpoint) or () if one.state == "SYN_SENT"]
-            self._waiting |= {one.cookie for one in connecting}
+            self._waiting |= {one.id for one in connecting}
             if connecting:
                 self._looked.add(service)
-            if stuck := [one for one in connecting if one.cookie in before]:
+            if stuck := [one for one in connecting if one.id in before]:
                 end_all(stuck)
                 self._shared.counters.add("direct.service_unreachable")
                 text = f"clients get no answer from {self.address(path.peer, service)}"

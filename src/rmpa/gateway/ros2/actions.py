@@ -22,7 +22,6 @@ from rmpa.gateway.ros2.shown_action import JoinedAction, ShownAction, find_heade
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.core.counters import Clock
     from rmpa.gateway.foreign import TopicTap
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.format import Ros2Endpoint
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.runtime.loop import SystemClock
 
 
 # An actionlib server of a module, as an action server in ROS 2's graph.
@@ -73,7 +73,7 @@ class GoalsToRos1:
         clock: Both clocks.
     """
 
-    def __init__(self, pair: ActionPair, out: OfferedAction, clock: Clock) -> None:
+    def __init__(self, pair: ActionPair, out: OfferedAction, clock: SystemClock) -> None:
         self.pair = pair
         self._out = out
         self._clock = clock

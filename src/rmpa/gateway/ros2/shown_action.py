@@ -27,7 +27,6 @@ from rmpa.runtime.loop import MachineTimer, SystemClock
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.core.counters import Clock
     from rmpa.gateway.foreign import ProxiedTopic, TopicTap
     from rmpa.gateway.neighbour import MeshSource, ZenohSample
     from rmpa.gateway.ros2.format import Ros2Endpoint
@@ -245,7 +244,7 @@ class GoalsToRos2:
         clock: Both clocks.
     """
 
-    def __init__(self, pair: ActionPair, out: ShownAction, clock: Clock) -> None:
+    def __init__(self, pair: ActionPair, out: ShownAction, clock: SystemClock) -> None:
         self.pair = pair
         self._out = out
         self._clock = clock

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.core.contract import Contract
-    from rmpa.core.counters import Clock
     from rmpa.gateway.foreign import TopicTap
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.sites.plans import SiteExport
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer
+    from rmpa.runtime.loop import SystemClock
 
 
 # The limits of rate and size of one topic that goes out: a thin link is protected at its near end. Sans-I/O.
@@ -271,7 +271,7 @@ class ExportedTopic:
         graph: AgentGraph,
         session: OpenSession,
         contract: Contract,
-        clock: Clock,
+        clock: SystemClock,
     ) -> None:
         self.entry = entry
         self._graph = graph

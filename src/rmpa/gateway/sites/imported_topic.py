@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.contract import Contracts
-    from rmpa.core.counters import Clock
     from rmpa.gateway.neighbour import ZenohSample
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.sites.catalogue import CrossingRules
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.wire.tcpros import TopicDescription
+    from rmpa.runtime.loop import SystemClock
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class ImportedTopic:
         site: str,
         graph: AgentGraph,
         session: OpenSession,
-        clock: Clock,
+        clock: SystemClock,
         on_demand: Callable[[ImportedTopic, bool], None],
         interrupted: InterruptedTopic | None = None,
     ) -> None:
@@ -347,7 +347,7 @@ class SiteTopics(SitePart):
         session: OpenSession,
         rules: CrossingRules,
         contracts: Contracts,
-        clock: Clock,
+        clock: SystemClock,
         counters: Counters | None = None,
     ) -> None:
         self._site = site

@@ -33,12 +33,13 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Mapping
 
-    from rmpa.core.counters import Clock, Counters
+    from rmpa.core.counters import Counters
     from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.keepalive import RemoteClock, RestPace
+    from rmpa.runtime.loop import SystemClock
 
     OnMark = Callable[[FrameKind, int, int], None]
 
@@ -129,7 +130,7 @@ class Connection:
         ours: Identity,
         *,
         owner: ConnectionOwner,
-        clock: Clock,
+        clock: SystemClock,
         endpoint: tuple[str, int],
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,

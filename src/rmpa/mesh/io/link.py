@@ -23,9 +23,10 @@ from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_h
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from rmpa.core.counters import Clock, Counters
+    from rmpa.core.counters import Counters
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.io.connection import Connection
+    from rmpa.runtime.loop import SystemClock
     from rmpa.runtime.stream import Stream
     from rmpa.runtime.tls import Buffer
 
@@ -204,7 +205,9 @@ class PeerLink:
         on_bulk_wanted: Called with this link when something waits for the bulk lane, which has no connection.
     """
 
-    def __init__(self, connection: Connection, clock: Clock, on_bulk_wanted: Callable[[PeerLink], None]) -> None:
+    def __init__(
+        self, connection: Connection, clock: SystemClock, on_bulk_wanted: Callable[[PeerLink], None]
+    ) -> None:
         self.id: Final = connection.id
         self.identity: Final = connection.identity
         self.guid: Final = connection.identity.guid

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Coroutine
 
-    from rmpa.core.counters import Clock
     from rmpa.core.identity import Guid, Identity
     from rmpa.mesh.frames import Hello
     from rmpa.mesh.io.securing import OnJoin, SecuredSocket
@@ -91,7 +90,7 @@ class Mesh:
         on_control: OnControl,
         handlers: LinkHandlers,
         lanes: LaneSettings | None = None,
-        clock: Clock | None = None,
+        clock: SystemClock | None = None,
         counters: Counters | None = None,
         rng: Callable[[], float] = random.random,
         dialler: Dialler | None = None,

@@ -26,10 +26,11 @@ from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
-    from rmpa.core.counters import Clock, RefusalLog
+    from rmpa.core.counters import RefusalLog
     from rmpa.core.identity import Identity
     from rmpa.mesh.frames import Hello
     from rmpa.mesh.keepalive import SocketAddress
+    from rmpa.runtime.loop import SystemClock
     from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)
@@ -228,7 +229,7 @@ class Securing:
         self,
         security: Membership,
         *,
-        clock: Clock,
+        clock: SystemClock,
         refusals: RefusalLog,
         on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None],
         on_refused: Callable[[str, Refuse], None],

@@ -21,14 +21,14 @@ from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.why.diagnosis import fallbacks, stuck, subscriber_text
 from rmpa.observe.why.diagnosis import remedy as remedy_for
 from rmpa.ros.http.rpc import call_api
-from rmpa.runtime.tcp_connections import listening_sockets
+from rmpa.runtime.kernel_tcp import listening_sockets
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot, UnreachableInfo
-    from rmpa.runtime.tcp_connections import ListeningSocket
+    from rmpa.runtime.kernel_tcp import TcpSocket
     from rmpa.trust.permissions import TrustStatus
 
 _PERMISSION: Final = "permission."
@@ -249,7 +249,7 @@ def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] |
 
 
 def exposed_ports(
-    nodes: Mapping[str, int], sockets: Sequence[ListeningSocket], processes: Mapping[int, int], agent_pid: int
+    nodes: Mapping[str, int], sockets: Sequence[TcpSocket], processes: Mapping[int, int], agent_pid: int
 ) -> dict[str, tuple[int, ...]]:
     """The ports beyond loopback of each node.
 
@@ -261,7 +261,7 @@ def exposed_ports(
     """
     by_process, by_port = defaultdict(set), defaultdict(set)
     for each in sockets:
-        by_port[each.port].add(each)
+        by_port[each.local[1]].add(each)
         if each.inode in processes:
             by_process[processes[each.inode]].add(each)
     found: dict[str, tuple[int, ...]] = {}
@@ -270,7 +270,7 @@ def exposed_ports(
         if agent_pid in owners_of_it:
             continue
         its = by_port[port].union(*(by_process[pid] for pid in owners_of_it))
-        ports = {each.port for each in its if is_beyond_loopback(each.address)}
+        ports = {each.local[1] for each in its if is_beyond_loopback(each.local[0])}
         if ports:
             found[node] = tuple(sorted(ports))
     return found

@@ -60,7 +60,7 @@ from rmpa.observe.doctor.network import (
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
-from rmpa.runtime.tcp_connections import program_at
+from rmpa.runtime.kernel_tcp import program_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -31,8 +31,8 @@ from rmpa.ros.wire.tcpros import subscriber_header
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use, is_shortage
+from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
-from rmpa.runtime.tcp_connections import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

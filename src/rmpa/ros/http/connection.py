@@ -22,8 +22,8 @@ from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser
 from rmpa.ros.wire.xmlrpc import serialize_fault
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
+from rmpa.runtime.kernel_tcp import program_at
 from rmpa.runtime.loop import yield_to_data
-from rmpa.runtime.tcp_connections import program_at
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Iterable

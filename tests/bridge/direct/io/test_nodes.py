@@ -12,8 +12,8 @@ from rmpa.bridge.direct.nodes import bus_links, end_all, end_links, publisher_up
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
-from rmpa.runtime import tcp_connections
-from rmpa.runtime.tcp_connections import connections, may_end_connections
+from rmpa.runtime import kernel_tcp
+from rmpa.runtime.kernel_tcp import connections, may_end_connections
 from tests.ros.node.peers import STRING, until
 from tests.runtime.capabilities import NET_ADMIN, without
 
@@ -94,7 +94,7 @@ async def test_a_publishers_connections_to_one_address_end(pair: Pair) -> None:
 
 async def test_without_the_right_the_reason_is_told(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     # As where the kernel (Yama) lets no process copy another one's descriptors.
-    monkeypatch.setattr(tcp_connections, "_disconnect", lambda _: False)
+    monkeypatch.setattr(kernel_tcp, "_disconnect", lambda _: False)
     ports = pair.ports
     assert ports
     if may_end_connections():

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.runtime import tcp_connections
+from rmpa.runtime import kernel_tcp
 from rmpa.runtime.accept import raise_file_limit
-from rmpa.runtime.sock_diag import SockDiag
-from rmpa.runtime.tcp_connections import (
-    TcpConnection,
+from rmpa.runtime.kernel_tcp import (
+    TcpSocket,
     ask_listening_ports,
     connections,
     end_connections,
@@ -33,8 +32,6 @@ from tests.runtime.capabilities import NET_ADMIN, without
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from rmpa.runtime.sock_diag import InetSocket
 
 DEADLINE: Final = 30.0
 
@@ -58,7 +55,7 @@ def pair(stack: ExitStack, listener: socket.socket) -> tuple[socket.socket, sock
     return client, stack.enter_context(listener.accept()[0])
 
 
-def seen(*, local_port: int | None = None, remote: tuple[str, int | None] | None = None) -> list[TcpConnection]:
+def seen(*, local_port: int | None = None, remote: tuple[str, int | None] | None = None) -> list[TcpSocket]:
     found = connections(local_port=local_port, remote=remote)
     assert found is not None
     return found
@@ -117,7 +114,7 @@ def test_connections_are_found_by_either_end(stack: ExitStack) -> None:
         client.getsockname(),
         other.getsockname(),
     }
-    assert len({of.cookie for of in at_port}) == 2
+    assert len({of.id for of in at_port}) == 2
     assert seen(remote=("127.0.0.9", None)) == []
     assert seen(local_port=port, remote=("127.0.0.9", None)) == []
     every = seen()
@@ -157,10 +154,10 @@ def test_a_dump_of_thousands_is_complete(stack: ExitStack) -> None:
 
 
 def test_a_kernel_that_does_not_tell(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: SockDiag) -> None:
+    def refuse() -> None:
         raise OSError(errno.EPROTONOSUPPORT, "Protocol not supported")
 
-    monkeypatch.setattr(SockDiag, "__init__", refuse)
+    monkeypatch.setattr(kernel_tcp, "open_netlink", refuse)
     assert ask_listening_ports() is None
     assert listening_addresses(11311) is None
     assert connections() is None
@@ -295,11 +292,11 @@ def test_without_the_capability_those_of_others_are_not_ended(stack: ExitStack) 
 
 @pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.EINVAL])
 def test_a_kernel_that_cannot_end_connections(stack: ExitStack, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    def refuse(_: SockDiag, __: InetSocket) -> int:
-        return number
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
 
     client, _ = pair(stack, listen(stack))
-    monkeypatch.setattr(SockDiag, "destroy", refuse)
+    monkeypatch.setattr(kernel_tcp, "destroy", refuse)
     with pytest.raises(OSError, match="CONFIG_INET_DIAG_DESTROY") as raised:
         end_connections(seen(remote=client.getsockname()))
     assert raised.value.errno == errno.EOPNOTSUPP
@@ -311,7 +308,7 @@ def test_a_kernel_that_cannot_end_connections(stack: ExitStack, monkeypatch: pyt
 
 
 def test_a_kernel_that_only_pretends_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tcp_connections, "end_connections", len)
+    monkeypatch.setattr(kernel_tcp, "end_connections", len)
     try_to_end.cache_clear()
     try:
         assert "did not end a connection" in may_end_connections()
