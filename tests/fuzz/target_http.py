@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.http.connection import HttpConnection
-from rmpa.ros.http.rpc import XmlRpcServer
+from rmpa.ros.http.server import HttpConnection, XmlRpcServer
 from rmpa.ros.wire.http import ResponseParser
 from rmpa.ros.wire.xmlrpc import serialize_call, serialize_response
 

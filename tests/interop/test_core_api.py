@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.http.rpc import XmlRpcServer, call
+from rmpa.ros.http.rpc import call
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, brief
 from tests.interop.ros import free_port
 

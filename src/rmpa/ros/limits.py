@@ -129,7 +129,7 @@ HTTP_BACKLOG: Final = 1024
 """Length of the listen queue: all nodes of a robot register at once. A SYN that finds it full is sent again after
 1 s."""
 HTTP_CONNECTIONS_MAX: Final = 512
-"""Open connections to one XML-RPC server: rospy keeps one per thread alive. Beyond it ``ros.http.connection`` chooses
+"""Open connections to one XML-RPC server: rospy keeps one per thread alive. Beyond it ``ros.http.server`` chooses
 the one to close for a new one."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
 """Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves."""

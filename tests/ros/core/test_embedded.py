@@ -11,7 +11,8 @@ from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core import liveness as identify
 from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
-from rmpa.ros.http.rpc import XmlRpcServer, call, call_api
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode

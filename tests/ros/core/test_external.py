@@ -14,7 +14,7 @@ from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
-from rmpa.ros.http.rpc import XmlRpcServer
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from rmpa.ros import limits
 from rmpa.ros.core import state
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.state import StoredState, parse, serialize
-from rmpa.ros.http.rpc import XmlRpcServer, call, call_api
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, legal_text, response_pieces
 

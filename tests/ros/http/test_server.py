@@ -10,7 +10,8 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import XmlRpcServer, call
+from rmpa.ros.http.rpc import call
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
 
 if TYPE_CHECKING:

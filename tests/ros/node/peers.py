@@ -7,7 +7,7 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING, Final, Self
 
-from rmpa.ros.http.rpc import XmlRpcServer
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, encode_header, parse_header, publisher_header
 
 if TYPE_CHECKING:

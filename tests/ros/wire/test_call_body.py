@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.xmlrpc import CallBody, call_name, serialize_call, too_large, too_many
+from rmpa.ros.wire.http import CallBody, call_name, too_large, too_many
+from rmpa.ros.wire.xmlrpc import serialize_call
 
 
 @pytest.mark.parametrize(
@@ -51,11 +52,11 @@ def test_any_parts_within_the_bound_come_out_whole(parts: list[bytes], limit: in
             body.add(part)
             assert len(body._data) <= max(limit, 4 * KIB)
         whole = b"".join(parts)
-        assert len(body) == len(whole)
+        assert body.size == len(whole)
         data, refusal = body.end()
         if len(whole) <= 100 or (len(whole) <= limit and room):
             assert (bytes(data), refusal) == (whole, "")
         else:
             assert whole.startswith(bytes(data))
             assert str(len(whole)) in refusal
-        assert (len(body), body.refused) == (0, False), "the next one begins anew"
+        assert (body.size, body.why) == (0, None), "the next one begins anew"

@@ -15,7 +15,7 @@ from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolEr
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc import (
-    CallReader,
+    DocumentReader,
     RosFault,
     RosReply,
     XmlRpcValue,
@@ -86,25 +86,25 @@ def test_every_prefix_of_a_call_is_refused_or_equal() -> None:
 
 @pytest.mark.parametrize("size", [1, 2, 7, 100])
 def test_a_call_is_read_piece_by_piece(size: int) -> None:
-    reader = CallReader()
+    reader = DocumentReader()
     for begin in range(0, len(GOLDEN_CALL), size):
         reader.feed(GOLDEN_CALL[begin : begin + size])
-    assert reader.close() == ("setParam", GOLDEN_PARAMS)
+    assert reader.call() == ("setParam", GOLDEN_PARAMS)
 
 
 def test_a_fault_in_pieces_is_no_call() -> None:
-    reader = CallReader()
+    reader = DocumentReader()
     for byte in serialize_fault(1, "no"):
         reader.feed(bytes([byte]))
     with pytest.raises(RemoteProtocolError, match="fault came"):
-        reader.close()
+        reader.call()
 
 
 def test_an_endless_comment_in_pieces_is_looked_at_a_few_times_only() -> None:
     """expat begins again at the start of an unfinished token whenever it is fed: 8 MiB would take seconds."""
-    reader = CallReader()
+    reader = DocumentReader()
     given: list[bytes] = []
-    reader._parser.feed = given.append  # type: ignore[assignment]
+    reader._parser.feed = given.append  # type: ignore[method-assign, assignment]
     reader._expat = type("Stuck", (), {"CurrentByteIndex": 0})()
     for _ in range(4096):
         reader.feed(b"x" * 2048)

@@ -29,7 +29,7 @@ from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolErro
 from rmpa.core.identity import OWN_NODE, peer_name_problem
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
-from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
+from rmpa.ros.wire.xmlrpc import response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import refusal
 
@@ -83,7 +83,7 @@ async def read_text(text: str) -> XmlRpcValue:
         RemoteProtocolError: The text is malformed, or contains a nil, which ROS does not have.
     """
     try:
-        value = await read_large(ResponseReader(), (piece.encode() for piece in slices(text)))
+        value = (await read_large(piece.encode() for piece in slices(text))).response()
     except UnicodeEncodeError as error:
         raise RemoteProtocolError(f"a parameter's text is not Unicode: {error.reason}") from None
     if holds_nil(value, yielding_to_data):

@@ -18,7 +18,7 @@ from rmpa.ros import limits
 from rmpa.ros.core.external import LOOPBACK, Core
 from rmpa.ros.core.liveness import Liveness, Notifier
 from rmpa.ros.core.state import CoreState
-from rmpa.ros.http.rpc import XmlRpcServer
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.publication import Publication

@@ -1,9 +1,10 @@
-"""XML-RPC over HTTP: the server, the client, and the pages for browsers.
+"""XML-RPC calls to nodes and masters, each on a connection of its own.
 
-An XML-RPC server: POST to any path, each response in one piece, all sizes and times bounded.
+No connection is kept alive: each costs a Python node a thread, and opening one on loopback takes 50 microseconds.
 
-``ros.wire.http`` parses HTTP, ``ros.wire.xmlrpc`` the bodies. The server fits ROS's existing clients: XmlRpc++ wants
-``Content-length`` and no chunks; Python keeps its connections open for as long as its threads live.
+A document of some MiB takes seconds to parse. It is read in slices of ``limits.XMLRPC_SLICE``, and other pending data
+is served between two slices; not in a thread, because a thread that computes takes the interpreter from the event
+loop for milliseconds at a time.
 """
 
 from __future__ import annotations
@@ -15,75 +16,41 @@ import ipaddress
 import logging
 import os
 import socket
-from collections.abc import Awaitable, Callable, Iterator
-from typing import TYPE_CHECKING, Final, TypeVar, overload
+from typing import TYPE_CHECKING, Final, TypeVar
 from urllib.parse import urlsplit
 
-from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import OutOfDescriptors, UnreachableError
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.http import connection as eviction
-from rmpa.ros.http import connection as listen
-from rmpa.ros.http.connection import HttpConnection
 from rmpa.ros.wire.http import ResponseParser, post_request
-from rmpa.ros.wire.xmlrpc import (
-    CallReader,
-    ResponseReader,
-    RosFault,
-    RosReply,
-    XmlRpcValue,
-    brief,
-    call_pieces,
-    response_pieces,
-    serialize_fault,
-)
-from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.accept import DESCRIPTORS, OUT_OF_DESCRIPTORS, Acceptor, Use
+from rmpa.ros.wire.xmlrpc import DocumentReader, RosReply, XmlRpcValue, brief, call_pieces
+from rmpa.runtime.accept import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from rmpa.ros.wire.tcpros import Buffer
-    from rmpa.ros.wire.xmlrpc import DocumentReader
+
+_log = logging.getLogger(__name__)
+_CHUNK: Final = 64 * KIB
+_LOOPBACK: Final = "127.0.0.1"
+_Document = TypeVar("_Document", bytes, bytearray, memoryview, str)
 
 
-# Reads XML-RPC documents in slices of ``limits.XMLRPC_SLICE``; other pending data is served between two slices.
-#
-# A document of some MiB takes seconds to parse. It is not parsed in a thread, because a thread that computes takes
-# the
-# interpreter from the event loop for milliseconds at a time.
-
-
-_T = TypeVar("_T")
-
-
-@overload
-def slices(document: Buffer) -> Iterator[Buffer]: ...
-@overload
-def slices(document: str) -> Iterator[str]: ...
-def slices(document: Buffer | str) -> Iterator[Buffer | str]:
+def slices(document: _Document) -> Iterator[_Document]:
     """A document in slices."""
     for begin in range(0, len(document), limits.XMLRPC_SLICE):
         yield document[begin : begin + limits.XMLRPC_SLICE]
 
 
-def read_small(reader: DocumentReader[_T], document: Buffer) -> _T:
-    """Read a document of at most ``limits.HTTP_BODY_INLINE`` bytes; the errors are those of ``reader``."""
-    for piece in slices(document):
-        reader.feed(piece)
-        yield_to_data()
-    return reader.close()
+async def read_large(pieces: Iterable[Buffer]) -> DocumentReader:
+    """Read a document of any size; after ``limits.HTTP_BODY_INLINE`` bytes other callbacks run between the pieces.
 
-
-async def read_large(reader: DocumentReader[_T], pieces: Iterable[Buffer]) -> _T:
-    """Read a document of any size; after ``limits.HTTP_BODY_INLINE`` bytes other callbacks run between slices.
-
-    Args:
-        reader: Its errors are raised.
-        pieces: Slices of the document.
+    Raises:
+        RemoteProtocolError: As ``DocumentReader.feed``.
     """
+    reader = DocumentReader()
     size = 0
     try:
         for piece in pieces:
@@ -96,254 +63,7 @@ async def read_large(reader: DocumentReader[_T], pieces: Iterable[Buffer]) -> _T
     except BaseException:
         reader.abandon()
         raise
-    return reader.close()
-
-
-_log = logging.getLogger(__name__)
-
-Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
-"""``(method, params, address of the client) -> value``, at once or awaited.
-
-A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
-"""
-
-
-class ResetConnection(Exception):  # noqa: N818 - the name says what the handler wants
-    """Raised by a handler: the call's connection is reset, as by a port where no process listens."""
-
-
-class XmlRpcServer:
-    """Listens at one address and hands each call to ``handler``, in the loop.
-
-    Args:
-        handler: Answers the calls; those of one connection one at a time and in order.
-        host: Numeric address or name to listen at.
-        port: 0 lets the system choose.
-        counters: Count refusals (``http.*``, ``xmlrpc.*``) and calls.
-        name: The server, for messages: ``ROS core``, ``node /talker``.
-        use: The purpose of its connections, which decides whether they may take the last file descriptors.
-    """
-
-    def __init__(
-        self,
-        handler: Handler,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        *,
-        counters: Counters | None = None,
-        name: str = "XML-RPC server",
-        use: Use = Use.DATA,
-    ) -> None:
-        self._handler = handler
-        self._host = host
-        self._wanted_port = port
-        self._name = name
-        self.counters = counters if counters is not None else Counters()
-        self._refusals = RefusalLog(_log, self.counters)
-        self._use = use
-        self._acceptor: Acceptor | None = None
-        self._arriving: set[asyncio.Task[None]] = set()
-        # In the order of their last use, which ``eviction.for_newcomer`` needs.
-        self._connections: dict[HttpConnection, None] = {}
-        self.port = 0
-        """The listening port; 0 before ``start``."""
-
-    @property
-    def connections(self) -> int:
-        """Open connections."""
-        return len(self._connections)
-
-    async def start(self) -> None:
-        """Listen.
-
-        Raises:
-            StartError: The address is in use, not of this machine, or not allowed.
-        """
-        sock = await listen.listen(self._name, self._host, self._wanted_port, self._use)
-        self.port = sock.getsockname()[1]
-        self._acceptor = Acceptor(
-            sock,
-            self.adopt,
-            name=self._name,
-            use=self._use,
-            at_once=limits.HTTP_ACCEPTS,
-            make_room=self._evict,
-        )
-        self._acceptor.start()
-        _log.info("= %s listens at %s:%d", self._name, self._host, self.port)
-
-    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
-
-        Args:
-            sock: Non-blocking; owned from here on.
-        """
-        task = asyncio.get_running_loop().create_task(self._connect(sock))
-        self._arriving.add(task)
-        task.add_done_callback(self._arriving.discard)
-
-    async def _connect(self, sock: socket.socket) -> None:
-        try:
-            await asyncio.get_running_loop().connect_accepted_socket(lambda: HttpConnection(self), sock)
-        except BaseException:
-            sock.close()
-            raise
-
-    async def close(self) -> None:
-        """Stop listening; wait up to ``runtime.limits.DRAIN_TIMEOUT`` for calls under way; close all connections."""
-        if self._acceptor is not None:
-            self._acceptor.close()
-            self._acceptor = None
-        if self._arriving:
-            await asyncio.wait(self._arriving)
-        for connection in list(self._connections):
-            connection.close_when_answered()
-        gone = [connection.gone for connection in self._connections]
-        if gone:
-            await asyncio.wait(gone, timeout=runtime_limits.DRAIN_TIMEOUT)
-        for connection in list(self._connections):
-            connection.abort()
-
-    # --- http.connection.HttpConnectionOwner -------------------------------------------------------------------
-
-    def admit(self, connection: HttpConnection) -> bool:
-        """Whether there is room for a new connection; another one may be closed for it."""
-        if len(self._connections) >= limits.HTTP_CONNECTIONS_MAX and not self._evict():
-            self.refuse("http.refused.connections", connection, "all connections are busy; this one is refused")
-            return False
-        self._connections[connection] = None
-        return True
-
-    def _evict(self) -> bool:
-        """Close a connection for a new one, if there is one that is idle or slow."""
-        evicted = eviction.for_newcomer(self._connections, asyncio.get_running_loop().time())
-        if evicted is not None:
-            self._give_up(evicted)
-        return evicted is not None
-
-    def _give_up(self, connection: HttpConnection) -> None:
-        """Close a connection for another one; the client of an idle one reconnects by itself."""
-        if connection.idle:
-            self.counters.add("http.evicted")
-        else:
-            text = "a call that came too slowly, or an answer that was not read, gave way to others"
-            self.refuse("http.evicted.slow", connection, f"{text}; is a program stopped, or a port scanner at work?")
-        self.remove(connection)
-        connection.abort()
-
-    def reserve(self, connection: HttpConnection, size: int) -> bool:
-        """Whether there is room for a large call, which stays reserved until it is answered."""
-        now = asyncio.get_running_loop().time()
-        while sum(one.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
-            slow = eviction.for_call(self._connections, now)
-            if slow is None or slow is connection:
-                return False
-            self._give_up(slow)
-        return True
-
-    def touch(self, connection: HttpConnection) -> None:
-        """Put a connection last in the order of use."""
-        if connection in self._connections:
-            del self._connections[connection]
-            self._connections[connection] = None
-
-    def remove(self, connection: HttpConnection) -> None:
-        """Forget a closed connection."""
-        self._connections.pop(connection, None)
-
-    def refuse(self, name: str, connection: HttpConnection, text: str) -> None:
-        """Count a refusal by its name, and log it."""
-        now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
-
-    def answer(self, body: memoryview, connection: HttpConnection) -> bytes | Awaitable[bytes]:
-        """Answer one call: at once, unless the handler has to wait, or there is much to read or write."""
-        if len(body) > limits.HTTP_BODY_INLINE:
-            return self._answer_large(body, connection)
-        try:
-            method, params = read_small(CallReader(), body)
-        except RemoteProtocolError as error:
-            return self._malformed(error, connection)
-        return self._dispatch(method, params, connection)
-
-    async def _answer_large(self, body: memoryview, connection: HttpConnection) -> bytes:
-        try:
-            method, params = await read_large(CallReader(), slices(body))
-        except RemoteProtocolError as error:
-            return self._malformed(error, connection)
-        answer = self._dispatch(method, params, connection)
-        return answer if isinstance(answer, bytes) else await answer
-
-    def _malformed(self, error: RemoteProtocolError, connection: HttpConnection) -> bytes:
-        self.refuse("xmlrpc.malformed", connection, f"refused a call: {error}")
-        return serialize_fault(1, str(error))
-
-    def _dispatch(
-        self, method: str, params: tuple[XmlRpcValue, ...], connection: HttpConnection
-    ) -> bytes | Awaitable[bytes]:
-        self.counters.add("xmlrpc.calls")
-        if _log.isEnabledFor(logging.DEBUG):
-            _log.debug("< %s %s%s", connection.client, method, brief(params))
-        try:
-            value = self._handler(method, params, connection.client)
-        except ResetConnection:
-            connection.reset()
-            return b""
-        except Exception as error:  # noqa: BLE001 - the top of a call: the caller gets an answer in any case
-            return self._failed(method, error)
-        if isinstance(value, Awaitable):
-            return self._answer_later(method, value)
-        return self._respond(method, value)
-
-    async def _answer_later(self, method: str, value: Awaitable[XmlRpcValue]) -> bytes:
-        try:
-            answer = self._respond(method, await value)
-        except Exception as error:  # noqa: BLE001 - as above
-            return self._failed(method, error)
-        return answer if isinstance(answer, bytes) else await answer
-
-    def _respond(self, method: str, value: XmlRpcValue) -> bytes | Awaitable[bytes]:
-        written: list[bytes] = []
-        size = 0
-        rest = response_pieces(value)
-        try:
-            for piece in rest:
-                written.append(piece)
-                size += len(piece)
-                if size > limits.HTTP_BODY_INLINE:
-                    return self._respond_large(method, written, rest)
-                yield_to_data()
-        except LocalProtocolError as error:
-            return self._failed(method, error)
-        return b"".join(written)
-
-    async def _respond_large(self, method: str, written: list[bytes], rest: Iterator[bytes]) -> bytes:
-        try:
-            for piece in rest:
-                written.append(piece)
-                await asyncio.sleep(0)
-        except LocalProtocolError as error:
-            return self._failed(method, error)
-        return b"".join(written)
-
-    def _failed(self, method: str, error: Exception) -> bytes:
-        if isinstance(error, RosFault):
-            return serialize_fault(error.code, error.text)
-        self.counters.add("xmlrpc.failed")
-        _log.error("! %s: %s failed", self._name, method, exc_info=error)
-        return serialize_fault(1, f"{method} failed here: {type(error).__name__}: {error}")
-
-
-# XML-RPC calls to nodes and masters, each on a connection of its own.
-#
-# No connection is kept alive: each costs a Python node a thread, and opening one on loopback takes 50 microseconds.
-
-
-__all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
-
-
-_CHUNK: Final = 64 * KIB
-_LOOPBACK: Final = "127.0.0.1"
+    return reader
 
 
 @functools.lru_cache(maxsize=1024)
@@ -368,18 +88,11 @@ def is_own_name(host: str) -> bool:
     return host in {"localhost", socket.gethostname()}
 
 
-async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
-    """Addresses of a host, best first; numbers and names of this machine do not go to the resolver."""
-    if is_own_name(host):
-        return [(_LOOPBACK, port)]
+async def _resolve(host: str, port: int) -> list[tuple[str, int]]:
     try:
         return [(str(ipaddress.IPv4Address(host)), port)]
     except ValueError:
-        return await _resolve(host, port)
-
-
-async def _resolve(host: str, port: int) -> list[tuple[str, int]]:
-    loop = asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
     try:
         found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
@@ -418,20 +131,18 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
             left (``EMFILE``).
     """
     error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
-    addresses = await _addresses(host, port)
-    for address in addresses:
+    if is_own_name(host):
+        try:
+            return await _connect_one((_LOOPBACK, port), use)
+        except OSError as refused:
+            if host == "localhost":
+                raise
+            error = refused  # a node may listen only at this machine's address in the network
+    for address in await _resolve(host, port):
         try:
             return await _connect_one(address, use)
         except OSError as refused:
             error = refused
-    if is_own_name(host) and host != "localhost":
-        # A node may listen only at this machine's address in the network.
-        for address in await _resolve(host, port):
-            if address not in addresses:
-                try:
-                    return await _connect_one(address, use)
-                except OSError as refused:
-                    error = refused
     raise error
 
 
@@ -507,7 +218,7 @@ async def read_response(body: bytes) -> XmlRpcValue:
     Raises:
         RosFault, RemoteProtocolError: As for ``call``.
     """
-    return await read_large(ResponseReader(), slices(body))
+    return (await read_large(slices(body))).response()
 
 
 async def call_api(

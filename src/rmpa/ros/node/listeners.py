@@ -19,8 +19,7 @@ import psutil
 from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.http.connection import RESET
-from rmpa.ros.http.rpc import ResetConnection, XmlRpcServer
+from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage

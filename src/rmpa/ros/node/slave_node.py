@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.http.rpc import XmlRpcServer
+from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.node.listeners import TcprosServer
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call

@@ -5,14 +5,15 @@ A request is a POST to any path; its body has a length or is sent in chunks. Of 
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import quote
 
 from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser, HttpResponseParser
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.xmlrpc import CallBody
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +29,95 @@ _REASONS: Final = {
     431: b"Request Header Fields Too Large",
 }
 CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
+
+
+_METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
+_TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
+_BEGIN: Final = 4 * KIB
+"""Bytes of a refused call that are kept, to name the call in the fault."""
+
+
+class CallBody:
+    """Collects one body after the other; a call that is too large is answered with an XML-RPC fault.
+
+    A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client
+    hides the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no
+    answer before it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
+
+    Args:
+        reserve: ``(bytes) -> whether there is room``: called once for each large call.
+
+    Attributes:
+        size: Bytes received.
+        reserved: Bytes reserved for the present call, until its owner sets 0.
+        why: Makes the text of the fault from the beginning and size of a call that is too large; it is dropped.
+    """
+
+    def __init__(self, reserve: Callable[[int], bool]) -> None:
+        self._reserve = reserve
+        self._data = bytearray()
+        self.size = 0
+        self.reserved = 0
+        self.why: Callable[[Buffer, int], str] | None = None
+
+    def expect(self, size: int) -> None:
+        """Announce the size of a body that has a Content-length."""
+        if size > limits.HTTP_BODY_MAX:
+            self.why = too_large
+        elif size > limits.HTTP_BODY_INLINE and not self.reserved:
+            if self._reserve(size):
+                self.reserved = size
+            else:
+                self.why = too_many
+
+    def add(self, data: bytes) -> None:
+        """Add a part."""
+        self.size += len(data)
+        if self.why is None and self.size > limits.HTTP_BODY_INLINE:
+            # A body in chunks has no announced size.
+            self.expect(max(self.size, limits.HTTP_BODY_MAX))
+        self._data += data
+        if self.why is not None:
+            del self._data[_BEGIN:]
+
+    def end(self) -> tuple[memoryview, str]:
+        """Return the whole body and an empty text; for a refused one its beginning and the text of the fault."""
+        data, size, why = self._data, self.size, self.why
+        self._data, self.size, self.why = bytearray(), 0, None
+        return memoryview(data), why(data, size) if why is not None else ""
+
+
+def call_name(begin: Buffer) -> str:
+    """A call's method, with the key if it is about a parameter: ``setParam /map``; ``a call`` if it is unknown.
+
+    Args:
+        begin: The first bytes of the call.
+    """
+    method = _METHOD.search(begin)
+    if method is None:
+        return "a call"
+    name = method[1].decode("ascii")
+    texts = _TEXTS.findall(begin, method.end())
+    if "Param" in name and len(texts) > 1:
+        name += " " + texts[1].decode("utf-8", "replace")
+    return name
+
+
+def too_large(begin: Buffer, size: int) -> str:
+    """The text of the fault for a call of ``size`` bytes, with the limit and a remedy."""
+    limit = limits.HTTP_BODY_MAX
+    return (
+        f"{call_name(begin)}: {size} bytes, above the {limit} ({limit >> 20} MiB) of one call; set its parts one by "
+        "one, keep large data in a file and its path in the parameter, or publish it on a latched topic"
+    )
+
+
+def too_many(begin: Buffer, size: int) -> str:
+    """The text of the fault for a call that does not fit beside those under way."""
+    return (
+        f"{call_name(begin)}: {size} bytes beside other large calls, above the {limits.HTTP_BODIES_MAX >> 20} MiB of "
+        "all that are under way; try again in a moment"
+    )
 
 
 class HttpRequest(NamedTuple):
@@ -152,7 +242,7 @@ class RequestParser:
         else:
             self.body.expect(size)
             if is_1_1 and headers.get(b"expect", b"").lower() == b"100-continue":
-                if self.body.refused:
+                if self.body.why is not None:
                     self._refuse(413, f"a body of more than {limits.HTTP_BODY_MAX} bytes", "http.too_large")
                 self.expects_continue = not self._refused
 

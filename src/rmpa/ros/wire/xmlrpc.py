@@ -1,10 +1,7 @@
-"""XML-RPC as bytes: reads and writes calls and responses, within bounds.
+"""XML-RPC calls and responses as bytes (xmlrpc.com/spec, and ROS's use of it).
 
-Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
-
-A fault is the only error that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client hides
-the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer before
-it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
+The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and allows
+only the types that ROS has. Long documents are read and written piece by piece.
 """
 
 from __future__ import annotations
@@ -12,11 +9,10 @@ from __future__ import annotations
 import base64
 import contextlib
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from itertools import chain
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, Union, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, Union, cast
 from xml.parsers.expat import ExpatError
 from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
@@ -24,111 +20,11 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError, RmpaError
-from rmpa.core.limits import INT32_MAX, INT32_MIN, KIB
+from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-_METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
-_TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
-_BEGIN: Final = 4 * KIB
-"""Bytes of a refused call that are kept, to name the call in the fault."""
-
-
-class CallBody:
-    """Collects one body after the other.
-
-    Args:
-        reserve: ``(bytes) -> whether there is room``: called once for each large call.
-    """
-
-    __slots__ = ("_data", "_left_out", "_reserve", "_why", "reserved")
-
-    def __init__(self, reserve: Callable[[int], bool]) -> None:
-        self._reserve = reserve
-        self._data = bytearray()
-        self._left_out = 0
-        self._why: Callable[[bytes | bytearray, int], str] | None = None
-        self.reserved = 0
-        """Bytes reserved for the present call, until ``answered``."""
-
-    def __len__(self) -> int:
-        """Bytes received."""
-        return len(self._data) + self._left_out
-
-    @property
-    def refused(self) -> bool:
-        """Whether the call is too large: its bytes are dropped."""
-        return self._why is not None
-
-    def expect(self, size: int) -> bool:
-        """Announce the size of a body that has a Content-length; return whether it is accepted."""
-        if size > limits.HTTP_BODY_MAX:
-            self._why = too_large
-        elif size > limits.HTTP_BODY_INLINE and not self.reserved:
-            if self._reserve(size):
-                self.reserved = size
-            else:
-                self._why = too_many
-        return self._why is None
-
-    def add(self, data: bytes | bytearray) -> None:
-        """Add a part."""
-        size = len(self) + len(data)
-        if self._why is None and size > limits.HTTP_BODY_INLINE:
-            # A body in chunks has no announced size.
-            self.expect(max(size, limits.HTTP_BODY_MAX))
-        if self._why is None:
-            self._data += data
-        else:
-            del self._data[_BEGIN:]
-            self._data += data[: _BEGIN - len(self._data)]
-            self._left_out = size - len(self._data)
-
-    def end(self) -> tuple[memoryview, str]:
-        """Return the whole body and an empty text; for a refused one its beginning and the text of the fault."""
-        data, size, why = self._data, len(self), self._why
-        self._data, self._left_out, self._why = bytearray(), 0, None
-        return memoryview(data), why(data, size) if why is not None else ""
-
-    def answered(self) -> None:
-        """Release the reserved bytes, because the call is answered."""
-        self.reserved = 0
-
-
-def call_name(begin: bytes | bytearray) -> str:
-    """A call's method, with the key if it is about a parameter: ``setParam /map``; ``a call`` if it is unknown.
-
-    Args:
-        begin: The first bytes of the call.
-    """
-    method = _METHOD.search(begin)
-    if method is None:
-        return "a call"
-    name = method[1].decode("ascii")
-    texts = _TEXTS.findall(begin, method.end())
-    if "Param" in name and len(texts) > 1:
-        name += " " + texts[1].decode("utf-8", "replace")
-    return name
-
-
-def too_large(begin: bytes | bytearray, size: int, limit: int = 0) -> str:
-    """The text of the fault for a call of ``size`` bytes, with the limit and a remedy."""
-    limit = limit or limits.HTTP_BODY_MAX
-    return (
-        f"{call_name(begin)}: {size} bytes, above the {limit} ({limit >> 20} MiB) of one call; set its parts one by "
-        "one, keep large data in a file and its path in the parameter, or publish it on a latched topic"
-    )
-
-
-def too_many(begin: bytes | bytearray, size: int) -> str:
-    """The text of the fault for a call that does not fit beside those under way."""
-    return (
-        f"{call_name(begin)}: {size} bytes beside other large calls, above the {limits.HTTP_BODIES_MAX >> 20} MiB of "
-        "all that are under way; try again in a moment"
-    )
-
 
 # Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces.
 #
@@ -161,12 +57,8 @@ def pieces(what: str, value: object) -> Iterator[bytes]:
     """
     try:
         yield from _pieces(value)
-    except _NotXmlRpcError as error:
+    except LocalProtocolError as error:
         raise LocalProtocolError(f"{what} {error}") from None
-
-
-class _NotXmlRpcError(Exception):
-    """A value cannot be written; the text has the reason, without a subject."""
 
 
 def _pieces(value: object) -> Iterator[bytes]:
@@ -182,7 +74,7 @@ def _pieces(value: object) -> Iterator[bytes]:
             write = _SCALARS.get(type(item))
             if write is None:
                 if len(above) > limits.XMLRPC_DEPTH_MAX:
-                    raise _NotXmlRpcError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
+                    raise LocalProtocolError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
                 above.append((rest, members, end))
                 rest, begin, end = _open(item, end="</member>\n" if members else "")
                 members = type(item) is dict
@@ -216,18 +108,18 @@ def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
         return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
     if type(item) in {list, tuple}:
         return iter(cast("list[object]", item)), "<value><array><data>\n", f"</data></array></value>\n{end}"
-    raise _NotXmlRpcError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
+    raise LocalProtocolError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
 
 
 def _escaped(text: str) -> str:
     if not text.isprintable() and (illegal := _ILLEGAL.search(text)) is not None:
-        raise _NotXmlRpcError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
+        raise LocalProtocolError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _name(key: object) -> str:
     if type(key) is not str:
-        raise _NotXmlRpcError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
+        raise LocalProtocolError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
     return _escaped(key)
 
 
@@ -245,7 +137,7 @@ def _base64(value: bytes) -> Iterable[str]:
 
 def _int(value: int) -> Iterable[str]:
     if not INT32_MIN <= value <= INT32_MAX:
-        raise _NotXmlRpcError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
+        raise LocalProtocolError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
     return (f"<value><int>{value}</int></value>\n",)
 
 
@@ -265,19 +157,11 @@ _SCALARS: Final[dict[type, Callable[..., Iterable[str]]]] = {
 """Writers of the types other than list and dict."""
 
 
-# XML-RPC calls and responses as bytes (xmlrpc.com/spec, and ROS's use of it).
-#
-# The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and
-# allows
-# only the types that ROS has. Long documents are read and written piece by piece.
-
-
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None
 ]
 """A value of XML-RPC. Parsed containers are lists and dicts; ``None`` is read, never written."""
 
-_T = TypeVar("_T")
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
 
 
@@ -374,7 +258,7 @@ class _BoundedUnmarshaller(Unmarshaller):
         super().end(tag)
 
 
-class DocumentReader(ABC, Generic[_T]):
+class DocumentReader:
     """Reads one document piece by piece, so that other work can be done between two pieces."""
 
     def __init__(self) -> None:
@@ -410,17 +294,38 @@ class DocumentReader(ABC, Generic[_T]):
         with contextlib.suppress(Exception):
             self._parser.close()
 
-    @abstractmethod
-    def close(self) -> _T:
-        """The content of the document, once all pieces were fed."""
-
-    def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
-        """Finish the document; return the method's name, or ``None`` for a response, and the values.
+    def call(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
+        """The name and the parameters of a ``methodCall``, once all pieces were fed.
 
         Raises:
-            Fault: The document is a fault.
-            RemoteProtocolError: As for ``feed``, or the document is incomplete.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete or not a call.
         """
+        try:
+            method, params = self._end()
+        except Fault as fault:
+            raise RemoteProtocolError("an XML-RPC fault came where a call was expected") from fault
+        if not method:
+            raise RemoteProtocolError("XML-RPC call without a methodName")
+        return method, params
+
+    def response(self) -> XmlRpcValue:
+        """The value of a ``methodResponse``, once all pieces were fed.
+
+        Raises:
+            RosFault: The response is a fault.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete or has not exactly one value.
+        """
+        try:
+            method, params = self._end()
+        except Fault as fault:
+            if not isinstance(fault.faultCode, int):
+                raise RemoteProtocolError(f"XML-RPC fault with code {brief(fault.faultCode)}") from fault
+            raise RosFault(fault.faultCode, str(fault.faultString)) from fault
+        if method is not None or len(params) != 1:
+            raise RemoteProtocolError(f"XML-RPC response with {len(params)} values; there must be one")
+        return params[0]
+
+    def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
         with self._errors():
             self._give()
             self._parser.close()
@@ -438,72 +343,34 @@ class DocumentReader(ABC, Generic[_T]):
             yield
         except BaseException as error:
             self.abandon()
-            if isinstance(error, Fault):
-                raise
-            if isinstance(error, DefusedXmlException):
-                text = f"XML declares entities, which XML-RPC has no use for: {error}"
-                raise RemoteProtocolError(text) from error
-            if isinstance(error, ExpatError):
-                raise RemoteProtocolError(f"malformed XML: {error}") from error
-            if isinstance(error, ResponseError):
-                raise RemoteProtocolError(f"this XML is not XML-RPC {error}".rstrip()) from error
-            if isinstance(error, ArithmeticError | AttributeError | LookupError | TypeError | ValueError):
-                # The standard unmarshaller has no error of its own for elements in the wrong order or bad content.
-                raise RemoteProtocolError(f"malformed XML-RPC value: {error}") from error
+            for kinds, text in _MALFORMED:
+                if isinstance(error, kinds):
+                    raise RemoteProtocolError(text.format(error).rstrip()) from error
             raise
 
 
-class CallReader(DocumentReader["tuple[str, tuple[XmlRpcValue, ...]]"]):
-    """Reads a ``methodCall`` document."""
-
-    def close(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
-        """The method's name and its parameters, once all pieces were fed.
-
-        Raises:
-            RemoteProtocolError: As for ``feed``, or the document is incomplete or not a call.
-        """
-        try:
-            method, params = self._end()
-        except Fault as fault:
-            raise RemoteProtocolError("an XML-RPC fault came where a call was expected") from fault
-        if not method:
-            raise RemoteProtocolError("XML-RPC call without a methodName")
-        return method, params
-
-
-class ResponseReader(DocumentReader[XmlRpcValue]):
-    """Reads a ``methodResponse`` document."""
-
-    def close(self) -> XmlRpcValue:
-        """The value, once all pieces were fed.
-
-        Raises:
-            RosFault: The response is a fault.
-            RemoteProtocolError: As for ``feed``, or the document is incomplete or has not exactly one value.
-        """
-        try:
-            method, params = self._end()
-        except Fault as fault:
-            if not isinstance(fault.faultCode, int):
-                raise RemoteProtocolError(f"XML-RPC fault with code {brief(fault.faultCode)}") from fault
-            raise RosFault(fault.faultCode, str(fault.faultString)) from fault
-        if method is not None or len(params) != 1:
-            raise RemoteProtocolError(f"XML-RPC response with {len(params)} values; there must be one")
-        return params[0]
+_MALFORMED: Final[Sequence[tuple[type[Exception] | tuple[type[Exception], ...], str]]] = (
+    (DefusedXmlException, "XML declares entities, which XML-RPC has no use for: {}"),
+    (ExpatError, "malformed XML: {}"),
+    (ResponseError, "this XML is not XML-RPC {}"),
+    # The standard unmarshaller has no error of its own for elements in the wrong order or bad content.
+    ((ArithmeticError, AttributeError, LookupError, TypeError, ValueError), "malformed XML-RPC value: {}"),
+)
+"""What the parsers raise for malformed documents, with the text of our error."""
 
 
 def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
-    """Read a whole ``methodCall`` document; returns and raises as ``CallReader``."""
-    reader = CallReader()
+    """Read a whole ``methodCall`` document; returns and raises as ``DocumentReader.call``."""
+    reader = DocumentReader()
     reader.feed(data)
-    return reader.close()
+    return reader.call()
 
 
 def parse_response(data: bytes) -> XmlRpcValue:
-    """Read a whole ``methodResponse`` document; returns and raises as ``ResponseReader``."""
-    reader = ResponseReader()
+    """Read a whole ``methodResponse`` document; returns and raises as ``DocumentReader.response``."""
+    reader = DocumentReader()
     reader.feed(data)
-    return reader.close()
+    return reader.response()
 
 
 def call_pieces(method: str, params: Sequence[XmlRpcValue]) -> Iterator[bytes]:
