@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from rmpa.bridge.data.export import ReliableRouteSender, RouteSender, make_route_sender
+from rmpa.bridge.data.export import ReliableRouteSender, RouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import QueuedMessage
@@ -80,7 +80,7 @@ def _fuzz(data: bytes) -> None:
     )
     link = _Link()
     links = [link]
-    leg: RouteSender = make_route_sender(link, 7, contract, 1, large=False)
+    leg = ReliableRouteSender(link, 7, contract, 1) if reliable else RouteSender(link, 7, contract)
     published = 0
     for start in range(1, len(data) - _MARK.size + 1, _MARK.size):
         what, number = _MARK.unpack_from(data, start)

@@ -212,7 +212,7 @@ class TrafficPeer(MeshPeer):
             sender = self.senders.pop(key)
             peer = self._peers[link.identity.instance]
             if isinstance(sender, ReliableRouteSender):
-                self.exports.suspend(peer)
+                sender.suspend()
             else:
                 self.exports.remove(peer)
 

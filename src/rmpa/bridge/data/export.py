@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.route import EXPRESS, Downsampler, LaneSwitch
 from rmpa.core.contract import Contract, Durability, History, Reliability
@@ -28,16 +28,14 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import LaneSender, PeerLink
     from rmpa.runtime.tls import Buffer
 
-
-# The sending end of a route: the lane of its messages, queue bounds, down-sampling, and messages kept for replay.
-#
-# A route sender is called for each message from the publisher's read callback. ``RouteSender.message`` has a short
-# path
-# for the usual case: a small message on the express lane, without down-sampling.
+_SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
 
 
 class RouteSender:
-    """Sends the messages of one best-effort route.
+    """The sending end of a best-effort route: the lane of its messages, queue bounds, and down-sampling.
+
+    It is called for each message from the publisher's read callback. ``message`` has a short path for the usual case:
+    a small message on the express lane, without down-sampling.
 
     Args:
         link: The link to the peer.
@@ -49,17 +47,11 @@ class RouteSender:
     reliable = False
 
     def __init__(self, link: PeerLink, route: int, contract: Contract, *, large: bool = False) -> None:
-        self.link: PeerLink | None = link
-        self.route = route
         self.contract = contract
         self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sequence = 0
-        self.dropped = 0
-        """Messages dropped here because a bound was reached; those dropped by the lane are counted there."""
         self._loop = asyncio.get_running_loop()
-        self._lane: LaneSender = link.express
         self._switch = LaneSwitch(contract, large=large)
-        self._small = mesh_limits.EXPRESS_MESSAGE_MAX
         self._held: deque[tuple[int, int, bytes]] = deque()
         """Sequence, stamp and bytes of messages that wait until the lane has changed."""
         self._held_bytes = 0
@@ -70,35 +62,26 @@ class RouteSender:
         self._timer: asyncio.TimerHandle | None = None
         self._direct = False
         """Whether ``message`` may take its short path for small messages."""
-        self._set_bounds()
-        self._use_lane()
+        self.link: PeerLink | None
+        self._lane: LaneSender
+        self._use(link, route)
 
     @property
     def lane(self) -> str:
         """The present lane, ``express`` or ``bulk``, to show."""
         return self._switch.lane.name.lower()
 
-    @property
-    def large(self) -> bool:
-        """Whether its messages use, or are about to use, the bulk lane."""
-        return self._switch.target is not EXPRESS
-
-    @property
-    def skipped(self) -> int:
-        """Messages left out to keep to the contract's rate."""
-        return self._downsampler.skipped if self._downsampler is not None else 0
-
     def message(self, stamp_ns: int, framed: Buffer) -> int:
         """Send one message; return how many older ones were dropped for it."""
-        if self._direct and len(framed) <= self._small:
+        if self._direct and len(framed) <= _SMALL:
             self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
             return self._lane.send(self.route, sequence, stamp_ns, framed)
         if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
-            self._keep_newest(self._downsampler, stamp_ns, framed)
+            self._newest = (stamp_ns, bytes(framed))  # in place of an older one, until the rate allows it
+            if self._timer is None:
+                self._timer = self._loop.call_at(self._downsampler.due, self._send_newest, self._downsampler)
             return 0
-        if self._downsampler is not None and self._newest is not None:
-            self._downsampler.skipped += 1
-            self._newest = None
+        self._newest = None
         return self._send(stamp_ns, framed)
 
     def begin(self, stamp_ns: int, size: int) -> bool:
@@ -120,9 +103,10 @@ class RouteSender:
             self._open_message = None
 
     def fenced(self, number: int) -> None:
-        """Take the peer's answer to a fence, and send the held messages over the new lane."""
+        """Take the peer's answer to a fence, and send what has waited over the new lane."""
         if self._switch.fenced(number):
-            self._resume_lane()
+            self._use_lane()
+            self._go_on()
 
     def acknowledged(self, sequence: int) -> None:
         """Ignore an acknowledgement; only reliable routes need it."""
@@ -131,7 +115,8 @@ class RouteSender:
         """Handle the loss of the bulk lane's connection; it ends a change from that lane at once."""
         if self._switch.lane_lost():
             self._discard_bulk()
-            self._resume_lane()
+            self._use_lane()
+            self._go_on()
 
     def close(self) -> None:
         """Send no more messages."""
@@ -140,7 +125,6 @@ class RouteSender:
         self._held.clear()
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
 
     # --- inside ---------------------------------------------------------------------------------------------
 
@@ -149,6 +133,36 @@ class RouteSender:
         if self._lane_for(len(framed)):
             return self._lane.send(self.route, sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
+
+    def _send_newest(self, downsampler: Downsampler) -> None:
+        self._timer = None
+        if self._newest is not None and not downsampler.admit(self._loop.time()):
+            self._timer = self._loop.call_at(downsampler.due, self._send_newest, downsampler)
+        elif self._newest is not None:
+            newest, self._newest = self._newest, None
+            self._send(*newest)
+
+    def _hold(self, sequence: int, stamp_ns: int, payload: bytes) -> int:
+        """Keep a message until the lane has changed, within the contract's bounds; return how many were dropped."""
+        self._held.append((sequence, stamp_ns, payload))
+        self._held_bytes += len(payload)
+        dropped = 0
+        while len(self._held) > 1 and (
+            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
+        ):
+            self._held_bytes -= len(self._held.popleft()[2])
+            dropped += 1
+        return dropped
+
+    def _go_on(self) -> None:
+        """Sends what has waited for the lane."""
+        held, self._held, self._held_bytes = self._held, deque(), 0
+        for sequence, stamp_ns, payload in held:
+            # A large message may have come during the change back to the express lane.
+            if self._lane_for(len(payload)):
+                self._lane.send(self.route, sequence, stamp_ns, payload)
+            else:
+                self._hold(sequence, stamp_ns, payload)
 
     def _lane_for(self, size: int) -> bool:
         """Whether a message may be sent over the present lane now; if not, begins the change of lane it needs."""
@@ -163,35 +177,11 @@ class RouteSender:
         self._direct = False
         self._lane.fence(self.route, self._switch.fence())
 
-    def _hold(self, sequence: int, stamp_ns: int, payload: bytes) -> int:
-        """Keep a message until the lane has changed, within the contract's bounds."""
-        self._held.append((sequence, stamp_ns, payload))
-        self._held_bytes += len(payload)
-        dropped = 0
-        while len(self._held) > 1 and (
-            len(self._held) > self._depth or self._held_bytes > mesh_limits.LANE_QUEUE_BYTES
-        ):
-            self._held_bytes -= len(self._held.popleft()[2])
-            dropped += 1
-        self.dropped += dropped
-        return dropped
-
-    def _resume_lane(self) -> None:
+    def _use(self, link: PeerLink, route: int) -> None:
+        """Uses a route of a link from now on."""
+        self.link, self.route = link, route
+        self._set_bounds(link)
         self._use_lane()
-        held, self._held = self._held, deque()
-        self._held_bytes = 0
-        for sequence, stamp_ns, payload in held:
-            # A large message may have come during the change back to the express lane.
-            if self._lane_for(len(payload)):
-                self._lane.send(self.route, sequence, stamp_ns, payload)
-            else:
-                self._hold(sequence, stamp_ns, payload)
-
-    def _discard_bulk(self) -> None:
-        """Drops messages that wait for the bulk lane's next connection: they would arrive after newer ones."""
-        if self.link is not None:
-            self.link.bulk.discard(self.route)
-            self._set_bounds()
 
     def _use_lane(self) -> None:
         """Uses the lane that the switch is on; begins a further change at once if the target is another lane."""
@@ -202,37 +192,18 @@ class RouteSender:
             self._begin_fence()
             return
         # On the bulk lane small messages are counted for the return, so only the express lane is direct.
-        self._direct = self._switch.lane is EXPRESS and self._downsampler is None
+        self._direct = self._switch.lane is EXPRESS and self._downsampler is None and not self.reliable
 
-    def _set_bounds(self) -> None:
-        if self.link is None:
-            return
-        contract = self.contract
-        for lane, stale in (
-            (self.link.express, runtime_limits.STALE_AGE),
-            (self.link.bulk, mesh_limits.BULK_STALE_AGE),
-        ):
-            strict = contract.lifespan is not None
-            lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
+    def _discard_bulk(self) -> None:
+        """Drops messages that wait for the bulk lane's next connection: they would arrive after newer ones."""
+        if self.link is not None:
+            self.link.bulk.discard(self.route)
+            self._set_bounds(self.link)
 
-    def _keep_newest(self, downsampler: Downsampler, stamp_ns: int, framed: Buffer) -> None:
-        """Keeps a message, in place of an older one, until the rate allows it."""
-        if self._newest is not None:
-            downsampler.skipped += 1
-        self._newest = (stamp_ns, bytes(framed))
-        if self._timer is None:
-            self._timer = self._loop.call_at(downsampler.due, self._send_newest)
-
-    def _send_newest(self) -> None:
-        self._timer = None
-        if self._newest is None or self._downsampler is None:
-            return
-        if not self._downsampler.admit(self._loop.time()):
-            self._timer = self._loop.call_at(self._downsampler.due, self._send_newest)
-            return
-        stamp_ns, payload = self._newest
-        self._newest = None
-        self._send(stamp_ns, payload)
+    def _set_bounds(self, link: PeerLink) -> None:
+        lifespan = self.contract.lifespan
+        for lane, stale in ((link.express, runtime_limits.STALE_AGE), (link.bulk, mesh_limits.BULK_STALE_AGE)):
+            lane.set_terms(self.route, self._depth, lifespan or stale, strict=lifespan is not None)
 
 
 class ReliableRouteSender(RouteSender):
@@ -249,18 +220,16 @@ class ReliableRouteSender(RouteSender):
     reliable = True
 
     def __init__(self, link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
-        depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self._keep: Callable[[bytes, int], object] | None = None
+        self._reported = 0
+        super().__init__(link, route, contract, large=large)
         self.sender = ReliableSender(
-            depth,
+            self._depth,
             mesh_limits.REPLAY_BYTES,
             mesh_limits.RELIABLE_WINDOW_MESSAGES,
             mesh_limits.RELIABLE_WINDOW_BYTES,
             epoch,
         )
-        self._keep: Callable[[bytes, int], object] | None = None
-        self._reported = 0
-        super().__init__(link, route, contract, large=large)
-        self._direct = False
 
     def begin(self, stamp_ns: int, size: int) -> bool:  # noqa: ARG002 - as the other kind
         """Return ``False``: a message that may have to be sent again is needed whole."""
@@ -269,7 +238,7 @@ class ReliableRouteSender(RouteSender):
     def acknowledged(self, sequence: int) -> None:
         """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
         self.sender.acknowledged(sequence)
-        self._pump()
+        self._go_on()
 
     def lane_lost(self) -> None:
         """Send the messages again that were on the lost bulk lane; the peer drops those that it has."""
@@ -279,9 +248,8 @@ class ReliableRouteSender(RouteSender):
         self._discard_bulk()
         self.sender.rewind()
         if self._switch.lane_lost():
-            self._resume_lane()
-        else:
-            self._pump()
+            self._use_lane()
+        self._go_on()
 
     def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
         """Keep messages while the link is gone, until ``resume`` or until they are given up.
@@ -306,12 +274,9 @@ class ReliableRouteSender(RouteSender):
         known = self.sender.confirmed
         self.sender.resume(known if is_earlier(after, known) else after)
         self._keep = None
-        self.link, self.route = link, route
         self._switch.restart()
-        self._set_bounds()
-        self._use_lane()
-        self._direct = False
-        self._pump()
+        self._use(link, route)
+        self._go_on()
 
     def missed(self) -> int:
         """Return how many messages were lost for the peer since the last call."""
@@ -326,63 +291,26 @@ class ReliableRouteSender(RouteSender):
             self._keep(bytes(framed), stamp_ns)
         else:
             self.sender.offer(bytes(framed), stamp_ns)
-            self._pump()
-        lost = self.sender.overflowed - before
-        self.dropped += lost
-        return lost
+            self._go_on()
+        return self.sender.overflowed - before
 
-    def _pump(self) -> None:
+    def _go_on(self) -> None:
         """Sends what the window allows."""
-        while self.link is not None and not self._switch.fencing:
-            for message in self.sender.take(1):
-                if not self._lane_for(len(message.payload)):
-                    self.sender.put_back()
-                    return
-                self._lane.send(self.route, message.sequence, message.stamp_ns, message.payload)
-                break
-            else:
+        while self.link is not None and not self._switch.fencing and (taken := self.sender.take(1)):
+            (message,) = taken
+            if not self._lane_for(len(message.payload)):
+                self.sender.put_back()
                 return
+            self._lane.send(self.route, message.sequence, message.stamp_ns, message.payload)
 
-    def _resume_lane(self) -> None:
-        self._use_lane()
-        self._direct = False
-        self._pump()
-
-    def _set_bounds(self) -> None:
+    def _set_bounds(self, link: PeerLink) -> None:
         """Sets no bounds: a numbered message may not be dropped from a queue; the window bounds the queue."""
-        if self.link is not None:
-            for lane in (self.link.express, self.link.bulk):
-                lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
-
-
-def make_route_sender(link: PeerLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
-    """Make the kind of sender that the contract's reliability needs."""
-    if contract.reliability is Reliability.RELIABLE:
-        return ReliableRouteSender(link, route, contract, epoch, large=large)
-    return RouteSender(link, route, contract, large=large)
+        for lane in (link.express, link.bulk):
+            lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
 
 class ExportFlow:
     """From one local publisher to the peers that want it, each by a route sender of its own."""
-
-    __slots__ = (
-        "_history",
-        "_keeping",
-        "_received",
-        "_senders",
-        "_size",
-        "_stamp",
-        "_streaming",
-        "_whole",
-        "by_peer",
-        "bytes",
-        "dropped",
-        "large",
-        "latching",
-        "messages",
-        "oversized",
-        "oversized_bytes",
-    )
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}
@@ -424,7 +352,11 @@ class ExportFlow:
     def add(self, peer: int, link: PeerLink, route: int, contract: Contract, epoch: int) -> RouteSender:
         """Send to one more peer; first the kept messages that its contract, or the latching publisher, allows."""
         self.remove(peer)
-        sender = make_route_sender(link, route, contract, epoch, large=self.large)
+        sender: RouteSender
+        if contract.reliability is Reliability.RELIABLE:
+            sender = ReliableRouteSender(link, route, contract, epoch, large=self.large)
+        else:
+            sender = RouteSender(link, route, contract, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
         # Messages kept only for another peer's contract are old data here, perhaps old commands.
@@ -434,12 +366,6 @@ class ExportFlow:
         self.by_peer[peer] = sender
         self._senders = tuple(self.by_peer.values())
         return sender
-
-    def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
-        """Suspend the reliable route of a peer whose link is gone; see ``ReliableRouteSender.suspend``."""
-        sender = self.by_peer.get(peer)
-        if isinstance(sender, ReliableRouteSender):
-            sender.suspend(keep)
 
     def remove(self, peer: int) -> None:
         """Stop sending to a peer."""

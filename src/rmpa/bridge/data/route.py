@@ -37,8 +37,6 @@ class LaneSwitch:
         large: Whether the source is known to have large messages.
     """
 
-    __slots__ = ("_fence", "_fixed", "_large_at", "_numbers", "_small", "lane", "target")
-
     def __init__(self, contract: Contract, *, large: bool = False) -> None:
         self._fixed = {Priority.HIGH: EXPRESS, Priority.LOW: BULK}.get(contract.priority)
         self._large_at = 0.0
@@ -108,14 +106,10 @@ class Downsampler:
         rate: Messages a second.
     """
 
-    __slots__ = ("_period", "due", "skipped")
-
     def __init__(self, rate: float) -> None:
         self._period = 1 / rate
         self.due = 0.0
         """When the next message may be sent, monotonic seconds."""
-        self.skipped = 0
-        """Messages left out for newer ones; the sender counts them here."""
 
     def admit(self, now: float) -> bool:
         """Whether a message may be sent now; if so, the next one is due a period later."""

@@ -225,7 +225,7 @@ class LocalSubscriptions:
             self._forget(route_sender, action.peer)
             if isinstance(route_sender, ReliableRouteSender):
                 key = (action.peer, action.source)
-                flow.suspend(action.peer, self._keeper(key))
+                route_sender.suspend(self._keeper(key))
                 until = asyncio.get_running_loop().time() + action.outage
                 self._give_up(self._parked.park(key, route_sender.sender, until))
                 self._timer.arm()
