@@ -99,22 +99,15 @@ class BodySender:
             head: Bytes in front of the body.
             budget: Gets the body's bytes back when they were handed to the link, or dropped.
         """
-        link = self._link
-        size = len(head) + len(body)
-        if link is None or size <= mesh_limits.EXPRESS_MESSAGE_MAX:
-            if link is not None:
-                framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))
-                link.express.send(self._route, sequence, time.time_ns(), framed)
-            if budget is not None:
-                budget.give(len(body))
-            return False
-        self._large.append((sequence, head, body, budget))
-        if self._task is None:
-            if size <= _WHOLE:
-                self._send_whole(link.bulk)
-            else:
-                self._task = asyncio.get_running_loop().create_task(self._drain(), name=f"bodies {self._route}")
-        return True
+        if self._link is not None and len(head) + len(body) > mesh_limits.EXPRESS_MESSAGE_MAX:
+            self._large.append((sequence, head, body, budget))
+            self._send_large()
+            return True
+        if self._link is not None:
+            self._link.express.send(self._route, sequence, time.time_ns(), _framed(head, body))
+        if budget is not None:
+            budget.give(len(body))
+        return False
 
     def close(self) -> None:
         """Send nothing more, and drop what waits."""
@@ -132,33 +125,37 @@ class BodySender:
         if budget is not None:
             budget.give(len(body))
 
-    def _send_whole(self, lane: LaneSender) -> None:
-        sequence, head, body, _ = self._large[0]
-        size = len(head) + len(body)
-        framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))
-        lane.send(self._route, sequence, time.time_ns(), framed)
-        self._left()
-
-    async def _drain(self) -> None:
-        """Send large bodies a portion at a time: copying 64 MiB at once would block the event loop for 30 ms."""
-        while self._large and self._link is not None:
-            lane = self._link.bulk
+    def _send_large(self) -> None:
+        """Send the bodies of one frame that are next; a task sends the one behind them, then what comes next."""
+        while self._large and self._task is None and self._link is not None:
             sequence, head, body, _ = self._large[0]
-            size = len(head) + len(body)
-            if size <= _WHOLE:
-                self._send_whole(lane)
-                continue
-            parcel = lane.open(self._route, _LENGTH + size, sequence, time.time_ns())
-            view = memoryview(body)
-            lane.extend(parcel, b"".join((size.to_bytes(_LENGTH, "little"), head, view[:_PORTION])))
-            for start in range(_PORTION, len(view), _PORTION):
-                yield_to_data()
-                await asyncio.sleep(0)
-                while lane.outbox.pending_bytes > _AHEAD and not (lane.ended or parcel.dropped):  # noqa: ASYNC110
-                    await asyncio.sleep(_PAUSE)
-                lane.extend(parcel, view[start : start + _PORTION])
+            if len(head) + len(body) > _WHOLE:
+                work = self._send_portions(self._link.bulk, sequence, head, body)
+                self._task = asyncio.get_running_loop().create_task(work, name=f"bodies {self._route}")
+                return
+            self._link.bulk.send(self._route, sequence, time.time_ns(), _framed(head, body))
             self._left()
+
+    async def _send_portions(self, lane: LaneSender, sequence: int, head: bytes, body: Buffer) -> None:
+        """Send a body a portion at a time: copying 64 MiB at once would block the event loop for 30 ms."""
+        parcel = lane.open(self._route, _LENGTH + len(head) + len(body), sequence, time.time_ns())
+        view = memoryview(body)
+        lane.extend(parcel, _framed(head, view[:_PORTION], len(head) + len(body)))
+        for start in range(_PORTION, len(view), _PORTION):
+            yield_to_data()
+            await asyncio.sleep(0)
+            while lane.outbox.pending_bytes > _AHEAD and not (lane.ended or parcel.dropped):  # noqa: ASYNC110
+                await asyncio.sleep(_PAUSE)
+            lane.extend(parcel, view[start : start + _PORTION])
+        self._left()
         self._task = None
+        self._send_large()
+
+
+def _framed(head: bytes, body: Buffer, size: int | None = None) -> bytes:
+    """A body with its length in front; ``size``: that of the whole, if this is its first portion."""
+    length = len(head) + len(body) if size is None else size
+    return b"".join((length.to_bytes(_LENGTH, "little"), head, body))
 
 
 class BodyReceiver(DataHandler):
@@ -173,7 +170,7 @@ class BodyReceiver(DataHandler):
         self._budget = budget
         self._most = most
         self._sequence: int | None = None
-        self._buffer: bytearray | None = None
+        self._buffer = bytearray()
         self._size = 0
         self._stamp_ns = 0
         """When the present body was sent, by the peer's clock."""
@@ -208,30 +205,31 @@ class BodyReceiver(DataHandler):
             part = self._begin(sequence, part)
         if sequence != self._sequence:
             return
-        buffer = self._buffer
         if flags & ABORT:
             self.drop("its sender gave it up")
             return
-        if buffer is not None:
-            if len(buffer) + len(part) > self._size:
-                raise RemoteProtocolError(f"a service's message of {self._size} bytes has more than that")
-            buffer += part
+        buffer, size = self._buffer, self._size
+        buffer += part
+        if len(buffer) > size:
+            raise RemoteProtocolError(f"a service's message of {size} bytes has more than that")
         if flags & LAST:
             self._stamp_ns = stamp_ns
-            self._sequence = self._buffer = None
-            if buffer is not None:
-                self._budget.give(self._size)
-                if len(buffer) != self._size:
-                    raise RemoteProtocolError(f"a service's message of {self._size} bytes has only {len(buffer)}")
-                self.body(sequence, buffer)
+            self.discard()
+            if len(buffer) != size:
+                raise RemoteProtocolError(f"a service's message of {size} bytes has only {len(buffer)}")
+            self.body(sequence, buffer)
 
     def drop(self, reason: str) -> None:
         """Give up a body of which only parts have arrived, if there is one; ``failed`` gets the reason."""
-        sequence, self._sequence = self._sequence, None
-        buffer, self._buffer = self._buffer, None
-        if buffer is not None and sequence is not None:
-            self._budget.give(self._size)
+        if (sequence := self.discard()) is not None:
             self.failed(sequence, reason)
+
+    def discard(self) -> int | None:
+        """Forget a body of which only parts have arrived; return its number, or ``None`` if there is none."""
+        sequence, self._sequence, self._buffer = self._sequence, None, bytearray()
+        if sequence is not None:
+            self._budget.give(self._size)
+        return sequence
 
     def _begin(self, sequence: int, part: memoryview) -> memoryview:
         if len(part) < _LENGTH:
@@ -240,11 +238,9 @@ class BodyReceiver(DataHandler):
         size = int.from_bytes(part[:_LENGTH], "little")
         if size > self._most:
             raise LimitExceeded("service message", size, self._most)
-        self._sequence, self._size = sequence, size
         if self._budget.take(size):
-            self._buffer = bytearray()
-        else:
-            self._buffer = None  # its parts are not kept
+            self._sequence, self._size = sequence, size
+        else:  # its other parts are not those of a body that is known
             text = f"large calls hold {self._budget.used >> 20} MiB already: at most {self._budget.limit >> 20}"
             self.failed(sequence, text)
         return part[_LENGTH:]
@@ -390,15 +386,6 @@ Done = Callable[[bool, "Buffer"], None]
 """Called with ``(ok, body)``: the response, or the text of the error."""
 
 
-@dataclass(slots=True)
-class _Waiting:
-    """A call that waits for a free connection."""
-
-    body: Buffer
-    until: float
-    done: Done
-
-
 class ServicePool:
     """Calls one local server over up to ``limits.SERVICE_POOL`` connections.
 
@@ -416,7 +403,8 @@ class ServicePool:
         self._idle: list[tuple[ServiceConnection, float]] = []
         self._busy: set[ServiceConnection] = set()
         self._opening: set[asyncio.Task[None]] = set()
-        self._queue: deque[_Waiting] = deque()
+        self._queue: deque[tuple[Buffer, float, Done]] = deque()
+        """The calls that wait: request, until when, and the callback."""
         self._closed = False
 
     @property
@@ -435,16 +423,7 @@ class ServicePool:
         Raises:
             RmpaError: The server does not answer, or refuses.
         """
-        try:
-            connection = await self._connect()
-        except RmpaError:
-            self._on_lost()
-            raise
-        if self._closed:
-            connection.close()
-        else:
-            self._free(connection)
-        return connection.description
+        return (await self._connect()).description
 
     def call(self, body: Buffer, timeout: float, done: Done) -> None:
         """Make a call; ``done`` is called once, perhaps before this method returns.
@@ -455,10 +434,10 @@ class ServicePool:
             done: Called with the response or the error.
         """
         if len(self._queue) >= limits.SERVICE_QUEUE:
-            text = f"service [{self.service}]: {len(self._queue)} calls wait for its server already"
-            done(False, text.encode())
+            done(False, self._text(f"{len(self._queue)} calls wait for its server already"))
             return
-        self._take(_Waiting(body, self._loop.time() + timeout, done))
+        self._queue.append((body, self._loop.time() + timeout, done))
+        self._serve()
 
     def close_idle(self, before: float) -> None:
         """Close the connections that were not used since ``before`` (``loop.time()``)."""
@@ -473,14 +452,13 @@ class ServicePool:
     def close(self, reason: str) -> None:
         """Close all connections; the calls under way and those that wait fail with the reason."""
         self._closed = True
-        text = f"service [{self.service}]: {reason}".encode()
         for task in self._opening:
             task.cancel()
         for connection in [*(connection for connection, _ in self._idle), *self._busy]:
             connection.close()
         self._idle.clear()
         while self._queue:
-            self._queue.popleft().done(False, text)
+            self._queue.popleft()[2](False, self._text(reason))
 
     async def closed(self) -> None:
         """Wait until attempts to connect have ended; call after ``close``."""
@@ -488,16 +466,29 @@ class ServicePool:
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _take(self, call: _Waiting) -> None:
-        while self._idle:
-            connection, _ = self._idle.pop()
-            if self._request(connection, call):
-                return
-        self._queue.append(call)
-        self._open_more()
+    def _text(self, reason: str) -> bytes:
+        return f"service [{self.service}]: {reason}".encode(errors="replace")
 
-    def _open_more(self) -> None:
-        """Open a connection for each call that waits, up to ``limits.SERVICE_POOL`` in all."""
+    def _serve(self) -> None:
+        """Give the calls that wait to free connections, and open more for the rest, ``SERVICE_POOL`` in all."""
+        while self._queue and self._idle:
+            connection, since = self._idle.pop()
+            body, until, done = self._queue.popleft()
+            rest = until - self._loop.time()
+            problem = self._text("its server had no time for this call") if rest <= 0 else b""
+            try:
+                if not problem:
+                    connection.request(body, partial(self._answered, connection, done), rest)
+                    self._busy.add(connection)
+                    continue
+            except (ServiceFailed, LocalProtocolError) as error:  # nothing was sent
+                if isinstance(error, LocalProtocolError) or connection.closed:
+                    connection.close()
+                    self._queue.appendleft((body, until, done))
+                    continue
+                problem = str(error).encode(errors="replace")
+            self._idle.append((connection, since))
+            done(False, problem)
         while len(self._opening) < len(self._queue) and self.size < limits.SERVICE_POOL:
             task = self._loop.create_task(self._open(), name=f"connect to {self.service}")
             self._opening.add(task)
@@ -505,60 +496,40 @@ class ServicePool:
 
     async def _open(self) -> None:
         try:
-            connection = await self._connect()
+            await self._connect()
         except RmpaError as error:
             # The waiting calls would fail as this attempt did; the next call makes a new attempt.
-            self._on_lost()
             while self._queue and not self._busy:
-                self._queue.popleft().done(False, str(error).encode(errors="replace"))
-            return
-        self._free(connection)
+                self._queue.popleft()[2](False, str(error).encode(errors="replace"))
 
     async def _connect(self) -> ServiceConnection:
-        return await ServiceConnection.open(self.server.uri, self.service, OWN_NODE, on_closed=self._on_lost)
-
-    def _request(self, connection: ServiceConnection, call: _Waiting) -> bool:
-        """Send a call's request; ``False`` if the connection was closed already, and nothing was sent."""
-        rest = call.until - self._loop.time()
         try:
-            connection.request(call.body, partial(self._answered, connection, call.done), rest)
-        except (ServiceFailed, LocalProtocolError) as error:
-            if isinstance(error, ServiceFailed) and not connection.closed:
-                self._free(connection)
-                call.done(False, str(error).encode(errors="replace"))
-                return True
-            connection.close()
-            return False
-        self._busy.add(connection)
-        return True
+            connection = await ServiceConnection.open(
+                self.server.uri, self.service, OWN_NODE, on_closed=self._on_lost
+            )
+        except RmpaError:
+            self._on_lost()
+            raise
+        self._free(connection)
+        return connection
 
     def _answered(
         self, connection: ServiceConnection, done: Done, result: tuple[bool, bytes | bytearray] | ServiceFailed
     ) -> None:
         self._busy.discard(connection)
-        if isinstance(result, ServiceFailed):
-            connection.close()
-            done(False, str(result).encode(errors="replace"))
-            if not self._closed:
-                self._on_lost()
-                self._open_more()
-            return
-        done(*result)
-        if self._closed:
-            connection.close()
-        else:
+        if not isinstance(result, ServiceFailed):
+            done(*result)
             self._free(connection)
+            return
+        connection.close()
+        done(False, str(result).encode(errors="replace"))
+        if not self._closed:
+            self._on_lost()
+            self._serve()
 
     def _free(self, connection: ServiceConnection) -> None:
-        """Give a connection that has become free to the next waiting call, or keep it."""
-        while self._queue:
-            call = self._queue.popleft()
-            if call.until <= self._loop.time():
-                call.done(False, f"service [{self.service}]: its server had no time for this call".encode())
-                continue
-            if not self._request(connection, call):
-                self._queue.appendleft(call)
-                self._open_more()
-            return
-        if not connection.closed:
+        if self._closed:
+            connection.close()
+        elif not connection.closed:
             self._idle.append((connection, self._loop.time()))
+        self._serve()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -146,12 +146,11 @@ class Caller(BodyReceiver):
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Handle a reply; it is dropped if its call has ended already."""
-        call, began, _ = self._pending.pop(sequence, (None, 0.0, False))
-        if call is None:
+        if (found := self._end(sequence)) is None:
             return
+        call, began, _ = found
         now = self.used_at = self._loop.time()
         ok = body[:1] == _OK
-        self._ended(call)
         if ok:
             self._stats.latencies.append(now - began)
         else:
@@ -180,32 +179,28 @@ class Caller(BodyReceiver):
 
     def close(self, reason: str) -> None:
         """Fail the calls under way with this reason, and send nothing more."""
-        self._sequence = None
-        if self._buffer is not None:
-            self._buffer = None
-            self._budget.give(self._size)
+        self.discard()
         for sequence in list(self._pending):
             self._fail(sequence, f"{self._what}: {reason}")
         self._sender.close()
 
     def _fail(self, sequence: int, text: str) -> None:
-        call, _, _ = self._pending.pop(sequence, (None, 0.0, False))
-        if call is not None:
-            self._ended(call)
+        if (found := self._end(sequence)) is not None:
             self._stats.fail(text)
-            call.fail(text)
+            found[0].fail(text)
 
     def _gone(self, sequence: int) -> None:
         """End a call whose client has left, or whose deadline is over."""
-        call, _, _ = self._pending.pop(sequence, (None, 0.0, False))
-        if call is not None:
-            self._ended(call)
-            late = self._loop.time() >= call.deadline
+        if (found := self._end(sequence)) is not None:
+            late = self._loop.time() >= found[0].deadline
             self._stats.fail("no answer in time" if late else "the client left in the middle of the call")
 
-    def _ended(self, call: ServiceCall) -> None:
-        self._stats.active -= 1
-        self._outgoing.give(len(call.request))
+    def _end(self, sequence: int) -> tuple[ServiceCall, float, bool] | None:
+        found = self._pending.pop(sequence, None)
+        if found is not None:
+            self._stats.active -= 1
+            self._outgoing.give(len(found[0].request))
+        return found
 
 
 class Server(BodyReceiver):
@@ -234,13 +229,13 @@ class Server(BodyReceiver):
         super().__init__(budgets.incoming)
         self._link = link
         self._time = link_time
-        self._sender: BodySender | None = BodySender(link, route)
+        self._sender = BodySender(link, route)
         self._pool = pool
         self._timeout = timeout
         self._outgoing = budgets.outgoing
         self._stats = stats
         self._loop = asyncio.get_running_loop()
-        self._recent: OrderedDict[int, None] = OrderedDict()
+        self._recent: deque[int] = deque(maxlen=_RECENT)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Pass a request to the server, unless its caller has given it up: it must not act then."""
@@ -275,17 +270,13 @@ class Server(BodyReceiver):
         """Send an error for each call whose reply may have been lost with the bulk lane's connection."""
         self.drop("the connection for large messages was lost")
         for sequence in self._recent:
-            self._send(sequence, False, b"the connection for large messages was lost behind the call")
+            self._sender.send(sequence, b"the connection for large messages was lost behind the call", _FAILED)
         self._recent.clear()
 
     def close(self) -> None:
         """Send nothing more: the replies of calls that are being served are dropped."""
-        sender, self._sender = self._sender, None
-        if sender is not None:
-            sender.close()
-        if self._buffer is not None:
-            self._sequence = self._buffer = None
-            self._budget.give(self._size)
+        self._sender.close()
+        self.discard()
 
     def _answered(self, sequence: int, size: int, began: float, ok: bool, body: Buffer) -> None:
         self._budget.give(size)
@@ -297,30 +288,13 @@ class Server(BodyReceiver):
             stats.fail(_text(body))
         if not self._outgoing.take(len(body)):
             self._reply_failed(sequence, f"more than {self._outgoing.limit >> 20} MiB of replies wait for the link")
-        elif not self._send(sequence, ok, body, self._outgoing):
-            self._recent[sequence] = None
-            if len(self._recent) > _RECENT:
-                self._recent.popitem(last=False)
+        elif self._sender.send(sequence, body, _OK if ok else _FAILED, self._outgoing):
+            self._recent.append(sequence)
 
     def _reply_failed(self, sequence: int, reason: str) -> None:
         text = f"service [{self._pool.service}]: {reason}"
         self._stats.fail(text)
-        self._send(sequence, False, text.encode())
-
-    def _send(self, sequence: int, ok: bool, body: Buffer, budget: Budget | None = None) -> bool:
-        """Send a reply; return whether it took the express lane, or was dropped after ``close``.
-
-        Args:
-            sequence: The number of the call.
-            ok: Whether the call succeeded.
-            body: The response, or the text of the error.
-            budget: Gets the body's bytes back when they were sent or dropped.
-        """
-        if self._sender is not None:
-            return not self._sender.send(sequence, body, _OK if ok else _FAILED, budget)
-        if budget is not None:
-            budget.give(len(body))
-        return True
+        self._sender.send(sequence, text.encode(), _FAILED)
 
 
 # Serves services of this module to peers: a pool of connections to each server, and checks that servers live.

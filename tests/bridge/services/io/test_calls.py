@@ -249,7 +249,7 @@ async def test_a_client_that_leaves_wants_no_answer() -> None:
     assert ends.stats.problem == "the client left in the middle of the call"
     ends.pool.waiting[0][1](True, LARGE)
     await asyncio.sleep(0)
-    while ends.server._sender is not None and ends.server._sender._task is not None:
+    while ends.server._sender._task is not None:
         await asyncio.sleep(0)
     assert call.answer is None
     ends.assert_nothing_held()
@@ -276,7 +276,7 @@ async def test_a_reply_that_is_lost_with_the_bulk_lane_is_an_error() -> None:
     ends.pool.waiting = []
     other = ends.call(SMALL)
     ends.pool.waiting[0][1](True, LARGE)
-    while ends.server._sender is not None and ends.server._sender._task is not None:
+    while ends.server._sender._task is not None:
         await asyncio.sleep(0)
     ends.back.bulk.kept[0]()
     ends.caller.lane_lost()
