@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.quality import QosWatch, QualitySummary
-    from rmpa.bridge.direct.conditions import Interruption
     from rmpa.bridge.direct.paths import Path
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
@@ -130,16 +129,18 @@ def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
     return there, sum(owner == peer for owner, _, _ in bridge.topics.direct_exports)
 
 
-def _interrupted(one: SubscriberTransport, found: Interruption | None, now: float) -> SubscriberTransport:
+def _interrupted(
+    one: SubscriberTransport, found: tuple[int, float, float | None] | None, now: float
+) -> SubscriberTransport:
     """A subscriber with when it was without its path."""
     if found is None:
         return one
-    ended = now if found.ended is None else found.ended
+    count, began, ended = found
     return msgspec.structs.replace(
         one,
-        interruptions=found.count,
-        interrupted=ended - found.began,
-        interrupted_ago=None if found.ended is None else now - ended,
+        interruptions=count,
+        interrupted=(now if ended is None else ended) - began,
+        interrupted_ago=None if ended is None else now - ended,
     )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, reply_of, unmet_by_trust
@@ -10,6 +13,7 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.trust.permissions import Permissions
 
+AWAY, NEAR = (cast("Any", SimpleNamespace(same_machine=near)) for near in (False, True))
 GRANT = Grant(45225, "/talker", "/talker/get_loggers")
 
 
@@ -79,10 +83,10 @@ def test_only_passing_conditions_are_tried_again_by_time() -> None:
 
 def test_a_secured_mesh_relays_between_machines_unless_the_user_allows_plain_connections() -> None:
     secured = PermissionGate(Permissions(TrustSettings()))
-    unmet = unmet_by_trust(secured, "this module", same_machine=False)
+    unmet = unmet_by_trust(secured, "this module", AWAY)
     assert unmet is not None
     assert (unmet.condition, unmet.lasting) == (Condition.TRUST, True)
-    assert unmet_by_trust(secured, "this module", same_machine=True) is None
+    assert unmet_by_trust(secured, "this module", NEAR) is None
     allowed = PermissionGate(Permissions(TrustSettings(direct=True)))
-    assert unmet_by_trust(allowed, "this module", same_machine=False) is None
-    assert unmet_by_trust(PermissionGate(), "this module", same_machine=False) is None
+    assert unmet_by_trust(allowed, "this module", AWAY) is None
+    assert unmet_by_trust(PermissionGate(), "this module", AWAY) is None

@@ -20,6 +20,7 @@ from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
     from rmpa.bridge.policy import PermissionGate
+    from rmpa.bridge.sessions import PeerSession
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 _TEXT_MAX: Final = 300
@@ -103,15 +104,15 @@ class Grant(NamedTuple):
     probe: str = ""
 
 
-def unmet_by_trust(gate: PermissionGate, where: str, *, same_machine: bool) -> Unmet | None:
+def unmet_by_trust(gate: PermissionGate, where: str, session: PeerSession) -> Unmet | None:
     """The condition that a secured mesh does not meet, if any.
 
     Args:
         gate: Whether the mesh is secured, and whether plain connections are let all the same.
         where: Whose setting that is, as text.
-        same_machine: Whether both modules are on one machine, so that the connection does not leave it.
+        session: The peer: on one machine a connection does not leave it.
     """
-    if gate.plain or same_machine:
+    if gate.plain or session.same_machine:
         return None
     text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
     return Unmet(Condition.TRUST, text)
@@ -224,35 +225,20 @@ def _read(value: object, kind: type[StructT]) -> StructT:
 # --- what was lost -------------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class Interruption:
-    """That a subscriber was without its direct path: what was published meanwhile is lost to it, and not counted.
-
-    Args:
-        count: How often.
-        began: When the last one began, monotonic seconds.
-        ended: When it ended; ``None`` while it lasts.
-    """
-
-    count: int
-    began: float
-    ended: float | None = None
+Interruptions = dict[tuple[str, Want], tuple[int, float, float | None]]
+"""When a subscriber was without its direct path, by the peer's name and what is reached: how often, when the last
+time began, and when it ended (``None``: it lasts), monotonic seconds. It outlasts links. What was published meanwhile
+is lost to it, and not counted."""
 
 
-class Interruptions(dict[tuple[str, Want], Interruption]):
-    """The interruptions of direct paths, by the peer's name and what is reached. They outlast links."""
-
-    def begin(self, peer: str, want: Want, now: float) -> None:
-        """Note that a path is gone; does nothing while it was gone already."""
-        found = self.pop((peer, want), None) or Interruption(0, now, now)
-        if found.ended is not None:
-            found = Interruption(found.count + 1, now)
-        self[peer, want] = found
-        if len(self) > limits.DIRECT_MAX:
-            del self[next(iter(self))]
-
-    def end(self, peer: str, want: Want, now: float) -> None:
-        """Note that a subscriber has a path again, direct or relayed."""
-        found = self.get((peer, want))
-        if found is not None and found.ended is None:
-            found.ended = now
+def interrupted(known: Interruptions, peer: str, want: Want, now: float, *, lasts: bool) -> None:
+    """Note that a path is gone (``lasts``), or that a subscriber has one again, direct or relayed."""
+    count, began, ended = known.pop((peer, want), (0, now, now))
+    if lasts and ended is not None:
+        count, began, ended = count + 1, now, None
+    elif not lasts and ended is None:
+        ended = now
+    if count:
+        known[peer, want] = count, began, ended
+    if len(known) > limits.DIRECT_MAX:
+        del known[next(iter(known))]

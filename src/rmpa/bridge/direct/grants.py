@@ -21,6 +21,7 @@ from rmpa.bridge.direct.conditions import (
     Interruptions,
     Unmet,
     Want,
+    interrupted,
     read_ask,
     reply_of,
     unmet_by_contract,
@@ -133,9 +134,6 @@ class Grants:
         if sum(peer == session.peer for peer, _ in granted) >= limits.DIRECT_MAX:
             return Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} direct connections to this module")
         return None
-
-    def _unmet_by_trust(self, session: PeerSession, where: str) -> Unmet | None:
-        return unmet_by_trust(self._shared.context.gate, where, same_machine=session.same_machine)
 
     def _is_hidden(self, found: Grant | Unmet) -> bool:
         """Whether a peer must not learn of changes: it may not have this topic or service."""
@@ -255,7 +253,7 @@ class TopicGrants(Grants):
         rpc.on_notification("direct.topic_release", self._released, _RELEASED)
         self._exports = exports
         self.ports = NodePorts()
-        self.interruptions = Interruptions()
+        self.interruptions: Interruptions = {}
         """When peers' subscribers were without a grant because their link was lost."""
 
     def graph_changed(self, change: GraphChange) -> None:
@@ -270,15 +268,18 @@ class TopicGrants(Grants):
         """As of ``Grants``."""
         for peer, want, _ in self if not session.link.crashed else ():
             if peer == session.peer:
-                self.interruptions.begin(session.link.name, want, asyncio.get_running_loop().time())
+                self._interrupted(session, want, lasts=True)
         super().link_down(session)
+
+    def _interrupted(self, session: PeerSession, want: Want, *, lasts: bool) -> None:
+        interrupted(self.interruptions, session.link.name, want, asyncio.get_running_loop().time(), lasts=lasts)
 
     # --- the local graph --------------------------------------------------------------------------------------------
 
     def _changed(self, session: PeerSession, want: Want, *, granted: bool) -> None:
         """Have the proxy of a peer's subscriber stand in the graph while it has a grant for the topic."""
         if granted:
-            self.interruptions.end(session.link.name, want, asyncio.get_running_loop().time())
+            self._interrupted(session, want, lasts=False)
         nodes = sum((peer, one.name, one.user) == (session.peer, want.name, want.user) for peer, one, _ in self)
         held, topic = f"subscriber of {want.name}", want.name
         if granted and nodes == 1:
@@ -338,7 +339,7 @@ class TopicGrants(Grants):
         if compares_names(offered.type):
             return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
         contract = combine(self._shared.context.contracts.of(source.topic, offered.type), asked.contract)
-        unmet = unmet_by_contract(contract, where) or self._unmet_by_trust(session, where)
+        unmet = unmet_by_contract(contract, where) or unmet_by_trust(self._shared.context.gate, where, session)
         if unmet is not None:
             return unmet
         if not self._uri(asked.want):
@@ -407,4 +408,4 @@ class ServiceGrants(Grants):
             return Unmet(Condition.OFFERED, f"{server.node} provides {service} now")
         if self._shared.context.services.transport(service) is Transport.RELAY:
             return Unmet(Condition.TRANSPORT, 'transport is "relay" in the server\'s module')
-        return self._unmet_by_trust(session, "the server's module")
+        return unmet_by_trust(self._shared.context.gate, "the server's module", session)

@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want, unmet_by_trust
+from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, Want, unmet_by_trust
 from rmpa.bridge.direct.nodes import end_all
 from rmpa.bridge.direct.paths import Path, Paths
 from rmpa.bridge.policy import Needs
@@ -190,8 +190,7 @@ class ServicePaths(Paths):
         if remote.wire != service:
             return Unmet(Condition.NAME, f"it is {remote.wire} in the server's module")
         session = self._shared.sessions.get(peer)
-        same_machine = session is not None and session.same_machine
-        return unmet_by_trust(self._shared.context.gate, "this module", same_machine=same_machine)
+        return unmet_by_trust(self._shared.context.gate, "this module", session) if session is not None else NO_LINK
 
     # --- links ---------------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from rmpa.bridge.direct.conditions import (
     Interruptions,
     Unmet,
     Want,
+    interrupted,
     unmet_by_contract,
     unmet_by_trust,
 )
@@ -78,7 +79,7 @@ class TopicPaths(Paths):
         shared.rpc.on_notification("direct.topic_again", self._asked_again, own)
         self._imports = imports
         self._topics = topics
-        self.interruptions = Interruptions()
+        self.interruptions: Interruptions = {}
         """When subscribers were without their path."""
         self._checking: asyncio.TimerHandle | None = None
         self._kernel_tells = kernel_tells()
@@ -136,7 +137,7 @@ class TopicPaths(Paths):
         self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str
     ) -> Unmet | None:
         unmet = unmet_by_contract(self._shared.context.contracts.of(entry.topic, entry.type), "this module")
-        unmet = unmet or unmet_by_trust(self._shared.context.gate, "this module", same_machine=session.same_machine)
+        unmet = unmet or unmet_by_trust(self._shared.context.gate, "this module", session)
         if unmet is not None:
             return unmet
         if entry.origin is not None:
@@ -220,8 +221,7 @@ class TopicPaths(Paths):
 
     def _interrupted(self, path: Path, *, lasts: bool) -> None:
         if (session := self._shared.sessions.get(path.peer)) is not None:
-            note = self.interruptions.begin if lasts else self.interruptions.end
-            note(session.link.name, path.want, self._now())
+            interrupted(self.interruptions, session.link.name, path.want, self._now(), lasts=lasts)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""

@@ -269,13 +269,12 @@ async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -
     module.session.link.crashed = False
     module.sut.link_down(module.session)
     module.sut.hidden(1, SOURCE)
-    lasting = module.sut.interruptions.get(("a", WANT))
-    assert lasting is not None
-    assert (lasting.count, lasting.ended) == (1, None)
+    count, _, ended = module.sut.interruptions["a", WANT]
+    assert (count, ended) == (1, None)
     module.sut.shown(1, SOURCE)
     module.sut.link_up(module.session)
     assert await module.ask() == DIRECT
-    assert lasting.ended is not None
+    assert module.sut.interruptions["a", WANT][2] is not None
 
 
 async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(module: Module) -> None:
