@@ -125,7 +125,7 @@ class DirectSection:
 
 def direct_counts(bridge: Bridge, peer: int) -> tuple[int, int]:
     """The number of direct connections to a peer's publishers, and of the grants that it has here."""
-    there = sum(path.peer == peer and path.endpoint is not None for path in bridge.topics.direct_imports)
+    there = sum(path.session.peer == peer and path.endpoint is not None for path in bridge.topics.direct_imports)
     return there, sum(owner == peer for owner, _, _ in bridge.topics.direct_exports)
 
 

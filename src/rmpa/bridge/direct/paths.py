@@ -47,7 +47,7 @@ class Path:
     More than twelve fields: the facts, the decision, and where the subscriber is, which follows it later.
 
     Args:
-        peer: The number of the peer's session.
+        session: The peer.
         want: What is reached.
         contract: That of the topic here; of a service the transport alone.
         here: The condition that does not hold by the rules and the graph of this module, if any.
@@ -64,7 +64,7 @@ class Path:
         mover: Moves the subscriber.
     """
 
-    peer: int
+    session: PeerSession
     want: Want
     contract: Contract
     here: Unmet | None = None
@@ -79,6 +79,11 @@ class Path:
     placed_at: float = 0.0
     stuck: str = ""
     mover: asyncio.Task[None] | None = None
+
+    @property
+    def target(self) -> tuple[str, int] | None:
+        """Where a new connection should lead; ``None``: to the agents."""
+        return (self.session.address, self.found.port) if isinstance(self.found, Grant) else None
 
     @property
     def endpoint(self) -> tuple[str, int] | None:
@@ -131,18 +136,13 @@ class Paths:
         """One path; ``None`` if it is not known."""
         return self._paths.get((peer, *want[:2]), {}).get(want.user)
 
-    def target(self, path: Path) -> tuple[str, int] | None:
-        """Where a new connection should lead; ``None``: to the agents."""
-        session = self._shared.sessions.get(path.peer)
-        return (session.address, path.found.port) if session is not None and isinstance(path.found, Grant) else None
-
     @staticmethod
     def _now() -> float:
         return asyncio.get_running_loop().time()
 
     # --- what subclasses do -----------------------------------------------------------------------------------------
 
-    async def _probe(self, session: PeerSession, path: Path, grant: Grant) -> str:
+    async def _probe(self, path: Path, grant: Grant) -> str:
         """Why a node cannot be reached from here; empty: it can."""
         raise NotImplementedError
 
@@ -156,18 +156,19 @@ class Paths:
 
     # --- facts ------------------------------------------------------------------------------------------------------
 
-    def judge(self, peer: int, want: Want, contract: Contract, unmet: Unmet | None) -> Path:
+    def judge(self, session: PeerSession, want: Want, contract: Contract, unmet: Unmet | None) -> Path:
         """Judge a path that is new, or for which something may have changed here.
 
         Args:
-            peer: The number of the peer's session.
+            session: The peer.
             want: What is reached.
             contract: That of the topic here; of a service the transport alone.
             unmet: The condition that does not hold here, if any.
         """
-        path = self.get(peer, want)
+        path = self.get(session.peer, want)
         if path is None:
-            path = self._paths.setdefault((peer, *want[:2]), {})[want.user] = Path(peer, want, contract, unmet)
+            path = Path(session, want, contract, unmet)
+            self._paths.setdefault((session.peer, *want[:2]), {})[want.user] = path
         elif (path.contract, path.here) == (contract, unmet):
             return path
         path.contract, path.here = contract, unmet
@@ -176,10 +177,11 @@ class Paths:
 
     def forget(self, path: Path) -> None:
         """Forget a path that is not used any more; its connections stay as they are."""
-        users = self._paths.get((path.peer, *path.want[:2]), {})
+        place = (path.session.peer, *path.want[:2])
+        users = self._paths.get(place, {})
         users.pop(path.want.user, None)
         if not users:
-            self._paths.pop((path.peer, *path.want[:2]), None)
+            self._paths.pop(place, None)
         self._stop(path)
         self._release(path)
 
@@ -203,7 +205,7 @@ class Paths:
             self.forget(path)
 
     def _of_peer(self, session: PeerSession) -> list[Path]:
-        return [path for path in self if path.peer == session.peer]
+        return [path for path in self if path.session is session]
 
     def broke(self, path: Path) -> None:
         """Ask again for what was direct until its connection ended by itself, unless that happens all the time."""
@@ -233,10 +235,9 @@ class Paths:
 
     def _unmet(self, path: Path) -> Unmet | None:
         """The condition that does not hold by what is known here; ``None``: the peer decides."""
-        session = self._shared.sessions.get(path.peer)
         if path.here is not None:
             return path.here
-        if session is None or not session.linked:
+        if not path.session.linked:
             return NO_LINK
         breaks = path.breaks
         often = len(breaks) == limits.DIRECT_BREAKS and breaks[-1] - breaks[0] < limits.DIRECT_BREAKS_SPAN
@@ -306,14 +307,12 @@ class Paths:
             if wanted and found.condition not in {Condition.TRANSPORT, Condition.MEASURES}:
                 subject = self._subject(path)
                 text = f'{subject}: relayed although transport is "direct": {found.text}'
-                self._on_warning("direct.relayed", f"{path.peer} {subject} {found.condition}", text)
+                self._on_warning("direct.relayed", f"{path.session.peer} {subject} {found.condition}", text)
         self._decided(path)
 
     async def _ask(self, path: Path) -> Grant | Unmet:
-        session, want = self._shared.sessions.get(path.peer), path.want
-        if session is None:
-            return NO_LINK
-        async with self._asks.setdefault(path.peer, asyncio.Semaphore(limits.DIRECT_ASKS)):
+        session, want = path.session, path.want
+        async with self._asks.setdefault(session.peer, asyncio.Semaphore(limits.DIRECT_ASKS)):
             broken = bool(path.breaks) and path.breaks[-1] > path.asked_at
             asked = DirectAsk(*want, path.contract if want.user else None, broken)
             path.asked_at, path.held = self._now(), True
@@ -334,20 +333,16 @@ class Paths:
 
     async def _reached(self, path: Path, grant: Grant) -> Unmet | None:
         """Probe a node, once for all that ask for it at a time."""
-        session = self._shared.sessions.get(path.peer)
-        if session is None:
-            return NO_LINK
-        key = (id(session.link), grant.port, "" if path.want.user else path.want.name)
+        key = (id(path.session.link), grant.port, "" if path.want.user else path.want.name)
         task = self._probes.get(key)
         if task is None:
-            task = self._probes[key] = self._spawn(self._probe(session, path, grant), f"probe {grant.node}")
+            task = self._probes[key] = self._spawn(self._probe(path, grant), f"probe {grant.node}")
             task.add_done_callback(lambda _: self._probes.pop(key, None))
         problem = await asyncio.shield(task)
         return Unmet(Condition.REACHABLE, problem) if problem else None
 
     def _release(self, path: Path) -> None:
         """Give back a grant that the peer may hold."""
-        session = self._shared.sessions.get(path.peer)
-        if path.held and session is not None and session.linked:
+        if path.held and path.session.linked:
             path.held = False
-            self._shared.rpc.notify(session, f"direct.{self.kind}_release", path.want._asdict())
+            self._shared.rpc.notify(path.session, f"direct.{self.kind}_release", path.want._asdict())

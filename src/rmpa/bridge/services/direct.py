@@ -75,10 +75,9 @@ class ServicePaths(Paths):
     def _lookup(self, service: str, uri: str, caller: str, api: str) -> str:
         """Answer a lookup; see ``Core.on_lookup``. It is called for each of them."""
         path = self.answers.get(service)
-        if path is None or path.task is not None or self._proxy_uri(path.peer, service) != uri:
+        if path is None or path.task is not None or self._proxy_uri(path.session.peer, service) != uri:
             return ""
-        session = self._shared.sessions.get(path.peer)
-        nearby = session is not None and session.same_machine  # clients that are bound to loopback reach it too
+        nearby = path.session.same_machine  # clients that are bound to loopback reach it too
         local_only = not nearby and is_loopback(host_of(api))
         if not api or local_only or is_own(caller) or caller.startswith(_OWN_TOOLS):
             self._shared.counters.add("direct.lookup_relayed")
@@ -87,12 +86,12 @@ class ServicePaths(Paths):
         if not nearby:
             self._looked.add(service)
             self._look_later()
-        return self.address(path.peer, service)
+        return self.address(path.session.peer, service)
 
     def address(self, peer: int, service: str) -> str:
         """What lookups of a peer's service are answered; empty: the proxy's address."""
         path = self.answers.get(service)
-        if path is None or path.peer != peer or path.endpoint is None:
+        if path is None or path.session.peer != peer or path.endpoint is None:
             return ""
         return f"rosrpc://{path.endpoint[0]}:{path.endpoint[1]}"
 
@@ -120,7 +119,7 @@ class ServicePaths(Paths):
             if stuck := [one for one in connecting if one.id in before]:
                 end_all(stuck)
                 self._shared.counters.add("direct.service_unreachable")
-                text = f"clients get no answer from {self.address(path.peer, service)}"
+                text = f"clients get no answer from {self.address(path.session.peer, service)}"
                 self._stop(path)
                 self._decide(path, Unmet(Condition.REACHABLE, text))
         if looked:
@@ -138,15 +137,19 @@ class ServicePaths(Paths):
 
     def shown(self, peer: int, service: str) -> None:
         """Judge a service that is in the local graph, or to which other rules apply."""
-        remote = self._imports.get(peer, service)
-        if remote is None or not remote.shown:
+        remote, session = self._imports.get(peer, service), self._shared.sessions.get(peer)
+        if remote is None or not remote.shown or session is None:
             return
         want, wanted = Want(service, remote.node), self._shared.context.services.transport(service)
         for path in self:
-            if path.peer == peer and path.want.name == service and (path.want != want or wanted is Transport.RELAY):
+            if (
+                path.session is session
+                and path.want.name == service
+                and (path.want != want or wanted is Transport.RELAY)
+            ):
                 self.forget(path)  # nothing is kept of services that are relayed by rule
         if wanted is not Transport.RELAY:
-            self.judge(peer, want, Contract(transport=wanted), self._unmet_here(peer, service, remote))
+            self.judge(session, want, Contract(transport=wanted), self._unmet_here(peer, service, remote))
 
     def hidden(self, peer: int, service: str, node: str, *, end: bool = False) -> None:
         """Forget a service that leaves the local graph; clients keep the connections that they have.
@@ -157,12 +160,12 @@ class ServicePaths(Paths):
             node: The node that provides it.
             end: End these connections, too: the peer may not serve it here any more.
         """
-        path, session = self.get(peer, Want(service, node)), self._shared.sessions.get(peer)
+        path = self.get(peer, Want(service, node))
         if path is not None:
             endpoint = path.endpoint
             self.forget(path)
-            if end and endpoint is not None and session is not None:
-                self._end(session, (endpoint,))
+            if end and endpoint is not None:
+                self._end(path.session, (endpoint,))
 
     def forget(self, path: Path) -> None:
         """As of ``Paths``; lookups are answered with the proxy's address again."""
@@ -202,7 +205,7 @@ class ServicePaths(Paths):
 
     def called(self, peer: int) -> set[str]:
         """The services of a peer that are called directly."""
-        return {service for service, path in self.answers.items() if path.peer == peer}
+        return {service for service, path in self.answers.items() if path.session.peer == peer}
 
     def gone(self, session: PeerSession) -> None:
         """As of ``Paths``."""
@@ -219,8 +222,8 @@ class ServicePaths(Paths):
 
     # --- carrying out --------------------------------------------------------------------------------------------
 
-    async def _probe(self, session: PeerSession, path: Path, grant: Grant) -> str:
-        address = f"rosrpc://{session.address}:{grant.port}"
+    async def _probe(self, path: Path, grant: Grant) -> str:
+        address = f"rosrpc://{path.session.address}:{grant.port}"
         try:
             connection = await ServiceConnection.open(
                 address, path.want.name, OWN_NODE, persistent=False, probe=True, timeout=limits.DIRECT_PROBE_TIMEOUT
@@ -233,11 +236,11 @@ class ServicePaths(Paths):
         return ""
 
     def _subject(self, path: Path) -> str:
-        return f"{path.want.name} of {self._imports.peer_name(path.peer)}"
+        return f"{path.want.name} of {path.session.link.name}"
 
     def _decided(self, path: Path) -> None:
-        service, peer = path.want.name, self._imports.peer_name(path.peer)
-        answered, before, path.place = self.answers.get(service), path.place, self.target(path)
+        service, peer = path.want.name, path.session.link.name
+        answered, before, path.place = self.answers.get(service), path.place, path.target
         if path.place is None:
             if answered is path:
                 del self.answers[service], self.lookups[service]
@@ -247,7 +250,7 @@ class ServicePaths(Paths):
             used = self._used.setdefault(peer, set())
             if len(used) < limits.DIRECT_MAX:
                 used.add(path.place)
-            _log.info("= %s of %s is called directly at %s", service, peer, self.address(path.peer, service))
+            _log.info("= %s of %s is called directly at %s", service, peer, self.address(path.session.peer, service))
 
     async def close(self) -> None:
         """As of ``Paths``."""

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.slave_node import SlaveNode
 
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
@@ -129,7 +128,7 @@ class TopicPaths(Paths):
         is_known = self.get(peer, want) is not None
         if contract.transport is Transport.RELAY and not is_known:
             return  # nothing is kept of topics that are relayed by rule
-        path = self.judge(peer, want, contract, self._unmet_here(session, source, entry, node, uri))
+        path = self.judge(session, want, contract, self._unmet_here(session, source, entry, node, uri))
         if not is_known and self._is_relayed(path):
             path.place = AGENTS  # until now it was relayed by rule
 
@@ -163,7 +162,7 @@ class TopicPaths(Paths):
         unmet = super()._unmet(path)
         if unmet is not None or not self._is_relayed(path):
             return unmet
-        entry = self._imports.get(path.peer, _source(path))
+        entry = self._imports.get(path.session.peer, _source(path))
         return _TWICE if entry is not None and entry.description and entry.description.latching else None
 
     def _is_relayed(self, path: Path) -> bool:
@@ -171,15 +170,8 @@ class TopicPaths(Paths):
         return publication is not None and path.want.user in publication.callers
 
     def _publication(self, path: Path) -> Publication | None:
-        topics = self._topics.get(path.peer)
+        topics = self._topics.get(path.session.peer)
         return topics.publication(_source(path)) if topics is not None else None
-
-    def _session(self, path: Path) -> PeerSession | None:
-        return self._shared.sessions.get(path.peer)
-
-    def _proxy(self, path: Path) -> SlaveNode | None:
-        session = self._session(path)
-        return session.proxies.get(path.want.node) if session is not None else None
 
     def _uri(self, path: Path) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
@@ -191,21 +183,19 @@ class TopicPaths(Paths):
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         want = Want(source.topic, source.node, subscriber)
         path, session = self.get(peer, want), self._shared.sessions.get(peer)
-        if path is None:
-            left = session is not None and session.link.name in self._left
-            if not left and self._now() >= self._started + limits.DIRECT_ADOPT:
-                return None
-            path = Path(peer, want, Contract())
-        return self._answer(path)
+        recent = self._now() < self._started + limits.DIRECT_ADOPT
+        if path is None and session is not None and (recent or session.link.name in self._left):
+            path = Path(session, want, Contract())
+        return self._answer(path) if path is not None else None
 
     async def _answer(self, path: Path) -> RosReply | None:
         await self.decision(path)
-        direct = self.target(path) if path.task is None else None
+        direct = path.target if path.task is None else None
         stays = await self._end_direct(path, keep=direct)
         if stays is not None:
             self._put(path, stays)
             return RosReply(0, "connected to the publisher already", [])
-        if direct is None or self.target(path) != direct:
+        if direct is None or path.target != direct:
             direct = None  # it is moved if it is direct by now
         self._put(path, direct or AGENTS)
         return RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, *direct]) if direct is not None else None
@@ -213,15 +203,14 @@ class TopicPaths(Paths):
     def _put(self, path: Path, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
         path.place, path.placed_at = place, self._now() if at is None else at
-        if place in {LOST, AGENTS, self.target(path)}:
+        if place in {LOST, AGENTS, path.target}:
             path.stuck = ""
         self._interrupted(path, lasts=place is LOST)
         self._place(path)
         self._watch()
 
     def _interrupted(self, path: Path, *, lasts: bool) -> None:
-        if (session := self._shared.sessions.get(path.peer)) is not None:
-            interrupted(self.interruptions, session.link.name, path.want, self._now(), lasts=lasts)
+        interrupted(self.interruptions, path.session.link.name, path.want, self._now(), lasts=lasts)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
         """Note which subscribers have left the proxy of a source, or have come back to it by themselves."""
@@ -246,7 +235,7 @@ class TopicPaths(Paths):
     def link_down(self, session: PeerSession) -> None:
         """As of ``Paths``; sources with direct subscribers stay in the graph if only the peer's agent has died."""
         for path in self._of_peer(session):
-            entry = self._imports.get(path.peer, _source(path))
+            entry = self._imports.get(session.peer, _source(path))
             if path.endpoint is None:
                 continue
             if not session.link.crashed:
@@ -271,22 +260,22 @@ class TopicPaths(Paths):
             self._spawn(self._leave(path), f"hang up {path.want.user}")
 
     async def _leave(self, path: Path) -> None:
-        proxy = self._proxy(path)
+        proxy = path.session.proxies.get(path.want.node)
         await self._list(path, without=proxy.uri if proxy is not None else "")
         await self._end_direct(path)
 
     # --- carrying out -----------------------------------------------------------------------------------------------
 
-    async def _probe(self, session: PeerSession, path: Path, grant: Grant) -> str:  # noqa: ARG002 - of topics all alike
-        timeout = limits.DIRECT_PROBE_TIMEOUT
-        problem = await probe(session.address, grant.port, grant.probe, node=grant.node, timeout=timeout)
-        return f"no connection to {session.address}:{grant.port}: {problem}" if problem else ""
+    async def _probe(self, path: Path, grant: Grant) -> str:
+        address, timeout = path.session.address, limits.DIRECT_PROBE_TIMEOUT
+        problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=timeout)
+        return f"no connection to {address}:{grant.port}: {problem}" if problem else ""
 
     def _subject(self, path: Path) -> str:
         return f"{_source(path)} to {path.want.user}"
 
     def _decided(self, path: Path) -> None:
-        if path.endpoint == self.target(path):
+        if path.endpoint == path.target:
             path.stuck = ""
             if path.endpoint is not None:
                 self._interrupted(path, lasts=False)
@@ -295,11 +284,11 @@ class TopicPaths(Paths):
 
     def _is_misplaced(self, path: Path) -> bool:
         """Whether a subscriber has another connection than was decided, or waits for being called back."""
-        if path.task is not None or path.place is None or self.get(path.peer, path.want) is not path:
+        if path.task is not None or path.place is None or self.get(path.session.peer, path.want) is not path:
             return False
         if path.place is LOST:
             return self._now() - path.placed_at > limits.DIRECT_SETTLE
-        return path.endpoint != self.target(path)
+        return path.endpoint != path.target
 
     def _place(self, path: Path) -> None:
         if path.mover is None and not self._closed and self._is_misplaced(path):
@@ -315,7 +304,7 @@ class TopicPaths(Paths):
 
     async def _renew(self, path: Path) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
-        uri, publication, proxy = self._uri(path), self._publication(path), self._proxy(path)
+        uri, publication, proxy = self._uri(path), self._publication(path), path.session.proxies.get(path.want.node)
         if not uri or proxy is None or publication is None:
             return False
         await self._list(path, without=proxy.uri)
@@ -338,9 +327,9 @@ class TopicPaths(Paths):
         Returns:
             The other end of one that stays: it is ``keep``, its node is stopped, or it cannot be ended (``stuck``).
         """
-        session, uri, topic, proxy = self._session(path), self._uri(path), path.want.name, self._proxy(path)
-        address = path.endpoint[0] if path.endpoint is not None else session.address if session is not None else ""
-        stand = standing(address) if address and uri else {}
+        uri, topic, proxy = self._uri(path), path.want.name, path.session.proxies.get(path.want.node)
+        address = path.session.address
+        stand = standing(address) if uri else {}
         if not stand:
             return None
         links = await bus_links(uri, topic)
@@ -360,7 +349,7 @@ class TopicPaths(Paths):
             if end == keep:
                 return end
             if problem := await end_links(end, [link]):
-                if end != self.target(path):  # it may be allowed again meanwhile
+                if end != path.target:  # it may be allowed again meanwhile
                     self._warn_stuck(path, end, problem)
                 return end
         return None
@@ -385,7 +374,7 @@ class TopicPaths(Paths):
             f"{source}: {user} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves only when "
             f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
         )
-        self._on_warning("direct.stuck", f"{path.peer} {source} {user}", text)
+        self._on_warning("direct.stuck", f"{path.session.peer} {source} {user}", text)
 
     # --- watching direct connections --------------------------------------------------------------------------------
 
@@ -415,7 +404,7 @@ class TopicPaths(Paths):
         uri = self._uri(path)
         links = await bus_links(uri, path.want.name) if uri else None
         stands = any(one.connected and one.remote == endpoint for one in links or ())
-        if not uri or stands or path.endpoint != endpoint or self.get(path.peer, path.want) is not path:
+        if not uri or stands or path.endpoint != endpoint or self.get(path.session.peer, path.want) is not path:
             return
         if links is None:
             self._shared.core.suspect(path.want.user)

@@ -238,7 +238,7 @@ class Topics(Part, TopicEvents):
 
     def depends(self, session: PeerSession) -> bool:
         """Whether nodes of this module have direct connections to the peer's."""
-        return self._driver.waits(session) or any(path.peer == session.peer for path in self.direct_imports)
+        return self._driver.waits(session) or any(path.session is session for path in self.direct_imports)
 
     def lane_lost(self, session: PeerSession) -> None:
         """Aborts messages that came in part over a lost bulk lane, and lets the senders repeat or drop theirs."""
