@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _GIVEN_UP: Final = Unmet(Condition.AGENT, "it was given up meanwhile")
+_Entry = tuple["PeerSession", DirectAsk, Grant | Unmet | None]
 _RELEASED: Final = Needs((), "what was granted to the peer itself")
 
 
@@ -66,14 +67,14 @@ class Grants:
 
     def __init__(self, shared: Shared) -> None:
         self._shared = shared
-        self._asked: dict[tuple[int, Want], tuple[DirectAsk, Grant | Unmet | None]] = {}
-        """By peer and what it wants: its question, and the answer; ``None`` while that is looked for."""
+        self._asked: dict[tuple[int, Want], _Entry] = {}
+        """By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked for."""
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
         """What ``of`` returns; ``None``: grants have changed since it was made."""
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
-        for (peer, want), (_, found) in list(self._asked.items()):
+        for (peer, want), (_, _, found) in list(self._asked.items()):
             if isinstance(found, Grant):
                 yield peer, want, found
 
@@ -105,16 +106,15 @@ class Grants:
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asked = read_ask(args)
-        key = session.peer, asked.want
-        _, before = self._asked.get(key, (None, None))
+        key, before = (session.peer, asked.want), self._answer(session, asked.want)
         found: Grant | Unmet | None = self._judge(session, asked)
         if asked.broken and isinstance(before, Grant):
             self._broke(asked.want)
         if found is None:
-            self._asked[key] = asked, before
+            self._asked[key] = session, asked, before
             found = await self._find(session, asked.want)
             found = self._judge(session, asked) or found  # the graph may have changed meanwhile
-            if self._asked.get(key, (None, None))[0] is not asked:
+            if key not in self._asked or self._asked[key][1] is not asked:
                 return reply_of(_GIVEN_UP)  # released, or asked again
         self._set(session, asked, found)
         if isinstance(found, Grant):
@@ -122,11 +122,14 @@ class Grants:
         _log.debug("< %s: %s: %s", session.link.name, asked.want, found)
         return reply_of(found)
 
+    def _answer(self, session: PeerSession, want: Want) -> Grant | Unmet | None:
+        entry = self._asked.get((session.peer, want))
+        return entry[2] if entry is not None else None
+
     def _judge(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         """The condition that does not hold for a peer; the name of a user is granted once for each node."""
         unmet = self._unmet(session, asked)
-        _, before = self._asked.get((session.peer, asked.want), (None, None))
-        if unmet is not None or isinstance(before, Grant):
+        if unmet is not None or isinstance(self._answer(session, asked.want), Grant):
             return unmet
         granted = [(peer, want) for peer, want, _ in self]
         if asked.user and asked.want in (want for _, want in granted):
@@ -141,31 +144,31 @@ class Grants:
 
     def _set(self, session: PeerSession, asked: DirectAsk, found: Grant | Unmet | None) -> None:
         """Note what a peer is answered; ``None``: it does not ask any more."""
-        want, peer, self._by_node = asked.want, session.peer, None
-        _, before = self._asked.pop((peer, want), (None, None))
+        want, before, self._by_node = asked.want, self._answer(session, asked.want), None
+        self._asked.pop((session.peer, want), None)
         if found is not None and not self._is_hidden(found):
-            self._asked[peer, want] = asked, found
+            self._asked[session.peer, want] = session, asked, found
         if isinstance(found, Unmet):
-            refused = [key for key, (_, one) in self._asked.items() if key[0] == peer and isinstance(one, Unmet)]
+            refused = [
+                key for key, (one, _, answer) in self._asked.items() if one is session and isinstance(answer, Unmet)
+            ]
             if len(refused) > limits.DIRECT_MAX:
                 del self._asked[refused[0]]
         if isinstance(before, Grant) == isinstance(found, Grant):
             return
         self._changed(session, want, granted=isinstance(found, Grant))
-        if isinstance(before, Grant):
-            for (other, one), (_, answer) in list(self._asked.items()):
-                if one == want and other != peer and isinstance(answer, Unmet):
-                    self._tell(other, want)  # perhaps it was refused because of the user's name
+        for other, one, answer in list(self._asked.values()) if isinstance(before, Grant) else ():
+            if one.want == want and other is not session and isinstance(answer, Unmet):
+                self._tell(other, want)  # perhaps it was refused because of the user's name
 
     def _again(self, which: Callable[[Want], bool]) -> None:
         """Let peers ask again: something has changed."""
-        for (peer, want), (_, found) in list(self._asked.items()):
-            if found is not None and which(want):
-                self._tell(peer, want)
+        for session, asked, found in list(self._asked.values()):
+            if found is not None and which(asked.want):
+                self._tell(session, asked.want)
 
-    def _tell(self, peer: int, want: Want) -> None:
-        session = self._shared.sessions.get(peer)
-        if session is not None and session.linked:
+    def _tell(self, session: PeerSession, want: Want) -> None:
+        if session.linked:
             self._shared.rpc.notify(session, f"direct.{self.kind}_again", want._asdict())
 
     def _released(self, session: PeerSession, args: dict[str, Any]) -> None:
@@ -181,9 +184,9 @@ class Grants:
         Args:
             refused: Have the peers ask again for what they were refused, too.
         """
-        for (peer, want), (asked, before) in list(self._asked.items()):
-            session, granted = self._shared.sessions.get(peer), isinstance(before, Grant)
-            if session is None or before is None or not (refused or granted):
+        for session, asked, before in list(self._asked.values()):
+            granted = isinstance(before, Grant)
+            if before is None or not (refused or granted):
                 continue
             unmet = self._judge(session, asked)
             if unmet is not None:
@@ -192,17 +195,17 @@ class Grants:
                 if granted or self._is_hidden(unmet):
                     self._set(session, asked, unmet)
             if granted is (unmet is not None) and not (unmet is not None and self._is_hidden(unmet)):
-                self._tell(peer, want)
+                self._tell(session, asked.want)
 
     def link_up(self, session: PeerSession) -> None:
         """Let a peer ask again for what it uses; what it was granted over an earlier link ends a little later."""
-        before = [asked for (peer, _), (asked, _) in self._asked.items() if peer == session.peer]
+        before = [asked for one, asked, _ in self._asked.values() if one is session]
         if before:
-            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, session, before)
+            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, before)
 
-    def _expire(self, session: PeerSession, before: list[DirectAsk]) -> None:
-        for asked in before:
-            if self._asked.get((session.peer, asked.want), (None, None))[0] is asked:
+    def _expire(self, before: list[DirectAsk]) -> None:
+        for session, asked, _ in list(self._asked.values()):
+            if any(asked is one for one in before):
                 self._set(session, asked, None)
 
     def link_down(self, session: PeerSession) -> None:
@@ -223,8 +226,8 @@ class Grants:
 
     def gone(self, session: PeerSession) -> None:
         """Forget what a peer asked for."""
-        for (peer, _), (asked, _) in list(self._asked.items()):
-            if peer == session.peer:
+        for one, asked, _ in list(self._asked.values()):
+            if one is session:
                 self._set(session, asked, None)
 
     def _end(self, session: PeerSession, port: int) -> None:
@@ -297,11 +300,10 @@ class TopicGrants(Grants):
 
     def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
         """Register missing subscribers again: the core has been restarted."""
-        for peer, subscriber, topic in {(peer, want.user, want.name) for peer, want, _ in self}:
-            session = self._shared.sessions.get(peer)
-            proxy = session.proxies.get(subscriber) if session is not None else None
-            if proxy is not None and proxy.name not in subscribers.get(topic, {}):
-                self._register(topic, proxy)
+        for session, asked, found in list(self._asked.values()):
+            proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
+            if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
+                self._register(asked.name, proxy)
 
     # --- conditions -------------------------------------------------------------------------------------------------
 
