@@ -79,7 +79,6 @@ class Params(Part):
         self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
         """The parameters that this module follows, in the order of the rules."""
         self._refusals = RefusalLog(_log, shared.counters)
-        self._subscribed: set[str] = set()
         self._time_before: list[str | None] = []
         """What ``/use_sim_time`` was here before it was followed; empty if it was not followed."""
         self._asking: dict[int, asyncio.Task[None]] = {}
@@ -148,13 +147,15 @@ class Params(Part):
         await self.owner.close()
         with contextlib.suppress(RmpaError, TimeoutError):
             async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
-                for key in self.owner.subscribed | self._subscribed:
-                    await self._core.leave(key)
+                await self._core.leave_others(set())
 
     async def _look(self) -> None:
         try:
             run = (await self._core.get("/run_id"))[1]
             restarted, self._run = self._run not in (None, run), run
+            if restarted:
+                self._core.subscribed.clear()
+            await self._core.leave_others(self.owner.followed | {entry.rule.to for entry in self.followed})
             await self.owner.look(restarted=restarted)
             await self._compare_all(restarted=restarted)
         except UnreachableError:
@@ -237,13 +238,8 @@ class Params(Part):
         Args:
             restarted: Whether the core was restarted: it has none of the values and subscriptions.
         """
-        for key in self._subscribed - {entry.rule.to for entry in self.followed}:
-            await self._core.leave(key)
-            self._subscribed.discard(key)
-            if key == SIM_TIME and self._time_before:
-                await self._reset_time(self._time_before.pop())
-        if restarted:
-            self._subscribed.clear()
+        if self._time_before and all(entry.rule.to != SIM_TIME for entry in self.followed):
+            await self._reset_time(self._time_before.pop())
         for entry in list(self.followed):
             if restarted:
                 entry.due = entry.known and entry.had
@@ -293,9 +289,8 @@ class Params(Part):
             raise RemoteProtocolError(f"more than {limits.FOLLOWED_BYTES_MAX >> 20} MiB of parameters are followed")
         try:
             value = await read_text(text) if text is not None else None
-            if key not in self._subscribed:
+            if key not in self._core.subscribed:
                 await self._core.follow(key)
-                self._subscribed.add(key)
             await self._bring(entry, value)
         except RemoteProtocolError:
             entry.text, entry.known = None, False

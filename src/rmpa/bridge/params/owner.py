@@ -102,6 +102,8 @@ class ParamCore:
     def __init__(self, core: Core, node: SlaveNode) -> None:
         self.ask = core.ask
         self._node = node
+        self.subscribed: set[str] = set()
+        """The keys of which the core notifies the agent's node."""
 
     async def get(self, key: str) -> tuple[bool, XmlRpcValue]:
         """Whether a parameter or namespace exists, and its value, which must not be modified."""
@@ -134,10 +136,13 @@ class ParamCore:
     async def follow(self, key: str) -> None:
         """Have the core notify the agent's node of changes; a repeated call has no further effect."""
         await self.ask("subscribeParam", OWN_NODE, self._node.uri, key)
+        self.subscribed.add(key)
 
-    async def leave(self, key: str) -> None:
-        """End these notifications."""
-        await self.ask("unsubscribeParam", OWN_NODE, self._node.uri, key)
+    async def leave_others(self, wanted: Iterable[str]) -> None:
+        """End the notifications of other keys than these."""
+        for key in self.subscribed.difference(wanted):
+            await self.ask("unsubscribeParam", OWN_NODE, self._node.uri, key)
+            self.subscribed.discard(key)
 
 
 # Answers the peers' requests about this module's parameters, and notifies them of changes of those they follow.
@@ -216,8 +221,6 @@ class ParamOwner:
         self._core = core
         self._shared = shared
         self._followers: dict[int, _Follower] = {}
-        self.subscribed: set[str] = set()
-        """The keys of which the local core notifies the agent's node."""
         rpc = shared.rpc
         rpc.on_request(transfer.GET, self._get, _EACH)
         rpc.on_request(transfer.NAMES, self._names, _LISTED)
@@ -232,6 +235,11 @@ class ParamOwner:
     @property
     def _gate(self) -> PermissionGate:
         return self._shared.context.gate
+
+    @property
+    def followed(self) -> set[str]:
+        """What peers follow."""
+        return set().union(*(follower.keys for follower in self._followers.values()))
 
     # --- events from the part ------------------------------------------------------------------------------------
 
@@ -260,11 +268,7 @@ class ParamOwner:
         Args:
             restarted: Whether the core was restarted: it has none of the subscriptions.
         """
-        followed = set().union(*(follower.keys for follower in self._followers.values()))
-        for key in self.subscribed - followed:
-            await self._core.leave(key)
-        self.subscribed = followed
-        for key in followed:
+        for key in self.followed:
             followers = [one for one in self._followers.values() if key in one.keys]
             await self._core.follow(key)
             changed = followers if restarted else []
@@ -365,7 +369,6 @@ class ParamOwner:
         follower = self._followers.setdefault(session.peer, _Follower(session))
         follower.keys = wanted
         for key in wanted:
-            self.subscribed.add(key)
             await self._core.follow(key)
         self._tell_soon(follower, wanted)
         return {"refused": refused}

@@ -509,7 +509,7 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     await pad.look()
     await base.look()
     assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
-    assert base.params.owner.subscribed == {"/arm"}
+    assert base.params.owner.followed == {"/arm"}
 
 
 @pytest.mark.parametrize("before", [None, False])
