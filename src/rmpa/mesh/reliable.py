@@ -302,7 +302,8 @@ class ReliableReceiver:
 
     def __init__(self, epoch: int | None = None, first: int | None = None) -> None:
         self._epoch = epoch
-        self._next = first
+        self.next = first
+        """The sequence that comes next; a receiver that takes a message with this one by itself adds 1."""
         self._unacknowledged = 0
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0
@@ -315,9 +316,9 @@ class ReliableReceiver:
 
     def position(self) -> tuple[int, int] | None:
         """``(epoch, last received sequence)`` for the sender's ``resume``; ``None`` if there is nothing to resume."""
-        if self._epoch is None or self._next is None:
+        if self._epoch is None or self.next is None:
             return None
-        return self._epoch, serial_add(self._next, -1)
+        return self._epoch, serial_add(self.next, -1)
 
     def begin(self, epoch: int, first: int | None = None) -> bool:
         """Handle a sender's announcement of its epoch and first sequence.
@@ -327,21 +328,21 @@ class ReliableReceiver:
             unknown number of messages was lost between the two epochs.
         """
         if epoch == self._epoch:
-            if self._next is None:
-                self._next = first
+            if self.next is None:
+                self.next = first
             return True
         known = self._epoch is not None
-        self._epoch, self._next = epoch, first
+        self._epoch, self.next = epoch, first
         self._unacknowledged = self._unacknowledged_bytes = 0
         self.breaks += known
         return not known
 
     def skip(self, following: int) -> int:
         """Handle a sender's announcement of its next message; return how many before it will never arrive."""
-        if self._next is None or not is_later(following, self._next):
+        if self.next is None or not is_later(following, self.next):
             return 0
-        gap = serial_distance(self._next, following)
-        self._next = following
+        gap = serial_distance(self.next, following)
+        self.next = following
         self.gap_total += gap
         return gap
 
@@ -349,7 +350,7 @@ class ReliableReceiver:
         """Return what ``accept`` would, without changing anything: for the first fragment of a message."""
         if epoch != self._epoch:
             return DELIVER if self._epoch is None else DUPLICATE
-        gap = 0 if self._next is None else sequence - self._next & SERIAL_MASK
+        gap = 0 if self.next is None else sequence - self.next & SERIAL_MASK
         if not gap:
             return DELIVER
         return DUPLICATE if gap >= SERIAL_HALF else ReceiveResult(deliver=True, gap=gap)
@@ -361,7 +362,7 @@ class ReliableReceiver:
                 self.duplicates += 1
                 return DUPLICATE
             self._epoch = epoch
-        gap = 0 if self._next is None else sequence - self._next & SERIAL_MASK
+        gap = 0 if self.next is None else sequence - self.next & SERIAL_MASK
         if not self._unacknowledged:
             self._unacknowledged_since = now
         self._unacknowledged += 1
@@ -369,7 +370,7 @@ class ReliableReceiver:
         if gap >= SERIAL_HALF:
             self.duplicates += 1
             return DUPLICATE
-        self._next = sequence + 1 & SERIAL_MASK
+        self.next = sequence + 1 & SERIAL_MASK
         if not gap:
             return DELIVER
         self.gap_total += gap
@@ -381,10 +382,10 @@ class ReliableReceiver:
         All messages up to this sequence have arrived or are known to be lost.
         """
         due = self.next_timer()
-        if due is None or now < due or self._next is None:
+        if due is None or now < due or self.next is None:
             return None
         self._unacknowledged = self._unacknowledged_bytes = 0
-        return self._next - 1 & SERIAL_MASK
+        return self.next - 1 & SERIAL_MASK
 
     def next_timer(self) -> float | None:
         """When the next acknowledgement is due, in monotonic seconds; ``None``: nothing is to be acknowledged."""

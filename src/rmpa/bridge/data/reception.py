@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.data.quality import QosWatch, Quality
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier
+from rmpa.core.identity import SERIAL_MASK, is_earlier
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.connection import DataHandler
@@ -65,10 +65,9 @@ _PREFIX_SIZE: Final = LENGTH.size
 class ImportFlow(DataHandler):
     """From one peer's route to the local subscribers of its proxy.
 
-    Most messages need a look at their number and their age alone (``_plain``). ``_next`` is the number that comes
-    next; while a message comes in parts, it is that of this message. So a gap shows what was lost, whatever ended the
-    parts. A reliable route has its ``ReliableReceiver`` for that. There are more than a dozen fields, because a
-    message in parts, a held one, a replay and an acknowledgement that is due are each a state of the same route.
+    Most messages need a look at their number and their age alone (``_plain``). The numbering takes a message when it
+    is complete. So a gap shows what was lost, whatever ended a message in parts. There are more than a dozen fields,
+    because a message in parts, a held one, a replay and an acknowledgement that is due are states of the same route.
 
     Args:
         output: The local subscribers.
@@ -98,10 +97,10 @@ class ImportFlow(DataHandler):
         self._link_time = link_time
         self._counters = counters
         self._loop = asyncio.get_running_loop()
-        self._receiver = ReliableReceiver() if contract.reliability is Reliability.RELIABLE else None
+        self._reliable = contract.reliability is Reliability.RELIABLE
+        self._numbering = ReliableReceiver()
         self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
-        self._next = 1
-        self._plain = self._receiver is None
+        self._plain = not self._reliable
         self._replay: deque[bytes] | None = None
         """Kept messages that the subscribers already have, and that the new route may repeat."""
         self._sequence: int | None = None
@@ -133,7 +132,7 @@ class ImportFlow(DataHandler):
     @property
     def position(self) -> tuple[int, int] | None:
         """Epoch and sequence of the last reliable message, after which a new link continues; else ``None``."""
-        return self._receiver.position() if self._receiver is not None else None
+        return self._numbering.position() if self._reliable else None
 
     def bind(self, link: PeerLink, route: int, epoch: int, first: int) -> bool:
         """Take the data of a route that was opened on a new link.
@@ -150,14 +149,13 @@ class ImportFlow(DataHandler):
         position, self._link, self._route, self._epoch = self.position, link, route, epoch
         self.torn()
         self._stop_ack_timer()
-        if self._receiver is not None:
-            self._receiver.begin(epoch, first)
+        self._numbering.begin(epoch, first)
         self._tell(self.watch.link_up(self._loop.time()))
         return position is not None and position[0] == epoch
 
     def skip(self, following: int) -> None:
         """Count the messages before ``following``, the next one that the sender announces, as missed."""
-        if self._receiver is not None and (count := self._receiver.skip(following)):
+        if count := self._numbering.skip(following):
             self._missing(count)
 
     def missed_unknown(self, why: str) -> None:
@@ -184,9 +182,10 @@ class ImportFlow(DataHandler):
         size = len(framed)
         if size < _PREFIX_SIZE or LENGTH.unpack_from(framed)[0] != size - _PREFIX_SIZE:
             raise RemoteProtocolError(f"a data frame of {size} bytes does not hold one message")
-        now_ns = time.time_ns()
-        if self._plain and sequence == self._next and now_ns - stamp_ns + self._link_time.ahead_ns <= self._stale_ns:
-            self._next = sequence + 1 & SERIAL_MASK
+        now_ns, numbering = time.time_ns(), self._numbering
+        age_ns = now_ns - stamp_ns + self._link_time.ahead_ns
+        if self._plain and sequence == numbering.next and age_ns <= self._stale_ns:
+            numbering.next = sequence + 1 & SERIAL_MASK
         elif not self._admits(sequence, stamp_ns, framed, now_ns):
             return
         self._output.publish_framed(framed)
@@ -208,8 +207,9 @@ class ImportFlow(DataHandler):
                 return  # a part of an earlier message, over a lane that is about to end
             raise RemoteProtocolError(f"a part of message {sequence} comes in the middle of message {self._sequence}")
         if flags & ABORT:
-            self._next = sequence + 1 & SERIAL_MASK  # its publisher has aborted it: it is not lost
             self.torn()
+            if not self._reliable:
+                self._accept(sequence, 0)  # its publisher has aborted it: it is not lost
             return
         self._received += len(part)
         if self._received > self._size or (self._received == self._size) != bool(flags & LAST):
@@ -248,37 +248,41 @@ class ImportFlow(DataHandler):
 
     def _judge(self) -> None:
         """Whether nothing but the number and the age of the next message has to be looked at."""
-        others = (self._receiver, self._replay, self._sequence, self._held)
-        self._plain = all(one is None for one in others)
+        usual = self._replay is None and self._sequence is None and self._held is None
+        self._plain = usual and not self._reliable
 
     def _admits(self, sequence: int, stamp_ns: int, framed: memoryview, now_ns: int) -> bool:
         """Whether a message is delivered that is not plain, not the next one, or perhaps too old."""
-        if self._receiver is not None:
-            return self._accept(sequence, stamp_ns, len(framed), now_ns) and not self._is_replay(framed)
-        admits = self._take(sequence)
-        if admits:
-            self._next = sequence + 1 & SERIAL_MASK
-            admits = not (
-                self._is_replay(framed)
-                or self._is_expired(stamp_ns, now_ns)
-                or self._hold_back(sequence, stamp_ns, framed, now_ns)
-            )
+        if not self._accept(sequence, len(framed)):
+            return False
+        if self._reliable and self._replay is None and self.contract.lifespan is None:
+            return True
+        admits = not (
+            self._is_replay(framed)
+            or self._is_expired(stamp_ns, now_ns)
+            or self._hold_back(sequence, stamp_ns, framed, now_ns)
+        )
         if admits:
             self._drop_held()
         self._judge()
         return admits
 
-    def _take(self, sequence: int) -> bool:
-        """Whether a best-effort message is a new one; those before it are missing, and one in parts has ended."""
-        gap = sequence - self._next & SERIAL_MASK
-        if gap >= SERIAL_HALF:
+    def _accept(self, sequence: int, size: int) -> bool:
+        """Whether a complete message is a new one. In any case a reliable one is acknowledged."""
+        now = self._loop.time()
+        result = self._numbering.accept(sequence, self._epoch, now, size)
+        due = self._numbering.next_timer() if self._reliable else None
+        if due is not None and due <= now:
+            self._acknowledge(now)
+        elif due is not None and self._ack_timer is None:
+            self._ack_timer = self._loop.call_at(due, self._acknowledge, due)
+        if not result.deliver:
             self._count("late")
             return False
-        # If a message is here in part, its lane is gone, though this side has not noticed yet.
-        self.torn()
-        self._next = sequence
-        if gap:
-            self._missing(gap)
+        if self._sequence is not None:
+            self.torn()  # its lane is gone, though this side has not noticed yet
+        if result.gap:
+            self._missing(result.gap)
         return True
 
     def _is_replay(self, framed: memoryview | bytearray) -> bool:
@@ -303,14 +307,18 @@ class ImportFlow(DataHandler):
         return True
 
     def _hold_back(self, sequence: int, stamp_ns: int, framed: memoryview, now_ns: int) -> bool:
-        """Whether a message that an outage had delayed is held instead of delivered.
+        """Whether a message is held that an outage has delayed, not a slow link or this process.
 
         It waits ``mesh.limits.STALE_HOLD`` for a newer one, and is delivered if none comes: the last command before a
         cable was pulled still counts.
         """
         # The first messages of a route may be kept, old ones: at least one if the publisher latches.
         kept = self.contract.kept if self.contract.durability is Durability.TRANSIENT_LOCAL else 1
-        if sequence <= kept or not self._is_too_old(stamp_ns, now_ns) or not self._was_held_up(stamp_ns, now_ns):
+        if self._reliable or sequence <= kept or not self._is_too_old(stamp_ns, now_ns):
+            return False
+        sent_at = self._loop.time() - (now_ns - stamp_ns + self._link_time.ahead_ns) / 1e9
+        held_up = self._link_time.resumed_at() - sent_at
+        if held_up * 1e9 <= self._stale_ns + (self._link_time.error_ns or 0):
             return False
         if self._held is None:
             timer = self._loop.call_later(mesh_limits.STALE_HOLD, self._deliver_held)
@@ -340,27 +348,9 @@ class ImportFlow(DataHandler):
             self._judge()
             self._deliver(framed, stamp_ns)
 
-    def _accept(self, sequence: int, stamp_ns: int, size: int, now_ns: int) -> bool:
-        """Whether a reliable message is to be delivered; it is acknowledged in any case."""
-        receiver, now = self._receiver, self._loop.time()
-        if receiver is None:
-            return False
-        result = receiver.accept(sequence, self._epoch, now, size)
-        due = receiver.next_timer()
-        if due is not None and due <= now:
-            self._acknowledge(now)
-        elif due is not None and self._ack_timer is None:
-            self._ack_timer = self._loop.call_at(due, self._acknowledge, due)
-        if result.gap:
-            self._missing(result.gap)
-        if not result.deliver:
-            self._count("late")
-        return result.deliver and not self._is_expired(stamp_ns, now_ns)
-
     def _acknowledge(self, now: float) -> None:
         self._stop_ack_timer()
-        sequence = self._receiver.due_ack(now) if self._receiver is not None else None
-        if sequence is not None:
+        if (sequence := self._numbering.due_ack(now)) is not None:
             self._link.mark(FrameKind.ACK, self._route, sequence)
 
     # --- messages in parts -----------------------------------------------------------------------------------------
@@ -372,42 +362,32 @@ class ImportFlow(DataHandler):
         size = _PREFIX_SIZE + LENGTH.unpack_from(part)[0]
         if size > ros_limits.MESSAGE_MAX:
             raise LimitExceeded("message", size, ros_limits.MESSAGE_MAX)
-        if self._receiver is not None:
-            if not self._receiver.judge(sequence, self._epoch).deliver:
-                self._accept(sequence, 0, 0, 0)
-                return
-            self.torn()
-            # Delivered whole only: it may be sent again, so no subscriber may have a part of it.
-            self._whole = bytearray()
-        elif not self._begin_plain(sequence, stamp_ns, size):
+        if not self._numbering.judge(sequence, self._epoch).deliver:
+            self._accept(sequence, 0)
             return
-        self._sequence, self._size, self._received = sequence, size, 0
-        self._judge()
-
-    def _begin_plain(self, sequence: int, stamp_ns: int, size: int) -> bool:
-        """Begin a best-effort message; return whether it is delivered."""
-        if not self._take(sequence):
-            return False
-        if self._is_expired(stamp_ns, time.time_ns()):
-            self._next = sequence + 1 & SERIAL_MASK
-            return False
+        self.torn()
+        if not self._reliable and self._is_expired(stamp_ns, time.time_ns()):
+            self._accept(sequence, 0)
+            return
         self._drop_held()
-        if self._replay is not None and any(len(kept) == size for kept in self._replay):
-            self._whole = bytearray()  # only the whole message shows whether it is a repeated one
+        if self._reliable or any(len(kept) == size for kept in self._replay or ()):
+            # Delivered whole only. A reliable message may be sent again, so no subscriber may have a part of it; and
+            # only the whole message shows whether it repeats a kept one.
+            self._whole = bytearray()
         else:
             self._replay = None
             self._output.begin(size)
-        return True
+        self._sequence, self._size, self._received = sequence, size, 0
+        self._judge()
 
     def _complete(self, sequence: int, stamp_ns: int) -> None:
         whole, self._whole, self._sequence = self._whole, None, None
-        self._next = sequence + 1 & SERIAL_MASK
         now_ns = time.time_ns()
-        if self._receiver is None or self._accept(sequence, stamp_ns, self._size, now_ns):
-            if whole is None:
-                self._note(stamp_ns, now_ns, self._size)
-            elif not self._is_replay(whole):
-                self._deliver(whole, stamp_ns)
+        is_new = self._accept(sequence, self._size)
+        if whole is None:
+            self._note(stamp_ns, now_ns, self._size)
+        elif is_new and not self._is_expired(stamp_ns, now_ns) and not self._is_replay(whole):
+            self._deliver(whole, stamp_ns)
         self._judge()
 
     # --- what it leads to ------------------------------------------------------------------------------------------
@@ -427,7 +407,7 @@ class ImportFlow(DataHandler):
     def _missing(self, count: int) -> None:
         self._count("lost", count)
         occurred = self.watch.lost(count, self._loop.time())
-        if self._receiver is not None:
+        if self._reliable:
             self._on_event(occurred)
 
     def _watch_due(self, now: float) -> None:

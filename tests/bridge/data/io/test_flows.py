@@ -297,7 +297,6 @@ class Inlet:
 
     def begin(self, epoch: int, first: int) -> bool:
         """The route is opened on a link; returns whether its numbering goes on."""
-        self.flow._next = first
         return self.flow.bind(cast("Any", self), 7, epoch, first)
 
     def mark(self, kind: FrameKind, route: int, sequence: int) -> None:
@@ -355,7 +354,7 @@ def test_gap_before_the_first_message_counts() -> None:
 def test_a_sequence_that_wraps_loses_nothing() -> None:
     inlet = Inlet()
     inlet.message(1)
-    inlet.flow._next = WRAP - 1
+    inlet.flow._numbering.next = WRAP - 1
     for sequence in (WRAP - 1, 0, 1):
         inlet.message(sequence)
     assert inlet.counts == (0, 0, 0, 0)
