@@ -34,14 +34,12 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import PEER_LEASE
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
-from rmpa.mesh.keepalive import ConnectionClosed, ControlReceived, HandshakeDone, HelloReceived
+from rmpa.mesh.connection import ConnectionProtocol
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.discovery.beacon import Address
-    from rmpa.mesh.keepalive import ConnectionEvent
 
 _FIRST_PORT: Final = 20000
 _NODES: Final = 4
@@ -134,6 +132,40 @@ class Module:
         )
 
 
+class Machine(ConnectionProtocol):
+    """The machine of a ``Link``.
+
+    Args:
+        link: Which drives it.
+        module: Which accepts it.
+    """
+
+    def __init__(self, link: Link, module: Module) -> None:
+        self._link = link
+        self._module = module
+        super().__init__(module.identity, time.monotonic(), dialled=False, wall_ns=time.time_ns)
+
+    def opened(self) -> None:
+        """Say what the module offers."""
+        self._link.flush()
+        for payload in self._module.catalogue():
+            self._link.transport.write(self.pack_control(payload))
+        self.need(time.monotonic(), needed=False)
+        self._module.crowd.linked(self._module)
+
+    def control_received(self, payload: bytes) -> None:
+        """Refuse each request."""
+        if op_of(payload) == "ask":
+            asked = decode(payload)
+            assert isinstance(asked, Request)
+            answer = Response(asked.number, ok=False, error="this module is only played")
+            self._link.transport.write(self.pack_control(encode(answer)))
+
+    def closed(self, reason: str) -> None:  # noqa: ARG002 - as the machine calls it
+        """Close the socket."""
+        self._link.transport.close()
+
+
 class Link(asyncio.Protocol):
     """A connection that the agent has dialled.
 
@@ -149,15 +181,9 @@ class Link(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin the handshake."""
         assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        self._machine = ConnectionProtocol(
-            ConnectionRole.ACCEPTOR,
-            self._module.identity,
-            time.monotonic(),
-            wall_ns=time.time_ns,
-            on_event=self._event,
-        )
-        self._flush()
+        self.transport = transport
+        self._machine = Machine(self, self._module)
+        self.flush()
 
     def data_received(self, data: bytes) -> None:
         """Take frames."""
@@ -165,34 +191,17 @@ class Link(asyncio.Protocol):
         with memoryview(self._input) as view:
             taken, _ = self._machine.receive(view, time.monotonic())
         del self._input[:taken]
-        self._flush()
+        self.flush()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The agent has ended it."""
         self._machine.lost(str(exc))
-        self._flush()
+        self.flush()
 
-    def _event(self, event: ConnectionEvent) -> None:
-        now = time.monotonic()
-        if isinstance(event, HelloReceived):
-            self._machine.accept(now)
-        elif isinstance(event, HandshakeDone):
-            self._flush()
-            for payload in self._module.catalogue():
-                self._transport.write(self._machine.control(payload))
-            self._machine.need(now, needed=False)
-            self._module.crowd.linked(self._module)
-        elif isinstance(event, ControlReceived) and op_of(event.payload) == "ask":
-            asked = decode(event.payload)
-            assert isinstance(asked, Request)
-            answer = Response(asked.number, ok=False, error="this module is only played")
-            self._transport.write(self._machine.control(encode(answer)))
-        elif isinstance(event, ConnectionClosed):
-            self._transport.close()
-
-    def _flush(self) -> None:
-        if self._machine.has_output:
-            self._transport.write(self._machine.take_output())
+    def flush(self) -> None:
+        """Send what the machine has to say, and arm its timer."""
+        if self._machine.output:
+            self.transport.write(self._machine.take_output())
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -202,7 +211,7 @@ class Link(asyncio.Protocol):
 
     def _due(self) -> None:
         self._machine.handle_timer(time.monotonic())
-        self._flush()
+        self.flush()
 
 
 def main(words: Sequence[str]) -> None:

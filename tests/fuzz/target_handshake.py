@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
-from rmpa.mesh.frames import Hello, KnownLink, Refuse, judge, judge_welcome
+from rmpa.mesh.frames import Hello, Refuse, judge, judge_welcome
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -27,9 +27,12 @@ def fuzz(data: bytes) -> None:
     except RemoteProtocolError as error:
         str(error)
         return
+    if isinstance(hello, Refuse):
+        str(hello)
+        return
     if Hello.parse(hello.serialize()) != hello:
         raise AssertionError(f"{hello} does not survive its round trip")
-    verdict = judge(hello, _OURS, [KnownLink(_THEIRS.guid, _THEIRS.instance, dialled=False, alive=True)])
+    verdict = judge(hello, _OURS, _THEIRS)
     judge_welcome(hello, _OURS, _THEIRS.guid)
     if verdict is None and hello.identity.guid != hello.guid:
         raise AssertionError("a welcome peer has no identity")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Refuse, pack_data_header, pong
-from rmpa.mesh.keepalive import ConnectionEvent, HelloReceived
-from tests.mesh.worlds import AnyRoute
+from tests.mesh.worlds import ACCEPTOR, DIALLER, AnyRoute, Side, Time
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -52,24 +51,18 @@ SEEDS: list[bytes] = [
 
 def fuzz(data: bytes) -> None:
     """The same bytes whole and in two pieces, to a fresh link of either role and to one that is up."""
-    for role in ConnectionRole:
-        for prefix in (b"", _HELLO if role is ConnectionRole.ACCEPTOR else _WELCOME):
+    for role in (DIALLER, ACCEPTOR):
+        for prefix in (b"", _HELLO if role == ACCEPTOR else _WELCOME):
             whole = _feed(role, [prefix + data])
             parts = _feed(role, [prefix, data[: len(data) // 2], data[len(data) // 2 :]])
             if whole != parts:
                 raise AssertionError(f"{whole} whole, but {parts} in pieces")
 
 
-def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
+def _feed(role: str, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
     """What the link says and how it ends; of parts, what they are put together."""
-    events: list[ConnectionEvent] = []
     parts: list[list[object]] = []
     data = 0
-
-    def on_event(event: ConnectionEvent) -> None:
-        events.append(event)
-        if isinstance(event, HelloReceived):
-            link.accept(0.0)
 
     def on_data(_route: int, _sequence: int, _stamp_ns: int, payload: memoryview) -> None:
         nonlocal data
@@ -82,7 +75,8 @@ def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, lis
         else:
             parts[-1][2:] = [flags & (LAST | ABORT), bytes(parts[-1][3]) + bytes(part)]  # type: ignore[call-overload]
 
-    link = ConnectionProtocol(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event)
+    time = Time()
+    link = Side(role, _OURS, time)
     link.routes = AnyRoute(on_data, on_part)
 
     def closed() -> bool:
@@ -94,7 +88,7 @@ def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, lis
             break
         kept += piece
         try:
-            consumed, wanted = link.receive(memoryview(kept), 0.0)
+            consumed, wanted = link.receive(memoryview(kept), time.now)
         except RemoteProtocolError as error:
             str(error)
             if not closed():
@@ -103,4 +97,4 @@ def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, lis
         if not 0 <= consumed <= len(kept) or wanted < 0:
             raise AssertionError(f"consumed {consumed} of {len(kept)}, wants {wanted}")
         kept = kept[consumed:]
-    return repr(events), data, link.state.value, parts
+    return repr(link.events), data, link.state.value, parts

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Reliability
@@ -10,16 +10,11 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, Hello
-from rmpa.mesh.keepalive import HelloReceived
 from rmpa.ros import limits
-from tests.mesh.worlds import AnyRoute
+from tests.mesh.worlds import ACCEPTOR, AnyRoute, Side, Time
 from tests.simulation.network import World
 from tests.simulation.process import Process
-
-if TYPE_CHECKING:
-    from rmpa.mesh.keepalive import ConnectionEvent
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -102,11 +97,7 @@ def _fuzz(data: bytes) -> None:
     flow = ImportFlow(subscribers, contract, LinkTime(), Counters(), lambda _: None, lambda: None)
     flow.bind(subscribers, 1, int(reliable), 1)
 
-    def on_event(event: ConnectionEvent) -> None:
-        if isinstance(event, HelloReceived):
-            link.accept(0.0)
-
-    link = ConnectionProtocol(ConnectionRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event)
+    link = Side(ACCEPTOR, _OURS, Time())
     link.routes = AnyRoute(lambda _, *message: flow.message(*message), lambda _, *part: flow.part(*part))
     link.receive(memoryview(_HELLO), 0.0)
     wire = data[1:]

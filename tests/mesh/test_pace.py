@@ -4,44 +4,40 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionRole, ConnectionState
+from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.keepalive import ConnectionClosed, PongReceived, RestPace
-from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
-
-if TYPE_CHECKING:
-    from rmpa.mesh.connection import ConnectionProtocol
+from rmpa.mesh.keepalive import rest_lease
+from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time
 
 
 def run(one: Side, other: Side, time: Time, seconds: float) -> int:
     """Let both run on a path without delay; return how often a timer fired."""
     end, fired = time.now + seconds, 0
     while True:
-        due = min((t for each in (one, other) if (t := each.link.next_timer()) is not None), default=end + 1)
+        due = min((t for each in (one, other) if (t := each.next_timer()) is not None), default=end + 1)
         if due > end:
             time.now = end
             return fired
         time.now = max(time.now, due)
         for each in (one, other):
-            timer = each.link.next_timer()
+            timer = each.next_timer()
             if timer is not None and timer <= time.now:
                 fired += 1
-                each.link.handle_timer(time.now)
+                each.handle_timer(time.now)
         exchange(one, other, time)
 
 
 def resting(*sides: Side) -> list[bool]:
-    return [each.link.rests for each in sides]
+    return [each.rests for each in sides]
 
 
 def rest(one: Side, other: Side, time: Time) -> None:
     for each in (one, other):
-        each.link.need(time.now, needed=False)
+        each.need(time.now, needed=False)
     exchange(one, other, time)
     assert resting(one, other) == [True, True]
 
@@ -49,15 +45,15 @@ def rest(one: Side, other: Side, time: Time) -> None:
 def test_a_link_rests_when_neither_side_needs_it() -> None:
     time = Time()
     dialler, acceptor = pair(time)
-    dialler.link.need(time.now, needed=False)
+    dialler.need(time.now, needed=False)
     exchange(dialler, acceptor, time)
     assert resting(dialler, acceptor) == [False, False], "the other side needs it still"
     busy = run(dialler, acceptor, time, 60.0)
-    acceptor.link.need(time.now, needed=False)
+    acceptor.need(time.now, needed=False)
     exchange(dialler, acceptor, time)
     assert resting(dialler, acceptor) == [True, True]
     calm = run(dialler, acceptor, time, 60.0)
-    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+    assert dialler.state is acceptor.state is ConnectionState.UP
     assert calm * 15 < busy
 
 
@@ -65,11 +61,11 @@ def test_silence_is_worth_a_check_at_the_pace_of_the_link() -> None:
     """In use within a second, at rest before the long lease ends, and soon when it is needed again."""
     time = Time()
     dialler, acceptor = pair(time)
-    assert dialler.link.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
+    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET < limits.EXPRESS_LEASE
     rest(dialler, acceptor, time)
-    assert limits.IDLE_KEEPALIVE_INTERVAL < dialler.link.quiet_after < limits.IDLE_LEASE
-    dialler.link.need(time.now, needed=True)  # and no answer comes
-    assert dialler.link.quiet_after == limits.GHOST_QUIET
+    assert limits.IDLE_KEEPALIVE_INTERVAL < dialler.keepalive.quiet_after < limits.IDLE_LEASE
+    dialler.need(time.now, needed=True)  # and no answer comes
+    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET
 
 
 @pytest.mark.parametrize("peers", [3, 31])
@@ -80,10 +76,9 @@ def test_an_agent_wakes_once_for_the_keepalives_of_all_its_resting_links(peers: 
     for number in range(peers):
         far = replace(HIGH, instance=rng.randbytes(16))
         ours, theirs = (LOW, far) if number % 2 else (far, LOW)
-        dialler = side(ConnectionRole.DIALLER, ours, time, expected=theirs.guid)
-        acceptor = side(ConnectionRole.ACCEPTOR, theirs, time)
-        deliver(dialler.link.take_output(), acceptor.link, time.now)
-        acceptor.link.accept(time.now)
+        dialler = Side(DIALLER, ours, time, expected=theirs.guid)
+        acceptor = Side(ACCEPTOR, theirs, time)
+        deliver(dialler.take_output(), acceptor, time.now)
         exchange(dialler, acceptor, time)
         rest(dialler, acceptor, time)
         links.append((dialler, acceptor) if number % 2 else (acceptor, dialler))
@@ -92,7 +87,7 @@ def test_an_agent_wakes_once_for_the_keepalives_of_all_its_resting_links(peers: 
     fired, pings = run_all(links, time, 600.0)
     assert len(fired) <= 600 / limits.IDLE_KEEPALIVE_INTERVAL + 1
     assert pings <= peers * 2 * (600 / limits.IDLE_KEEPALIVE_INTERVAL + 1), "a ping and its pong, one way each"
-    assert all(each.link.state is ConnectionState.UP for pair_ in links for each in pair_)
+    assert all(each.state is ConnectionState.UP for pair_ in links for each in pair_)
 
 
 def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple[set[int], int]:
@@ -102,16 +97,16 @@ def run_all(links: list[tuple[Side, Side]], time: Time, seconds: float) -> tuple
     machines = [(pair_, each) for pair_ in links for each in pair_]
     while True:
         due, (pair_, each) = min(
-            (((t if (t := m[1].link.next_timer()) is not None else end + 1), m) for m in machines), key=lambda x: x[0]
+            (((t if (t := m[1].next_timer()) is not None else end + 1), m) for m in machines), key=lambda x: x[0]
         )
         if due > end:
             time.now = end
             return fired, sent
         time.now = max(time.now, due)
-        each.link.handle_timer(time.now)
+        each.handle_timer(time.now)
         if each is pair_[0]:
             fired.add(round(time.now * 1000))
-        if each.link.has_output:
+        if each.output:
             sent += 2
         exchange(*pair_, time)
 
@@ -120,65 +115,55 @@ def test_silence_at_rest_ends_the_link_by_the_longer_lease() -> None:
     time = Time()
     dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
-    pass_time(dialler.link, time, limits.IDLE_LEASE - 0.01)
-    assert dialler.link.state is ConnectionState.UP
-    pass_time(dialler.link, time, 0.02)
-    assert dialler.last() == ConnectionClosed("high was silent for its lease of 16 s")
+    pass_time(dialler, time, limits.IDLE_LEASE - 0.01)
+    assert dialler.state is ConnectionState.UP
+    pass_time(dialler, time, 0.02)
+    assert dialler.last() == ("closed", "high was silent for its lease of 16 s")
 
 
 @pytest.mark.parametrize(
     ("peers", "interval", "lease"), [(3, 5.0, 16.0), (50, 5.0, 16.0), (63, 6.3, 19.9), (999, 19.0, 58.0)]
 )
 def test_keepalives_at_rest_are_rarer_with_more_peers(peers: int, interval: float, lease: float) -> None:
-    pace = RestPace()
-    pace.count(peers)
-    assert pace.interval == pytest.approx(interval)
-    assert pace.lease == pytest.approx(lease)
-    assert pace.lease <= limits.LINK_LEASE_MAX
-    assert 2 * pace.interval * limits.ACCEPTOR_KEEPALIVE_FACTOR < pace.lease
+    """Three of them and a second fit into the lease."""
+    assert rest_lease(peers) == pytest.approx(lease) == 3 * interval + 1
+    assert lease <= limits.LINK_LEASE_MAX
+    assert 2 * interval * limits.ACCEPTOR_KEEPALIVE_FACTOR < lease
 
 
 def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks() -> None:
     """The lease is promised before the side is silent for so long; a link in use stays as it is."""
-    time, paces = Time(), (RestPace(), RestPace())
-    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, rest=paces[0])
-    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, rest=paces[1])
-    deliver(dialler.link.take_output(), acceptor.link, time.now)
-    acceptor.link.accept(time.now)
-    exchange(dialler, acceptor, time)
+    time = Time()
+    dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
     few = run(dialler, acceptor, time, 600.0)
-    for pace in paces:
-        pace.count(999)
+    for each in (dialler, acceptor):
+        each.keepalive.rest_lease = rest_lease(999)
     run(dialler, acceptor, time, 20.0)
-    assert dialler.link.remote_lease == acceptor.link.remote_lease == 58.0
+    assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == 58.0
     many = run(dialler, acceptor, time, 600.0)
     assert many * 3 < few
-    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
-    dialler.link.need(time.now, needed=True)
+    assert dialler.state is acceptor.state is ConnectionState.UP
+    dialler.need(time.now, needed=True)
     exchange(dialler, acceptor, time)
-    assert dialler.link.remote_lease == acceptor.link.remote_lease == limits.EXPRESS_LEASE
+    assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == limits.EXPRESS_LEASE
     rest(dialler, acceptor, time)
-    for pace in paces:
-        pace.count(2)
+    for each in (dialler, acceptor):
+        each.keepalive.rest_lease = rest_lease(2)
     run(dialler, acceptor, time, 60.0)
-    assert dialler.link.remote_lease == acceptor.link.remote_lease == limits.IDLE_LEASE
+    assert dialler.keepalive.remote_lease == acceptor.keepalive.remote_lease == limits.IDLE_LEASE
     assert few - 2 <= run(dialler, acceptor, time, 600.0) <= few + 2
 
 
 def test_two_sides_with_different_numbers_of_peers_keep_their_own_promises() -> None:
     """As with an earlier release, whose pace does not change with the number."""
-    time, many = Time(), RestPace()
-    many.count(999)
-    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, rest=many)
-    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
-    deliver(dialler.link.take_output(), acceptor.link, time.now)
-    acceptor.link.accept(time.now)
-    exchange(dialler, acceptor, time)
+    time = Time()
+    dialler, acceptor = pair(time)
+    dialler.keepalive.rest_lease = rest_lease(999)
     rest(dialler, acceptor, time)
     run(dialler, acceptor, time, 600.0)
-    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
-    assert (dialler.link.remote_lease, acceptor.link.remote_lease) == (limits.IDLE_LEASE, 58.0)
+    assert dialler.state is acceptor.state is ConnectionState.UP
+    assert (dialler.keepalive.remote_lease, acceptor.keepalive.remote_lease) == (limits.IDLE_LEASE, 58.0)
 
 
 @pytest.mark.parametrize("who", [0, 1])
@@ -187,16 +172,16 @@ def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(who: int) -> None:
     both = pair(time)
     rest(*both, time)
     run(*both, time, 604.0)
-    heard = {each.link: len(each.events) for each in both}
-    stale = [each.link.clock.estimate(time.now) for each in both]
-    both[who].link.need(time.now, needed=True)
+    heard = {each: len(each.events) for each in both}
+    stale = [each.clock.estimate(time.now) for each in both]
+    both[who].need(time.now, needed=True)
     run(*both, time, 0.2)
     for each, before in zip(both, stale, strict=True):
-        now = each.link.clock.estimate(time.now)
+        now = each.clock.estimate(time.now)
         assert now is not None
         assert before is not None
         assert now[1] < before[1] / 3, "the old one is of seconds ago"
-        pongs = [event for event in each.events[heard[each.link] :] if isinstance(event, PongReceived)]
+        pongs = [event for event in each.events[heard[each] :] if event[0] == "pong"]
         assert len(pongs) >= limits.WAKE_PINGS, "one of several is quick even on a busy path"
 
 
@@ -206,28 +191,28 @@ def test_one_side_that_needs_the_link_brings_back_the_short_lease(who: int) -> N
     both = pair(time)
     rest(*both, time)
     run(*both, time, 33.0)
-    both[who].link.need(time.now, needed=True)
+    both[who].need(time.now, needed=True)
     exchange(*both, time)
-    assert not any(each.link.rests for each in both)
+    assert not any(each.rests for each in both)
     run(*both, time, 5.0)
     dead, alive = both[1 - who], both[who]
-    dead.link.take_output()
-    pass_time(alive.link, time, limits.EXPRESS_LEASE + 0.3)
-    assert alive.link.state is ConnectionState.CLOSED
+    dead.take_output()
+    pass_time(alive, time, limits.EXPRESS_LEASE + 0.3)
+    assert alive.state is ConnectionState.CLOSED
 
 
 def test_a_peer_that_died_at_rest_is_noticed_soon_once_it_is_needed() -> None:
     time = Time()
     dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
-    pass_time(dialler.link, time, 3.0)
-    dialler.link.need(time.now, needed=True)
-    pass_time(dialler.link, time, limits.GHOST_QUIET)
-    assert dialler.link.quiet_after == limits.GHOST_QUIET
-    assert not any(isinstance(event, ConnectionClosed) for event in dialler.events), "it has time to answer"
-    pass_time(dialler.link, time, limits.WAKE_TIMEOUT - limits.GHOST_QUIET + 0.01)
-    assert dialler.link.state is ConnectionState.CLOSED
-    assert dialler.last() == ConnectionClosed("high was silent for its lease of 1.5 s")
+    pass_time(dialler, time, 3.0)
+    dialler.need(time.now, needed=True)
+    pass_time(dialler, time, limits.GHOST_QUIET)
+    assert dialler.keepalive.quiet_after == limits.GHOST_QUIET
+    assert not dialler.seen("closed"), "it has time to answer"
+    pass_time(dialler, time, limits.WAKE_TIMEOUT - limits.GHOST_QUIET + 0.01)
+    assert dialler.state is ConnectionState.CLOSED
+    assert dialler.last() == ("closed", "high was silent for its lease of 1.5 s")
 
 
 def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> None:
@@ -238,7 +223,7 @@ def test_a_pause_at_rest_that_is_shorter_than_the_lease_changes_nothing() -> Non
     time.now += 3.0
     run(dialler, acceptor, time, 30.0)
     assert resting(dialler, acceptor) == [True, True]
-    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
+    assert dialler.state is acceptor.state is ConnectionState.UP
 
 
 def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_asks_it() -> None:
@@ -246,11 +231,11 @@ def test_a_suspend_of_this_machine_is_not_the_peers_silence_and_the_next_use_ask
     dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
     time.now += 3600.0
-    dialler.link.handle_timer(time.now)
-    assert not any(isinstance(event, ConnectionClosed) for event in dialler.events)
-    dialler.link.need(time.now, needed=True)
-    pass_time(dialler.link, time, limits.WAKE_TIMEOUT + 0.01)
-    assert dialler.link.state is ConnectionState.CLOSED, "the peer has gone meanwhile"
+    dialler.handle_timer(time.now)
+    assert not dialler.seen("closed")
+    dialler.need(time.now, needed=True)
+    pass_time(dialler, time, limits.WAKE_TIMEOUT + 0.01)
+    assert dialler.state is ConnectionState.CLOSED, "the peer has gone meanwhile"
 
 
 @pytest.mark.parametrize("needed", [False, True])
@@ -259,17 +244,17 @@ def test_bits_of_later_versions_in_a_pace_frame_are_ignored(*, needed: bool) -> 
     dialler, acceptor = pair(time)
     rest(dialler, acceptor, time)
     frame = Frame(FrameKind.PACE, route=0xFFFFFFFC | needed, sequence=16_000).serialize()
-    deliver(frame, dialler.link, time.now)
-    assert dialler.link.rests is not needed
+    deliver(frame, dialler, time.now)
+    assert dialler.rests is not needed
 
 
 @pytest.mark.parametrize("claimed", [0, 1, 10**9])
 def test_a_claimed_lease_is_held_within_bounds(claimed: int) -> None:
     time = Time()
     dialler, _ = pair(time)
-    deliver(Frame(FrameKind.PACE, route=1, sequence=claimed).serialize(), dialler.link, time.now)
-    pass_time(dialler.link, time, limits.LINK_LEASE_MAX + 1.0)
-    assert dialler.link.state is ConnectionState.CLOSED
+    deliver(Frame(FrameKind.PACE, route=1, sequence=claimed).serialize(), dialler, time.now)
+    pass_time(dialler, time, limits.LINK_LEASE_MAX + 1.0)
+    assert dialler.state is ConnectionState.CLOSED
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -282,16 +267,16 @@ def test_whatever_both_say_when_they_agree_in_the_end(seed: int) -> None:
     for step in range(4000):
         time.now += 0.01
         for number, each in enumerate(both):
-            link: ConnectionProtocol = each.link
+            link = each
             if step < 3000 and rng.random() < 0.01:
                 last[number] = rng.random() < 0.5
                 link.need(time.now, needed=last[number])
             if (due := link.next_timer()) is not None and due <= time.now:
                 link.handle_timer(time.now)
-            if link.has_output:
+            if link.output:
                 at = max([time.now + rng.random() * 0.3, *(when for when, _ in wires[number])])
                 wires[number].append((at, link.take_output()))
             while wires[1 - number] and wires[1 - number][0][0] <= time.now:
                 deliver(wires[1 - number].pop(0)[1], link, time.now)
-    assert all(each.link.state is ConnectionState.UP for each in both)
-    assert [each.link.rests for each in both] == [not any(last)] * 2
+    assert all(each.state is ConnectionState.UP for each in both)
+    assert [each.rests for each in both] == [not any(last)] * 2

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState, DataHandler
+from rmpa.mesh.connection import ConnectionProtocol, DataHandler
 from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.mesh.keepalive import ConnectionEvent, RestPace
+    from rmpa.mesh.frames import FrameKind, Hello, Refuse
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
+
+DIALLER, ACCEPTOR = "dialler", "acceptor"
 
 WALL = 1_700_000_000_000_000_000
 
@@ -49,17 +50,71 @@ class AnyRoute(dict[int, DataHandler]):
         return _Route(route, self)
 
 
-@dataclass
-class Side:
-    """One connection machine, its events and its data."""
+class Time:
+    """A clock that tests move."""
 
-    link: ConnectionProtocol
-    events: list[ConnectionEvent] = field(default_factory=list)
-    data: list[tuple[int, int, int, bytes]] = field(default_factory=list)
-    parts: list[tuple[int, int, int, int, bytes]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.offset_ns = 0
 
-    def last(self) -> ConnectionEvent:
+    def wall_ns(self) -> int:
+        return WALL + round(self.now * 1e9) + self.offset_ns
+
+
+class Side(ConnectionProtocol):
+    """One connection machine, its events as tuples and its data.
+
+    Args:
+        role: Which side.
+        ours: Its identity.
+        time: Its clocks.
+        verdict: The acceptor's answer to each hello; ``None`` accepts it.
+        options: As of ``ConnectionProtocol``.
+    """
+
+    def __init__(
+        self, role: str, ours: Identity, time: Time, *, verdict: Refuse | None = None, **options: Any
+    ) -> None:
+        self.events: list[tuple[Any, ...]] = []
+        self.data: list[tuple[int, int, int, bytes]] = []
+        self.parts: list[tuple[int, int, int, int, bytes]] = []
+        self.verdict = verdict
+        super().__init__(ours, time.now, dialled=role == DIALLER, wall_ns=time.wall_ns, **options)
+        self.routes = AnyRoute(
+            lambda route, seq, stamp, view: self.data.append((route, seq, stamp, bytes(view))),
+            lambda route, seq, stamp, flags, view: self.parts.append((route, seq, stamp, flags, bytes(view))),
+        )
+
+    def judge(self, hello: Hello) -> Refuse | None:
+        if not self.dialled:
+            self.events.append(("hello", hello.identity))
+        return super().judge(hello) or self.verdict
+
+    def opened(self) -> None:
+        assert self.remote is not None
+        self.events.append(("opened", self.remote.identity))
+
+    def refused(self, refuse: Refuse, *, by_us: bool) -> None:
+        self.events.append(("refused", refuse, by_us))
+
+    def control_received(self, payload: bytes) -> None:
+        self.events.append(("control", payload))
+
+    def mark_received(self, kind: FrameKind, route: int, sequence: int) -> None:
+        self.events.append(("mark", kind, route, sequence))
+
+    def pong_received(self, stamp: int, rtt: float) -> None:
+        self.events.append(("pong", stamp, rtt))
+
+    def closed(self, reason: str) -> None:
+        self.events.append(("closed", reason))
+
+    def last(self) -> tuple[Any, ...]:
         return self.events[-1]
+
+    def seen(self, kind: str) -> list[tuple[Any, ...]]:
+        """The events of one kind."""
+        return [event for event in self.events if event[0] == kind]
 
     def messages(self) -> list[tuple[int, int, int, bytes]]:
         """What came in parts, put together; every part must have its place."""
@@ -79,17 +134,6 @@ class Side:
         return whole
 
 
-class Time:
-    """A clock that tests move."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.offset_ns = 0
-
-    def wall_ns(self) -> int:
-        return WALL + round(self.now * 1e9) + self.offset_ns
-
-
 def pass_time(link: ConnectionProtocol, time: Time, seconds: float) -> None:
     """Let time pass as a driver does: timers are handled when they are due."""
     end = time.now + seconds
@@ -97,37 +141,6 @@ def pass_time(link: ConnectionProtocol, time: Time, seconds: float) -> None:
         time.now = max(time.now, due)
         link.handle_timer(time.now)
     time.now = end
-
-
-def side(
-    role: ConnectionRole,
-    ours: Identity,
-    time: Time,
-    *,
-    expected: Guid | None = None,
-    lease: float = 1.0,
-    lane: Lane = Lane.EXPRESS,
-    rest: RestPace | None = None,
-) -> Side:
-    events: list[ConnectionEvent] = []
-    data: list[tuple[int, int, int, bytes]] = []
-    parts: list[tuple[int, int, int, int, bytes]] = []
-    link = ConnectionProtocol(
-        role,
-        ours,
-        time.now,
-        wall_ns=time.wall_ns,
-        on_event=events.append,
-        expected=expected,
-        lane=lane,
-        lease=lease,
-        rest=rest,
-    )
-    link.routes = AnyRoute(
-        lambda route, seq, stamp, view: data.append((route, seq, stamp, bytes(view))),
-        lambda route, seq, stamp, flags, view: parts.append((route, seq, stamp, flags, bytes(view))),
-    )
-    return Side(link, events, data, parts)
 
 
 def deliver(data: bytes, target: ConnectionProtocol, now: float, chunk: int = 1 << 30) -> None:
@@ -139,19 +152,17 @@ def deliver(data: bytes, target: ConnectionProtocol, now: float, chunk: int = 1 
         kept = kept[consumed:]
 
 
-def pair(time: Time, *, lease: float = 1.0, lane: Lane = Lane.EXPRESS) -> tuple[Side, Side]:
+def pair(time: Time, *, lane: Lane = Lane.EXPRESS) -> tuple[Side, Side]:
     """A dialler and an acceptor, both up."""
-    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, lease=lease, lane=lane)
-    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=lease)
-    deliver(dialler.link.take_output(), acceptor.link, time.now)
-    acceptor.link.accept(time.now)
+    dialler = Side(DIALLER, LOW, time, expected=HIGH.guid, lane=lane)
+    acceptor = Side(ACCEPTOR, HIGH, time)
     exchange(dialler, acceptor, time)
-    assert dialler.link.state is ConnectionState.UP
-    assert acceptor.link.state is ConnectionState.UP
+    assert dialler.up
+    assert acceptor.up
     return dialler, acceptor
 
 
 def exchange(one: Side, other: Side, time: Time, chunk: int = 1 << 30) -> None:
-    while one.link.has_output or other.link.has_output:
-        deliver(one.link.take_output(), other.link, time.now, chunk)
-        deliver(other.link.take_output(), one.link, time.now, chunk)
+    while one.output or other.output:
+        deliver(one.take_output(), other, time.now, chunk)
+        deliver(other.take_output(), one, time.now, chunk)

@@ -14,7 +14,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.membership import RESTARTED, MembershipProtocol
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Hello
-from rmpa.mesh.keepalive import CloseLink, Dial, LinkDown, LinkUp, RestPace
+from rmpa.mesh.keepalive import rest_lease
 from rmpa.mesh.peering import Peering
 from tests.simulation.large_network import TCP_BYTES, Link
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.discovery.announcing import OutgoingBeacon
     from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.membership import PeerEvent
-    from rmpa.mesh.keepalive import PeeringOutput
+    from rmpa.mesh.peering import PeeringOutput
     from tests.simulation.large_network import LargeNetwork
 
 TOPICS: Final = 20
@@ -63,6 +63,8 @@ class Module:
         self.alive = False
         self.reachable = True
         self.links: dict[int, Link] = {}
+        self._used: dict[int, Identity] = {}
+        """The peers of the links that are used."""
         self.offers = 1
         self.wants: set[int] = set()
         """The places of peers whose data is used here: their links stay."""
@@ -131,9 +133,7 @@ class Module:
         """Seconds of silence after which the other end of a link counts it as lost."""
         if link.used:
             return mesh_limits.EXPRESS_LEASE
-        pace = RestPace()
-        pace.count(len(self.known))
-        return pace.lease
+        return rest_lease(len(self.known))
 
     def part(self, link: Link) -> None:
         """The path of a link that leads across a partition is gone: both ends notice by their leases."""
@@ -236,7 +236,7 @@ class Module:
             self.tally.members -= 1
             if event.reason != RESTARTED:
                 self._judge_loss(identity, event.reason)
-            self.peering.peer_gone(identity.guid, now)
+            self.peering.peer_gone(identity.guid)
             self._forget(identity)
         elif event.change == "doubted":
             self._check_link(identity.guid.place)
@@ -267,16 +267,19 @@ class Module:
 
     def _on_order(self, order: PeeringOutput) -> None:
         match order:
-            case Dial(guid=guid, endpoints=endpoints):
+            case ("dial", guid, endpoints, _):
                 run = self.run
                 self.network.later(lambda: self._dialled(guid, endpoints[0], run), times=3.0)
-            case LinkUp(link_id=link_id, identity=identity):
-                self._linked(self.links[link_id], identity)
-            case LinkDown(identity=identity):
+            case ("up", link_id):
+                link = self.links[link_id]
+                self._used[link_id] = identity = link.other(self).identity
+                self._linked(link, identity)
+            case ("down", link_id, _, _):
+                identity = self._used.pop(link_id)
                 if self.watch:
                     self.lost_at[identity.guid.place] = self.network.now
                 self.membership.link_down(identity.guid, self.network.now, identity.instance)
-            case CloseLink(link_id=link_id, reason=reason) if link_id in self.links:
+            case ("close", link_id, reason) if link_id in self.links:
                 self._end(self.links[link_id], reason)
             case _:
                 pass

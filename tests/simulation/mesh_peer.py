@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.frames import FrameKind, Lane
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.keepalive import LinkDown
+    from rmpa.mesh.peering import LinkDownCause
     from tests.simulation.network import Address, World
 
 
@@ -75,10 +75,14 @@ class MeshPeer(RosterPeer):
         self.mesh = Mesh(
             self.identity,
             cast("socket.socket", SimListener(self.network, self.address, self.process)),
-            on_link_up=ours(self.link_up),
-            on_link_down=ours(self.link_down),
-            on_control=ours(self.control),
-            handlers=LinkHandlers(ours(self.mark), ours(self.clock_known), ours(self.lane_lost)),
+            LinkHandlers(
+                ours(self.link_up),
+                ours(self.link_down),
+                ours(self.control),
+                ours(self.mark),
+                ours(self.clock_known),
+                ours(self.lane_lost),
+            ),
             clock=SimClock(self.world),
             rng=rng.random,
             dialler=SimDialler(self),
@@ -136,9 +140,9 @@ class MeshPeer(RosterPeer):
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 
-    def link_down(self, link: PeerLink, down: LinkDown) -> None:
+    def link_down(self, link: PeerLink, cause: LinkDownCause, reason: str) -> None:
         """Its link is not used any more."""
-        self.note(f"= link {link.id} down {link.identity}: {down.reason}")
+        self.note(f"= link {link.id} down {link.identity}: {reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)
         self.flush()
 

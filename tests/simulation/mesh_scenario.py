@@ -14,8 +14,7 @@ from tests.simulation.scenario import Outcome, Scenario
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.connection import Connection
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.link import Connection, PeerLink
     from tests.simulation.sockets import SimSocket
 
 _MANY = 10
@@ -58,7 +57,7 @@ class MeshScenario(Scenario):
         """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
         with (
-            mock.patch("rmpa.mesh.io.dial.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.mesh.io.mesh.unacknowledged", lambda sock: sock.in_flight),
             mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
                 limits,

@@ -18,7 +18,7 @@ from tests.simulation.mesh_scenario import socket_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.connection import Connection
+    from rmpa.mesh.io.link import Connection
     from tests.simulation.traffic import TrafficPeer
 
 TROUBLES: Final = ("break", "swallow", "part", "kill receiver", "kill sender", "abort")
@@ -77,7 +77,7 @@ class PointScenario(LanesScenario):
         """As ``LanesScenario``, with fragments short enough to be read in a trace."""
         with (
             super().simulated(),
-            mock.patch("rmpa.mesh.io.link.Outbox", partial(Outbox, fragment=_FRAGMENT)),
+            mock.patch("rmpa.mesh.io.lane.Outbox", partial(Outbox, fragment=_FRAGMENT)),
             mock.patch.object(core_limits, "FRAGMENT_BYTES", _FRAGMENT),
             mock.patch.object(mesh_limits, "EXPRESS_MESSAGE_MAX", 50),
         ):

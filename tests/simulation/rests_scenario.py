@@ -44,7 +44,7 @@ class RestsScenario(MeshScenario):
         for link in links:
             peer.process.run(partial(link.need, needed=True))
         self.world.run(self.world.now + limits.WAKE_TIMEOUT + limits.EXPRESS_LEASE)
-        assert not any(link.up for link in links), f"{peer.name} has not noticed that its peers are gone"
+        assert not any(link.connection.up for link in links), f"{peer.name} has not noticed that its peers are gone"
 
     def _change(self, peer: MeshPeer) -> None:
         if peer.alive and not self.checked:

@@ -20,7 +20,7 @@ from rmpa.discovery.network import choose, further_addresses, list_interfaces, p
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.keepalive import LinkDown, LinkDownCause
+from rmpa.mesh.peering import LinkDownCause
 from rmpa.runtime.accept import open_mesh_port
 from rmpa.runtime.loop import SystemClock
 
@@ -85,10 +85,14 @@ class NetworkEndpoint:
         self.mesh = Mesh(
             self.identity,
             tcp,
-            on_link_up=self._link_up,
-            on_link_down=self._link_down,
-            on_control=bridge.control,
-            handlers=LinkHandlers(bridge.mark, bridge.sessions.clock, bridge.sessions.lane_lost),
+            LinkHandlers(
+                self._link_up,
+                self._link_down,
+                bridge.control,
+                bridge.mark,
+                bridge.sessions.clock,
+                bridge.sessions.lane_lost,
+            ),
             lanes=settings.lanes,
             clock=clock,
             security=trust.membership if trust is not None else None,
@@ -149,9 +153,9 @@ class NetworkEndpoint:
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.sessions.link_up(link)
 
-    def _link_down(self, link: PeerLink, down: LinkDown) -> None:
+    def _link_down(self, link: PeerLink, cause: LinkDownCause, _reason: str) -> None:
         self._bridge.sessions.link_down(link)
-        if down.cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
+        if cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:

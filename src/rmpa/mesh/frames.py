@@ -1,7 +1,5 @@
 """Frames, the units of a connection's byte stream, and the handshake at its start (docs/design/protocol.md).
 
-Frames: the units of a connection's byte stream (docs/design/protocol.md, "Frames").
-
 ``Frame`` is the readable form, for all frames that are rare. The data path packs headers by ``pack_data_header`` and
 ``pack_fragment_header``, reads them by ``unpack_header``, and makes no objects.
 """
@@ -10,8 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
-from types import MappingProxyType
+from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
@@ -21,8 +18,6 @@ from rmpa.mesh import limits
 from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
     from rmpa.core.outbox import QueuedMessage
 
 Buffer = bytes | bytearray | memoryview
@@ -57,30 +52,18 @@ class FrameKind(IntEnum):
     LANE = 13
 
 
-class PaceFlag(IntFlag):
-    """What the route field of a pace frame says; bits that are not known are ignored."""
-
-    NEEDED = 1
-    """Something at the sender depends on the connection, so that neither side may rest."""
-
-
-PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
-    {
-        FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,
-        FrameKind.WELCOME: limits.HELLO_PAYLOAD_MAX,
-        FrameKind.REFUSE: limits.HELLO_PAYLOAD_MAX,
-        FrameKind.PING: 0,
-        FrameKind.PONG: _STAMPS.size,
-        FrameKind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
-        FrameKind.DATA: limits.DATA_PAYLOAD_MAX,
-        FrameKind.BYE: limits.HELLO_PAYLOAD_MAX,
-        FrameKind.ACK: 0,
-        FrameKind.FENCE: 0,
-        FrameKind.FENCED: 0,
-        FrameKind.PACE: 0,
-        FrameKind.LANE: 0,
-    }
-)
+PACE_NEEDED: Final = 1
+"""Bit of a pace frame's route field: something at the sender depends on the connection, so neither side may rest.
+Bits that are not known are ignored."""
+PAYLOAD_MAX: Final[dict[int, int]] = dict.fromkeys(map(int, FrameKind), 0) | {
+    FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,
+    FrameKind.WELCOME: limits.HELLO_PAYLOAD_MAX,
+    FrameKind.REFUSE: limits.HELLO_PAYLOAD_MAX,
+    FrameKind.PONG: _STAMPS.size,
+    FrameKind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
+    FrameKind.DATA: limits.DATA_PAYLOAD_MAX,
+    FrameKind.BYE: limits.HELLO_PAYLOAD_MAX,
+}
 """The most bytes of payload that a frame of each kind may claim."""
 
 
@@ -117,9 +100,8 @@ def check_header(length: int, kind: int, flags: int) -> None:
         raise LimitExceeded(f"{FrameKind(kind).name.lower()} frame", length, limit)
     if kind != FrameKind.DATA:
         if flags & WHOLE != WHOLE:
-            raise RemoteProtocolError(
-                f"{FrameKind(kind).name.lower()} frame is a fragment; only data comes in fragments"
-            )
+            name = FrameKind(kind).name.lower()
+            raise RemoteProtocolError(f"{name} frame is a fragment; only data comes in fragments")
     elif flags & ABORT:
         if length or flags & WHOLE != LAST:
             raise RemoteProtocolError(f"data frame that aborts its message has {length} bytes, flags {flags:#x}")
@@ -173,8 +155,7 @@ class Frame:
         Raises:
             LocalProtocolError: The payload is longer than this kind allows.
         """
-        if len(self.payload) > PAYLOAD_MAX[self.kind]:
-            limit = PAYLOAD_MAX[self.kind]
+        if len(self.payload) > (limit := PAYLOAD_MAX[self.kind]):
             raise LocalProtocolError(f"{self.kind.name} payload of {len(self.payload)} bytes exceeds {limit}")
         header = _pack(len(self.payload), self.kind, self.flags, 0, self.route, self.sequence, self.stamp_ns)
         return header + self.payload
@@ -225,9 +206,7 @@ def parse_text(payload: Buffer) -> str:
 
 
 # The handshake: each side sends its identity, and accepts or refuses (docs/design/protocol.md, "Handshake").
-#
-# ``judge`` decides on a hello, ``judge_welcome`` on the answer. Both are pure functions; the machines act on their
-# results.
+# ``judge`` decides on a hello, ``judge_welcome`` on the answer.
 
 
 MAGIC: Final = b"RMPA"
@@ -243,10 +222,6 @@ class Lane(IntEnum):
 
     EXPRESS = 1
     BULK = 2
-
-
-LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
-"""The lanes that this version knows."""
 
 
 class Refusal(IntEnum):
@@ -306,16 +281,8 @@ class Refuse:
 _LABELS: Final = {code.value: code.name.lower() for kind in (Refusal, TrustReason) for code in kind}
 
 
-class HandshakeError(RemoteProtocolError):
-    """A hello or welcome that cannot be read; ``refuse`` is the answer to its sender."""
-
-    def __init__(self, refuse: Refuse) -> None:
-        super().__init__(refuse.text)
-        self.refuse = refuse
-
-
-def _malformed(text: str) -> HandshakeError:
-    return HandshakeError(Refuse(Refusal.MALFORMED, f"the handshake is malformed: {text}"))
+def _malformed(text: str) -> Refuse:
+    return Refuse(Refusal.MALFORMED, f"the handshake is malformed: {text}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,45 +311,38 @@ class Hello:
     @classmethod
     def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
         """The hello of this identity; ``lease`` in seconds."""
-        return cls(
-            identity.guid,
-            identity.instance,
-            identity.name,
-            identity.domain,
-            round(lease * 1000),
-            expected,
-            lane,
-        )
+        milliseconds = round(lease * 1000)
+        return cls(identity.guid, identity.instance, identity.name, identity.domain, milliseconds, expected, lane)
 
     @classmethod
-    def parse(cls, payload: Buffer) -> Hello:
+    def parse(cls, payload: Buffer) -> Hello | Refuse:
         """Read a hello or welcome; bytes after what is known are for later versions and ignored.
 
-        Raises:
-            HandshakeError: The payload is of another version, or malformed.
+        Returns:
+            The hello; the answer to its sender if it is of another version or malformed.
         """
         if len(payload) < _PREFIX.size:
-            raise _malformed(f"{len(payload)} bytes")
+            return _malformed(f"{len(payload)} bytes")
         magic, version, _, _ = _PREFIX.unpack_from(payload)
         if magic != MAGIC:
-            raise _malformed("it does not begin with RMPA; is this port meant for something else?")
+            return _malformed("it does not begin with RMPA; is this port meant for something else?")
         if version != VERSION:
             text = f"protocol version {version} meets version {VERSION}: install the same release of rmpa on both"
-            raise HandshakeError(Refuse(Refusal.VERSION, text))
+            return Refuse(Refusal.VERSION, text)
         if len(payload) < _HELLO.size:
-            raise _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")
+            return _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")
         _, _, lane, domain, guid, instance, lease_ms, expected, size = _HELLO.unpack_from(payload)
         raw = bytes(payload[_HELLO.size : _HELLO.size + size])
         if len(raw) != size:
-            raise _malformed("it is shorter than its name")
+            return _malformed("it is shorter than its name")
         name = raw.decode("utf-8", "replace")
         if problem := peer_name_problem(name):
-            raise _malformed(problem)
+            return _malformed(problem)
         if lease_ms == 0:
-            raise _malformed("a lease of 0")
+            return _malformed("a lease of 0")
         if not Guid(guid).dialable:
             # Discovery would gossip about this GUID, and no beacon may carry such a one.
-            raise _malformed(f"no peer can be reached at {Guid(guid)}")
+            return _malformed(f"no peer can be reached at {Guid(guid)}")
         dialled = Guid(expected) if expected else None
         return cls(Guid(guid), instance, name, domain, lease_ms, dialled, lane)
 
@@ -390,18 +350,8 @@ class Hello:
         """The bytes on the wire."""
         name = self.name.encode()
         expected = self.expected.value if self.expected is not None else 0
-        head = _HELLO.pack(
-            MAGIC,
-            VERSION,
-            self.lane,
-            self.domain,
-            self.guid.value,
-            self.instance,
-            self.lease_ms,
-            expected,
-            len(name),
-        )
-        return head + name
+        numbers = (self.lane, self.domain, self.guid.value, self.instance, self.lease_ms, expected)
+        return _HELLO.pack(MAGIC, VERSION, *numbers, len(name)) + name
 
     @property
     def lease(self) -> float:
@@ -418,28 +368,6 @@ class Hello:
         return f"{self.name} ({self.guid}) domain {self.domain}"
 
 
-def same_place(one: Guid, other: Guid) -> bool:
-    """Whether two GUIDs have the same address and port: incarnations of one peer, or two peers in conflict."""
-    return one.place == other.place
-
-
-@dataclass(frozen=True, slots=True)
-class KnownLink:
-    """A link that is up, against which a hello is judged.
-
-    Args:
-        guid: The peer's.
-        instance: The peer's.
-        dialled: Whether this side dialled.
-        alive: Whether bytes were received within ``limits.GHOST_QUIET``; otherwise the peer may be dead.
-    """
-
-    guid: Guid
-    instance: bytes
-    dialled: bool
-    alive: bool
-
-
 FULL: Final = Refuse(
     Refusal.FULL,
     f"this mesh has {limits.MODULES_MAX} modules and no place for one more: make further ones a site of their own "
@@ -448,36 +376,42 @@ FULL: Final = Refuse(
 """The answer to a module for which a mesh has no place; it may join when one becomes free."""
 
 
-def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, full: bool = False) -> Refuse | None:
+def judge(
+    hello: Hello,
+    ours: Identity,
+    linked: Identity | None = None,
+    *,
+    dialled: bool = False,
+    alive: bool = True,
+    full: bool = False,
+) -> Refuse | None:
     """Decide on a hello: ``None`` accepts the connection.
 
     Args:
         hello: The dialler's hello.
         ours: The identity of this agent.
-        links: The links that are up, or at least those with a peer of the hello's address and port.
+        linked: The peer of the link that is up with the hello's address and port; ``None``: there is no such link.
+        dialled: Whether this side dialled that link.
+        alive: Whether bytes were received on it within ``limits.GHOST_QUIET``; otherwise the peer may be dead.
         full: Whether there is no place for one more peer.
     """
     if refuse := _judge_identity(hello, ours):
         return refuse
-    if hello.lane not in LANES:
+    if hello.lane not in (Lane.EXPRESS, Lane.BULK):
         return Refuse(Refusal.LANE, f"lane {hello.lane} is not supported here: install the same release on both")
-    if hello.expected is not None and not same_place(hello.expected, ours.guid):
+    if hello.expected is not None and hello.expected.place != ours.guid.place:
         text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
-    there = [link for link in links if same_place(link.guid, hello.guid)]
+    same_run = linked is not None and linked.instance == hello.instance
     if hello.lane == Lane.BULK:
-        if any(link.instance == hello.instance for link in there):
-            return None
-        return Refuse(Refusal.NO_EXPRESS, "a bulk lane belongs to an express one, and there is none yet")
-    for link in there:
-        if link.instance != hello.instance:
-            if link.alive:
-                return _duplicate(hello.guid)
-        elif link.dialled and ours.guid < hello.guid:
-            return Refuse(Refusal.ALREADY_LINKED, "we are linked already; the link that the lower GUID dialled stays")
-    if full and not there:
-        return FULL
-    return None
+        text = "a bulk lane belongs to an express one, and there is none yet"
+        return None if same_run else Refuse(Refusal.NO_EXPRESS, text)
+    if linked is None:
+        return FULL if full else None
+    if same_run:
+        text = "we are linked already; the link that the lower GUID dialled stays"
+        return Refuse(Refusal.ALREADY_LINKED, text) if dialled and ours.guid < hello.guid else None
+    return _duplicate(hello.guid) if alive else None
 
 
 def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refuse | None:
@@ -490,7 +424,7 @@ def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refu
     """
     if refuse := _judge_identity(welcome, ours):
         return refuse
-    if expected is not None and not same_place(expected, welcome.guid):
+    if expected is not None and expected.place != welcome.guid.place:
         who = f"{welcome.name} ({welcome.guid})"
         text = f"we called {expected}, but {who} answers: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
@@ -505,7 +439,7 @@ def _judge_identity(hello: Hello, ours: Identity) -> Refuse | None:
     if hello.domain != ours.domain:
         text = f"domain {hello.domain} meets domain {ours.domain}: start both with the same --domain (ROS_DOMAIN_ID)"
         return Refuse(Refusal.DOMAIN, text)
-    if same_place(hello.guid, ours.guid):
+    if hello.guid.place == ours.guid.place:
         return _duplicate(hello.guid)
     return None
 

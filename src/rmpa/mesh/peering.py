@@ -1,8 +1,8 @@
 """Decides which side dials, when, and which of two links with one peer stays: one machine over all peers.
 
 A peer's place is its address and port; its runs (incarnations) follow each other there. Outputs are collected, and
-returned by ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` are events for
-the rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
+returned by ``take`` (``PeeringOutput``). Each dial is answered by exactly one of ``link_up``, ``dial_refused`` or
+``dial_failed``.
 
 Beacons can be forged. Therefore *unverified* peers, which were never linked, are dialled from a queue, at a rate that
 is bounded over all of them. Peers that were linked before are dialled at once.
@@ -13,34 +13,73 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from enum import Enum
+from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Backoff, TimerQueue, TokenBucket, earliest
+from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FULL, Hello, KnownLink, Lane, Refusal, Refuse, judge
-from rmpa.mesh.keepalive import (
-    OTHER_PEER,
-    SELDOM_MENDED,
-    UNPROVEN,
-    CloseLink,
-    Dial,
-    LinkDown,
-    LinkDownCause,
-    LinkRefused,
-    LinkUp,
-    PeeringOutput,
-    PeerStatus,
-    SocketAddress,
-)
+from rmpa.mesh.frames import FULL, Hello, Lane, Refusal, Refuse, judge
 from rmpa.trust.permissions import NOT_OF_THIS_MESH, TrustReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.core.identity import Guid, Identity
-
 _log = logging.getLogger(__name__)
+
+SocketAddress = tuple[str, int]
+
+_SELDOM_MENDED: Final = frozenset(
+    {
+        Refusal.VERSION,
+        Refusal.DOMAIN,
+        Refusal.DUPLICATE,
+        Refusal.MALFORMED,
+        Refusal.LANE,
+        Refusal.FULL,
+        TrustReason.PLAIN,
+        TrustReason.FOREIGN,
+        TrustReason.EXPIRED,
+        TrustReason.REVOKED,
+        TrustReason.NAME,
+        TrustReason.DOWNGRADE,
+    }
+)
+"""Refusals for reasons that seldom pass by themselves."""
+_UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.CLOCK})
+"""Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause."""
+_OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
+
+
+class LinkDownCause(Enum):
+    """Why a link is no longer used; the value is the text for users."""
+
+    REPLACED = "replaced by a newer link"
+    """The same run of the peer has another link from the same moment on."""
+    RESTARTED = "the peer restarted"
+    """Another run of the peer has taken its place."""
+    ENDED = "the connection ended"
+    """The connection of its express lane ended."""
+
+
+PeeringOutput = (
+    tuple[Literal["dial"], Guid, tuple[SocketAddress, ...], bool]
+    | tuple[Literal["close"], int, str]
+    | tuple[Literal["up"], int]
+    | tuple[Literal["down"], int, LinkDownCause, str]
+    | tuple[Literal["refused"], Identity, Refuse]
+)
+"""What the driver has to do, or the rooms above have to know:
+
+* ``("dial", guid, endpoints, briefly)``: connect to this peer at the endpoint that answers first, best first. With
+  ``briefly`` each gets one short attempt, because the next dial follows soon.
+* ``("close", link id, reason)``: send a bye on this link and close it.
+* ``("up", link id)``: this link is the one that is used with its peer.
+* ``("down", link id, cause, reason)``: the link that was used with its peer is no longer used.
+* ``("refused", identity, refuse)``: a peer refuses links for a reason that was not reported before.
+"""
 
 
 @dataclass(slots=True)
@@ -52,29 +91,79 @@ class _LinkInfo:
 
 
 @dataclass(slots=True)
-class _Peer:
-    identity: Identity
-    lower: bool
+class Peer:
+    """What is known of one peer; only the machine changes it.
+
+    It has more than 12 fields: the peer, its link, the present dial, and when and why the next one comes.
+
+    Args:
+        run: Its newest run that is known.
+        backoff: The pauses between its dials.
+        announced: Whether discovery knows the peer.
+        verified: Whether it was linked before.
+        token_taken: Whether the present dial counts against the rate of unverified peers.
+        gone: Whether it is forgotten when its link or dial ends.
+        source: The source address of its own beacons.
+        good: The endpoint where it was reached last.
+        link: The link that is used with it.
+        fell: When its last link ended, monotonic seconds.
+        dialling: The endpoints of the present dial.
+        hello_at: When the present dial sent its hello.
+        tried: The endpoints that were dialled since the last pause.
+        next_attempt: When it is dialled next, monotonic seconds.
+        forget_at: When it is forgotten.
+        pursued_until: Until when it is dialled by short attempts.
+        attempts: Dials since the last link.
+        last_error: Why there is no link, as far as is known; for a linked peer, why its previous link ended.
+        refused: The last refusal, if it is one for a reason that seldom passes by itself.
+        reported: The codes of the refusals that were reported.
+    """
+
+    run: Identity
     backoff: Backoff
-    announced: bool = False  # discovery knows the peer
-    verified: bool = False  # the peer was linked before
-    token_taken: bool = False  # the present dial counts against the rate of unverified peers
-    gone: bool = False  # the peer is forgotten when its link or dial ends
+    announced: bool = False
+    verified: bool = False
+    token_taken: bool = False
+    gone: bool = False
     source: str | None = None
-    good: SocketAddress | None = None  # the endpoint where the peer was reached last
+    good: SocketAddress | None = None
     link: _LinkInfo | None = None
     fell: float | None = None
     dialling: tuple[SocketAddress, ...] = ()
-    hello_at: float | None = None  # when the present dial sent its hello
+    hello_at: float | None = None
     tried: set[SocketAddress] = field(default_factory=set)
     next_attempt: float | None = None
     forget_at: float | None = None
-    pursued_until: float = -math.inf  # dialled by short attempts until then
+    pursued_until: float = -math.inf
     attempts: int = 0
     last_error: str = ""
-    last_endpoint: SocketAddress | None = None
     refused: Refuse | None = None
-    reported: set[int] = field(default_factory=set)  # refusals that were reported
+    reported: set[int] = field(default_factory=set)
+
+    @property
+    def identity(self) -> Identity:
+        """The run that is linked, else the newest one."""
+        return self.run if self.link is None else self.link.identity
+
+    @property
+    def state(self) -> Literal["linked", "dialling", "waiting", "refused"]:
+        """``refused``: waiting after a refusal for a reason that seldom passes by itself."""
+        if self.link is not None:
+            return "linked"
+        if self.dialling:
+            return "dialling"
+        return "waiting" if self.refused is None else "refused"
+
+    @property
+    def since(self) -> float | None:
+        """When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link."""
+        return self.fell if self.link is None else self.link.since
+
+    @property
+    def foreign(self) -> TrustReason | None:
+        """Why it is not of this mesh, if its last refusal says so."""
+        code = self.refused.code if self.refused is not None and self.link is None else None
+        return TrustReason(code) if code in NOT_OF_THIS_MESH else None
 
     @property
     def has_place(self) -> bool:
@@ -85,8 +174,8 @@ class _Peer:
         """The endpoints to dial, best first: the last one that worked, the beacon's source, the announced ones."""
         candidates = [self.good] if self.good is not None else []
         if self.source is not None:
-            candidates.append((self.source, self.identity.guid.port))
-        return list(dict.fromkeys([*candidates, *self.identity.endpoints]))
+            candidates.append((self.source, self.run.guid.port))
+        return list(dict.fromkeys([*candidates, *self.run.endpoints]))
 
 
 class Peering:
@@ -102,20 +191,14 @@ class Peering:
         self._ours = ours
         self._rng = rng
         self._alive = alive
-        self._peers: dict[int, _Peer] = {}
-        self._by_link: dict[int, _Peer] = {}
+        self._peers: dict[int, Peer] = {}
         self._outputs: list[PeeringOutput] = []
         self._timers: TimerQueue[int] = TimerQueue()
-        self._unverified: set[int] = set()
         self._dial_queue: dict[int, None] = {}
         """Unverified peers whose dials are due, the one that has been due longest first."""
-        self._never_dialled: dict[int, None] = {}
-        """The peers of the queue that were never dialled."""
         self._newest_next = True
-        self._reported_full: set[int] = set()
-        """``Refusal.FULL`` once one of all peers has said so, until a link comes up."""
-        self._pursued: set[int] = set()
-        """Peers whose links were in use and fell silent within ``limits.PURSUIT``."""
+        self.left_out = False
+        """Whether a mesh that is full has refused this module, and no link has come up since."""
         self._queue_at: float | None = None
         self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
@@ -134,25 +217,24 @@ class Peering:
         peer = self._peers.get(identity.guid.place)
         if peer is None:
             peer = self._add(identity)
-        restarted = peer.identity.instance != identity.instance
+        restarted = peer.run.instance != identity.instance
         fresh = not peer.announced or restarted
-        if restarted and identity.guid < peer.identity.guid and peer.link is not None:
+        if restarted and identity.guid < peer.run.guid and peer.link is not None:
             return  # an outdated report: the link is with a newer run
         peer.announced, peer.gone, peer.forget_at = True, False, None
         self._set_timer(peer)
         peer.source = source or peer.source
-        peer.identity = identity
+        peer.run = identity
         if restarted:
-            peer.lower = self._ours.guid < identity.guid
-            self._restart(peer, now)
+            self._restart(peer)
         if fresh and peer.link is None and not peer.dialling:
-            self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
+            self._dial_at(peer, now + self._fallback(peer))
         self._dial_due(peer, now)
 
-    def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines get the time
+    def peer_gone(self, guid: Guid) -> None:
         """Stop dialling a peer that discovery has given up. A link that is up stays until it ends by itself."""
         peer = self._peers.get(guid.place)
-        if peer is None or peer.identity.guid != guid:
+        if peer is None or peer.run.guid != guid:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
@@ -165,16 +247,20 @@ class Peering:
         if peer is not None and hello.lane == Lane.EXPRESS and self._crosses(peer, hello, now):
             text = "we dial each other; the link that the lower GUID dials stays"
             return Refuse(Refusal.ALREADY_LINKED, text)
-        known = []
-        if peer is not None and peer.link is not None:
-            link = peer.link
-            known.append(KnownLink(link.identity.guid, link.identity.instance, link.dialled, self._alive(link.id)))
-        refuse = judge(hello, self._ours, known, full=self._full(peer))
+        link = None if peer is None else peer.link
+        refuse = judge(
+            hello,
+            self._ours,
+            None if link is None else link.identity,
+            dialled=link is not None and link.dialled,
+            alive=link is not None and self._alive(link.id),
+            full=self._full(peer),
+        )
         if refuse is FULL:
             self.link_refused(hello.guid, refuse)
         return refuse
 
-    def _full(self, peer: _Peer | None = None) -> bool:
+    def _full(self, peer: Peer | None = None) -> bool:
         """Whether the mesh has no place for this peer, or for a new one.
 
         A place is taken by a link, and kept while its peer is away for a moment: until discovery has given it up.
@@ -214,31 +300,32 @@ class Peering:
         peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
             peer.dialling, peer.hello_at = (), None
-            peer.good = peer.last_endpoint = endpoint
+            peer.good = endpoint
         new = _LinkInfo(link_id, identity, dialled, now)
         old = peer.link
         if old is not None and self._keeps(old, new):
-            self._outputs.append(CloseLink(link_id, "we are linked already; the lower GUID's link stays"))
+            self._outputs.append(("close", link_id, "we are linked already; the lower GUID's link stays"))
             return
         if old is not None:
             same_run = old.identity.instance == identity.instance
             self._replace(peer, old, LinkDownCause.REPLACED if same_run else LinkDownCause.RESTARTED)
-        if peer.identity.instance != identity.instance:
-            peer.identity = identity
-            peer.lower = self._ours.guid < identity.guid
+        if peer.run.instance != identity.instance:
+            peer.run = identity
             peer.backoff.reset()
         peer.link = new
-        self._end_pursuit(peer)
+        peer.pursued_until = -math.inf
         peer.forget_at = peer.refused = None
         self._dial_at(peer, None)
-        self._verify(peer, now)
+        peer.verified = True
+        if peer.token_taken:  # a dial that led to the link does not count against the rate
+            peer.token_taken = False
+            self._dial_rate.put_back()
+            self._dial_unverified(now)
         peer.attempts = 0
-        peer.gone = False
+        peer.gone = self.left_out = False
         peer.tried.clear()
         peer.reported.clear()
-        self._reported_full.clear()
-        self._by_link[link_id] = peer
-        self._outputs.append(LinkUp(link_id, identity))
+        self._outputs.append(("up", link_id))
 
     def link_down(
         self,
@@ -258,14 +345,14 @@ class Peering:
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
             needed: Whether something at either side depended on it, so that the peer is worth many attempts.
         """
-        peer = self._by_link.get(link_id)
+        peer = next((p for p in self._peers.values() if p.link is not None and p.link.id == link_id), None)
         if peer is None or peer.link is None:
             return
-        link = peer.link
-        self._drop(peer, link, LinkDownCause.ENDED, reason)
+        since, peer.link = peer.link.since, None
+        self._outputs.append(("down", link_id, LinkDownCause.ENDED, reason))
         peer.fell = now
         peer.last_error = reason
-        if silent or now - link.since >= limits.LINK_STABLE:
+        if silent or now - since >= limits.LINK_STABLE:
             peer.backoff.reset()
         if not peer.announced and len(self._peers) > core_limits.PEERS_MAX:
             peer.gone = True  # forged identities must not fill the memory, nor cause dials
@@ -277,9 +364,8 @@ class Peering:
             self._set_timer(peer)
         if silent and needed:
             peer.pursued_until = now + limits.PURSUIT
-            self._pursued.add(peer.identity.guid.place)
         if not peer.dialling:
-            self._dial_at(peer, now + self._pause(peer, now) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
+            self._dial_at(peer, now + self._pause(peer, now) + self._fallback(peer))
 
     def dial_failed(self, guid: Guid, error: str, now: float, endpoint: SocketAddress | None = None) -> None:
         """Handle a ``Dial`` without an answer, or whose connection ended before its handshake was done.
@@ -309,18 +395,20 @@ class Peering:
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer, now)))
             return
-        if refuse.code in UNPROVEN or not proved:
+        if refuse.code in _UNPROVEN or not proved:
             peer.refused = refuse
-        if not proved or refuse.code in OTHER_PEER or refuse.code not in SELDOM_MENDED:
+        if not proved or refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
             self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse
             pause = max(limits.REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
-        reported = self._reported_full if refuse.code == Refusal.FULL else peer.reported
-        if refuse.code not in OTHER_PEER and refuse.code not in reported:
-            reported.add(refuse.code)
-            self._outputs.append(LinkRefused(peer.identity, refuse))
+        full = refuse.code == Refusal.FULL
+        reported = self.left_out if full else refuse.code in peer.reported
+        if refuse.code not in _OTHER_PEER and not reported:
+            peer.reported.add(refuse.code)
+            self.left_out |= full
+            self._outputs.append(("refused", peer.run, refuse))
 
     def link_refused(self, guid: Guid, refuse: Refuse) -> None:
         """Note why there is no link with a peer, which was found on a connection that the peer dialled."""
@@ -333,11 +421,6 @@ class Peering:
         there = [p for p in self._peers.values() if p.link is None and any(e[0] == host for e in p.endpoints())]
         if len(there) == 1:
             self.link_refused(there[0].identity.guid, refuse)
-
-    @property
-    def left_out(self) -> bool:
-        """Whether a mesh that is full has refused this module, and no link has come up since."""
-        return bool(self._reported_full)
 
     # --- time and outputs -----------------------------------------------------------------------------------
 
@@ -367,60 +450,49 @@ class Peering:
         peer = self._peers.get(guid.place)
         return peer.endpoints() if peer is not None else []
 
-    def peers(self) -> list[PeerStatus]:
+    def peers(self) -> list[Peer]:
         """All known peers, by GUID."""
-        return [_status(p) for p in sorted(self._peers.values(), key=lambda p: p.identity.guid)]
+        return sorted(self._peers.values(), key=lambda p: p.run.guid)
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _add(self, identity: Identity) -> _Peer:
-        backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
-        peer = _Peer(identity, self._ours.guid < identity.guid, backoff)
+    def _add(self, identity: Identity) -> Peer:
+        peer = Peer(identity, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
         self._peers[identity.guid.place] = peer
-        self._unverified.add(identity.guid.place)
         return peer
 
-    def _verify(self, peer: _Peer, now: float) -> None:
-        """Mark a linked peer as verified; a dial that led to the link does not count against the rate."""
-        peer.verified = True
-        self._unverified.discard(peer.identity.guid.place)
-        if peer.token_taken:
-            peer.token_taken = False
-            self._dial_rate.put_back()
-            self._dial_unverified(now)
+    def _fallback(self, peer: Peer) -> float:
+        """Seconds that this side waits for the peer's dial: none if it has the lower GUID, and dials first."""
+        return 0.0 if self._ours.guid < peer.run.guid else limits.DIAL_FALLBACK
 
-    def _forget_if_idle(self, peer: _Peer) -> None:
+    def _forget_if_idle(self, peer: Peer) -> None:
         """Forget a peer that is gone, unless it has a link or an unanswered dial."""
         peer.forget_at = None
         self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
-            self._end_pursuit(peer)
-            self._peers.pop(peer.identity.guid.place, None)
-            self._unverified.discard(peer.identity.guid.place)
+            self._peers.pop(peer.run.guid.place, None)
 
-    def _restart(self, peer: _Peer, now: float) -> None:
+    def _restart(self, peer: Peer) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
         peer.refused = None
         link = peer.link
-        ghost = link is not None and link.identity.instance != peer.identity.instance
-        if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
+        ghost = link is not None and link.identity.instance != peer.run.instance
+        if link is not None and ghost and (link.identity.guid < peer.run.guid or not self._alive(link.id)):
             self._replace(peer, link, LinkDownCause.RESTARTED)
-        if peer.link is None and not peer.dialling:
-            self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
-    def _crosses(self, peer: _Peer, hello: Hello, now: float) -> bool:
+    def _crosses(self, peer: Peer, hello: Hello, now: float) -> bool:
         """Whether a hello crosses that of this side, whose link stays.
 
         The link of the hello would be replaced a round trip later, with the calls that are made over it meanwhile. An
         unverified peer is accepted all the same: a forged beacon may lead this side's dial to an address without an
         answer.
         """
-        if not peer.lower or not peer.verified or peer.link is not None or peer.hello_at is None:
+        if self._fallback(peer) or not peer.verified or peer.link is not None or peer.hello_at is None:
             return False
-        same_run = peer.identity.instance == hello.instance
+        same_run = peer.run.instance == hello.instance
         return same_run and now - peer.hello_at < limits.CROSSING_TIME
 
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
@@ -432,17 +504,12 @@ class Peering:
             return False
         return old.dialled == (self._ours.guid < old.identity.guid)
 
-    def _replace(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
+    def _replace(self, peer: Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
         """Close a link that is replaced by another link, or whose run of the peer is replaced."""
-        self._outputs.append(CloseLink(link.id, cause.value))
-        self._drop(peer, link, cause, cause.value)
-
-    def _drop(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause, reason: str) -> None:
         peer.link = None
-        self._by_link.pop(link.id, None)
-        self._outputs.append(LinkDown(link.id, link.identity, cause, reason))
+        self._outputs += [("close", link.id, cause.value), ("down", link.id, cause, cause.value)]
 
-    def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> _Peer | None:
+    def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> Peer | None:
         """End a peer's dial, and mark the endpoint (``None``: all dialled ones) as tried.
 
         Returns:
@@ -455,7 +522,6 @@ class Peering:
             peer.tried.update(peer.dialling)
         else:
             peer.tried.add(endpoint)
-            peer.last_endpoint = endpoint
         peer.dialling, peer.hello_at = (), None
         peer.token_taken = False
         if peer.gone:
@@ -463,7 +529,7 @@ class Peering:
             return None
         return peer
 
-    def _retry(self, peer: _Peer, now: float) -> None:
+    def _retry(self, peer: Peer, now: float) -> None:
         """Try the other endpoints at once, or wait when all were tried."""
         if peer.link is not None:
             return
@@ -476,55 +542,41 @@ class Peering:
 
     # --- when to dial ---------------------------------------------------------------------------------------
 
-    def _cap(self, peer: _Peer) -> float:
+    def _cap(self, peer: Peer) -> float:
         """The longest pause between dials, in seconds: unverified peers share the rate of all of them."""
         if peer.verified:
             return limits.BACKOFF_MAX
-        return max(limits.BACKOFF_MAX, len(self._unverified) / limits.DIAL_STRANGERS_RATE)
+        unverified = sum(not each.verified for each in self._peers.values())
+        return max(limits.BACKOFF_MAX, unverified / limits.DIAL_STRANGERS_RATE)
 
-    def _pause(self, peer: _Peer, now: float) -> float:
-        if self._is_pursued(peer, now):
-            shared = len(self._pursued) / limits.PURSUITS_PER_SECOND
-            return max(limits.REDIAL_PAUSE, shared) * (0.5 + self._rng())
+    def _pause(self, peer: Peer, now: float) -> float:
+        if now < peer.pursued_until:
+            pursued = sum(now < each.pursued_until for each in self._peers.values())
+            return max(limits.REDIAL_PAUSE, pursued / limits.PURSUITS_PER_SECOND) * (0.5 + self._rng())
         peer.backoff.cap = self._cap(peer)
         return peer.backoff.delay()
 
-    def _end_pursuit(self, peer: _Peer) -> None:
-        peer.pursued_until = -math.inf
-        self._pursued.discard(peer.identity.guid.place)
-
-    def _is_pursued(self, peer: _Peer, now: float) -> bool:
-        """Whether a peer is dialled by short attempts, many of them."""
-        if now < peer.pursued_until:
-            return True
-        self._pursued.discard(peer.identity.guid.place)
-        return False
-
-    def _set_timer(self, peer: _Peer) -> None:
-        place = peer.identity.guid.place
+    def _set_timer(self, peer: Peer) -> None:
+        place = peer.run.guid.place
         attempt = None if place in self._dial_queue else peer.next_attempt
         self._timers.set(place, earliest(attempt, peer.forget_at))
 
-    def _dial_at(self, peer: _Peer, when: float | None) -> None:
+    def _dial_at(self, peer: Peer, when: float | None) -> None:
         """Set the time of the next dial; ``None``: never."""
-        place = peer.identity.guid.place
+        place = peer.run.guid.place
         peer.next_attempt = when
         self._dial_queue.pop(place, None)
-        self._never_dialled.pop(place, None)
         self._set_timer(peer)
 
-    def _dial_due(self, peer: _Peer, now: float) -> None:
+    def _dial_due(self, peer: Peer, now: float) -> None:
         """Dial a peer whose dial is due; an unverified one joins the queue instead."""
         due = peer.next_attempt
         if due is None or now < due or peer.link is not None or peer.dialling:
             return
         if peer.verified:
-            self._dial(peer, briefly=self._is_pursued(peer, now))
+            self._dial(peer, briefly=now < peer.pursued_until)
             return
-        place = peer.identity.guid.place
-        self._dial_queue[place] = None
-        if not peer.attempts:
-            self._never_dialled[place] = None
+        self._dial_queue[peer.run.guid.place] = None
         self._set_timer(peer)
         self._dial_unverified(now)
 
@@ -538,51 +590,20 @@ class Peering:
             self._queue_at = now + limits.REFUSED_RETRY
             return
         while self._dial_queue and self._dial_rate.take(now):
-            newest = self._newest_next and self._never_dialled
-            place = next(reversed(self._never_dialled) if newest else iter(self._dial_queue))
+            queue = [self._peers[place] for place in self._dial_queue]
+            newest = next((p for p in reversed(queue) if not p.attempts), None) if self._newest_next else None
             self._newest_next = not self._newest_next
-            peer = self._peers[place]
+            peer = newest or queue[0]
             peer.token_taken = True
             self._dial(peer)
         self._queue_at = self._dial_rate.next(now) if self._dial_queue else None
 
-    def _dial(self, peer: _Peer, *, briefly: bool = False) -> None:
+    def _dial(self, peer: Peer, *, briefly: bool = False) -> None:
         self._dial_at(peer, None)
         left = [e for e in peer.endpoints() if e not in peer.tried]
         if not left:
             peer.tried.clear()
             left = peer.endpoints()
         peer.dialling = tuple(left)
-        peer.last_endpoint = left[0]
         peer.attempts += 1
-        self._outputs.append(Dial(peer.identity.guid, peer.dialling, briefly))
-
-
-def _status(peer: _Peer) -> PeerStatus:
-    state: Literal["linked", "dialling", "waiting", "refused"]
-    if peer.link is not None:
-        state = "linked"
-    elif peer.dialling:
-        state = "dialling"
-    else:
-        state = "waiting" if peer.refused is None else "refused"
-    link = peer.link
-    return PeerStatus(
-        peer.identity if link is None else link.identity,
-        state,
-        None if link is None else link.id,
-        peer.lower,
-        peer.fell if link is None else link.since,
-        peer.attempts,
-        peer.last_error,
-        peer.next_attempt,
-        peer.last_endpoint,
-        _foreign(peer),
-    )
-
-
-def _foreign(peer: _Peer) -> TrustReason | None:
-    """Why an unlinked peer is not of this mesh, if its last refusal says so."""
-    if peer.link is None and peer.refused is not None and peer.refused.code in NOT_OF_THIS_MESH:
-        return TrustReason(peer.refused.code)
-    return None
+        self._outputs.append(("dial", peer.run.guid, peer.dialling, briefly))

@@ -37,9 +37,10 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.discovery import Discovery, Stranger
     from rmpa.discovery.endpoints import PeerView
-    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.keepalive import PeerStatus
+    from rmpa.mesh.peering import Peer
     from rmpa.observe.control_client import ControlClient
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.runtime.stream import Stream
@@ -418,9 +419,7 @@ class PeersSection:
             infos.append(msgspec.structs.replace(info, state="relayed", via=via, topics_in=len(topics)))
         return infos
 
-    def _peer(
-        self, view: PeerView | None, status: PeerStatus | None, session: PeerSession | None, now: float
-    ) -> PeerInfo:
+    def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
         run = view.run if view is not None else None
         identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()

@@ -10,7 +10,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, URGENT, Outbox
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.io.link import LaneSender
+from rmpa.mesh.io.lane import LaneSender
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:

@@ -72,10 +72,14 @@ class Peer:
         self.mesh = Mesh(
             self.identity,
             sock,
-            on_link_up=self.on_link_up,
-            on_link_down=lambda link, down: self.downs.append((link, down.reason)),
-            on_control=lambda _link, payload: self.controls.append(payload),
-            handlers=LinkHandlers(self.on_mark, self.clocks.append, self.on_lane_lost),
+            LinkHandlers(
+                self.on_link_up,
+                lambda link, _cause, reason: self.downs.append((link, reason)),
+                lambda _link, payload: self.controls.append(payload),
+                self.on_mark,
+                self.clocks.append,
+                self.on_lane_lost,
+            ),
             lanes=lanes,
             security=security,
             on_join=on_join,
@@ -84,7 +88,7 @@ class Peer:
     def on_link_up(self, link: PeerLink) -> None:
         self.ups.append(link)
         link.routes = AnyRoute(self.on_data, self.on_part)
-        link.use(self.mesh.handlers)
+        link.use(used=True)
 
     def on_data(self, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         self.data.append((route, sequence, stamp_ns, bytes(payload)))
@@ -115,7 +119,7 @@ class Peer:
         return [(sequence, payload) for r, sequence, _, payload in self.data if r == route]
 
     def linked(self, *others: Peer) -> bool:
-        return all((link := self.mesh.link(o.identity.guid)) is not None and link.up for o in others)
+        return all((link := self.mesh.link(o.identity.guid)) is not None and link.connection.up for o in others)
 
     def link(self, other: Peer) -> PeerLink:
         link = self.mesh.link(other.identity.guid)
@@ -136,7 +140,7 @@ class Peer:
         self.mesh._acceptor.close()
         self.mesh._timer.close()
         for connection in self.mesh.connections():
-            connection.abort("killed")
+            connection.lost("killed")
 
 
 @asynccontextmanager

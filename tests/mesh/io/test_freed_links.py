@@ -13,8 +13,7 @@ from tests.mesh.io.meshes import Peer, peers, until
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.connection import Connection
-    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.link import Connection, PeerLink
 
 MB = 1 << 20
 

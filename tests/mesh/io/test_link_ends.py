@@ -71,7 +71,7 @@ async def test_the_end_of_the_bulk_lane_is_not_that_of_the_link() -> None:
     async with linked_pair() as (one, other):
         bulk = one.link(other).bulk_connection
         assert bulk is not None
-        bulk.abort("a test")
+        bulk.lost("a test")
         await until(lambda: bool(other.lanes_lost), "lost")
         await until(lambda: one.both_lanes(other) and other.both_lanes(one), "a new one")
         assert (one.downs, other.downs) == ([], [])

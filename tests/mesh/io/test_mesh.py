@@ -22,6 +22,7 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
+from rmpa.mesh.io.link import PeerLink
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
@@ -96,20 +97,22 @@ async def test_link_that_ends_during_its_redial_leaks_no_socket(
         link = one.link(other)
         racing, ended = asyncio.Event(), asyncio.Event()
         sockets: list[socket.socket] = []
-        redial = one.mesh.dialler.redial
+        redial = one.mesh.dialler.dial
 
-        async def late(*args: Any) -> tuple[socket.socket, tuple[str, int]]:
+        async def late(*args: Any, **options: Any) -> tuple[socket.socket, tuple[str, int]]:
             racing.set()
             await ended.wait()
-            sock, endpoint = await redial(*args)
+            sock, endpoint = await redial(*args, **options)
             sockets.append(sock)
             return sock, endpoint
 
-        monkeypatch.setattr(one.mesh.dialler, "redial", late)
-        monkeypatch.setattr(one.mesh._redials, "_alive", lambda _: False)
-        one.mesh.connection_quiet(link.connection)
-        task = one.mesh._redials._tasks[link.id]
-        await racing.wait()
+        with monkeypatch.context() as patched:
+            patched.setattr(one.mesh.dialler, "dial", late)
+            patched.setattr(PeerLink, "alive", False)
+            one.mesh.redial(link)
+            task = link.redial
+            assert task is not None
+            await racing.wait()
         link.abort("the cable is out")
         await until(lambda: bool(one.downs) and link.connection.sock.fileno() < 0, "its end")
         ended.set()
@@ -165,13 +168,13 @@ async def test_a_dial_that_fails_of_a_bug_is_logged(
     async with peers(2, found=False) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
 
-        async def fails(*_: object) -> tuple[socket.socket, tuple[str, int]]:
+        async def fails(*_: object, **__: object) -> tuple[socket.socket, tuple[str, int]]:
             raise KeyError("as asked")
 
         monkeypatch.setattr(one.mesh.dialler, "dial", fails)
         one.mesh.peer_found(other.identity)
         await until(lambda: any(r.exc_info for r in caplog.records), "a line in the log")
-        assert not one.mesh._dials
+        assert not one.mesh._tasks
 
 
 async def test_messages_arrive_in_order_and_byte_exact() -> None:

@@ -21,8 +21,8 @@ from tests.mesh.worlds import AnyRoute
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.mesh.io.connection import Connection
-    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import Connection, PeerLink
 
 HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 
@@ -126,7 +126,7 @@ async def test_handlers_receive_from_both_lanes() -> None:
         got: list[int] = []
         link = other.link(one)
         link.routes = AnyRoute(lambda _r, sequence, _t, _p: got.append(sequence))
-        link.use(other.mesh.handlers)
+        link.use(used=True)
         one.link(other).bulk.send(7, 1, 0, b"x")
         one.link(other).express.send(7, 2, 0, b"x")
         await until(lambda: sorted(got) == [1, 2], "both")
@@ -264,7 +264,7 @@ async def test_small_messages_go_on_while_the_bulk_lane_is_gone(by_dialler: bool
             link = sender.link(receiver)
             assert link.bulk_connection is None
             assert not link.bulk.connected
-            assert link.up
+            assert link.connection.up
             link.bulk.send(7, 2, 0, large(2, 300_000))
             link.bulk.send(7, 3, 0, b"small behind it")
             for number in range(50):
@@ -339,7 +339,7 @@ async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:
         one.mesh.peer_found(other.identity)
         await until(lambda: one.linked(other), "a link")
         one.link(other).bulk._on_wanted()
-        await until(lambda: bool(one.mesh._bulk_lanes._dials), "a link, and the dial")
+        await until(lambda: one.link(other).bulk_dial is not None, "a link, and the dial")
 
 
 async def test_both_lanes_end_with_the_link() -> None:
@@ -362,7 +362,7 @@ async def test_a_killed_peer_leaves_no_lane_behind() -> None:
         other.kill()
         await until(lambda: not one.mesh.connections(), "nothing is left")
         assert len(one.downs) == 1
-        await until(lambda: not one.mesh._bulk_lanes._dials, "no bulk lane is dialled")
+        await until(lambda: not one.mesh._tasks, "no bulk lane is dialled")
 
 
 # --- a bulk lane in place of another ------------------------------------------------------------------------------
@@ -389,7 +389,7 @@ async def test_new_bulk_lane_replaces_a_stuck_one() -> None:
         for (route, number), payload in got.items():
             assert payload == large(route, 100_000 if number == 2 else 3_000_000)
         await until(lambda: len(one.mesh.connections()) == 2, "the old one is closed")
-        assert link.up
+        assert link.connection.up
         assert not one.downs
         for sock in (express, stuck, fresh):
             sock.close()
@@ -438,8 +438,7 @@ async def test_fence_is_answered_after_all_messages_before_it(way: str) -> None:
             taken(link, kind, route, sequence)
             seen.append([number for number, _ in other.messages(7)])
 
-        link = one.link(other)
-        link.use(replace(one.mesh.handlers, mark=on_mark))
+        one.mesh.handlers = replace(one.mesh.handlers, mark=on_mark)
         for number in range(4):
             lane.send(7, 2 * number, 0, large(number, 2_000_000 if number % 2 else 100))
             lane.fence(7, number + 1)
@@ -489,13 +488,13 @@ async def test_fence_on_an_unused_link_is_not_answered() -> None:
     async with peers(1) as (one,):
         sock, _ = await raw(one, HAND_MADE, lease=60.0)
         await until(lambda: bool(one.ups), "a link")
-        one.ups[0].use(None)
+        one.ups[0].use(used=False)
         before = one.ups[0].bytes_in
         loop = asyncio.get_running_loop()
         data = pack_data_header(3, 7, 1, 0) + b"not"
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=1).serialize())
         await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
-        one.ups[0].use(one.mesh.handlers)
+        one.ups[0].use(used=True)
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=2).serialize())
         kept = b""
         answers: list[int] = []
@@ -553,11 +552,10 @@ async def test_a_wish_for_the_lane_before_the_link_is_used_is_kept() -> None:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         link = one.link(other)
-        handlers = one.mesh.handlers
-        link.use(None)
+        link.use(used=False)
         other.link(one).bulk.send(7, 1, 0, b"x")
         await until(lambda: link.bulk_wanted, "asked")
-        assert not one.mesh._bulk_lanes._dials
-        link.use(handlers)
-        one.mesh._bulk_lanes.link_up(link)
+        assert link.bulk_dial is None
+        link.use(used=True)
+        one.mesh.dial_bulk(link)
         await until(lambda: len(one.data) == 1, "it comes")

@@ -19,7 +19,6 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import MIB
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionRole
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.loop import SystemClock
@@ -31,7 +30,7 @@ from tests.mesh.io.meshes import DEADLINE, Peer, introduce, until
 from tests.trust.authority import Authority
 
 if TYPE_CHECKING:
-    from rmpa.mesh.keepalive import PeerStatus
+    from rmpa.mesh.peering import Peer as KnownPeer
 
 DAY = 86_400.0
 
@@ -45,7 +44,7 @@ def _has_all(peer: Peer) -> bool:
     return len(peer.data) == 2 and bool(peer.controls)
 
 
-def status(at: Peer, of: Peer) -> PeerStatus:
+def status(at: Peer, of: Peer) -> KnownPeer:
     return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
 
 
@@ -243,7 +242,7 @@ async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
     async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         lane = base.link(arm).bulk_connection
-        monkeypatch.setattr(base.mesh, "connection_prove", lambda *_: None)
+        monkeypatch.setattr(base.mesh, "_prove", lambda *_: None)
         thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
         try:
             await thief.mesh.start()
@@ -258,8 +257,8 @@ async def _claim(thief: Peer, victim: Peer, at: Peer, lane: Lane) -> None:
     """Dial with one's own name and certificate, and the run and address of another module."""
     thief.mesh.identity = replace(victim.identity, name="thief")
     sock = await _dial(at)
-    secured = await thief.mesh._secure_dialled(sock)
-    thief.mesh._open(sock, ConnectionRole.DIALLER, ("127.0.0.1", at.port), at.identity.guid, lane, secured=secured)
+    secured = await thief.mesh._secure(sock)
+    thief.mesh._open(sock, ("127.0.0.1", at.port), expected=at.identity.guid, lane=lane, secured=secured)
 
 
 async def test_a_test_of_reachability_is_no_failure(lab: Authority) -> None:

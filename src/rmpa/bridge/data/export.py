@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.outbox import QueuedMessage
-    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.runtime.tls import Buffer
 
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX

@@ -32,7 +32,8 @@ from rmpa.runtime.loop import yield_to_data
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Origin
-    from rmpa.mesh.io.link import LaneSender, PeerLink
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.runtime.tls import Buffer
 

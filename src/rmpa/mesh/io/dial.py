@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import errno
 import fcntl
-import logging
 import os
 import socket
 import struct
@@ -19,13 +18,11 @@ from rmpa.mesh.frames import Lane
 from rmpa.runtime.accept import DESCRIPTORS, Use
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Sequence
+    from collections.abc import Sequence
 
     from rmpa.config.settings import LaneSettings
     from rmpa.core.counters import Counters
-    from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.io.securing import SecuredSocket
-    from rmpa.mesh.keepalive import SocketAddress
+    from rmpa.mesh.peering import SocketAddress
 
 
 # Options and kernel statistics of the connections' sockets.
@@ -180,53 +177,30 @@ class Dialler:
             raise
         return sock
 
-    async def dial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
-        """Connect for the express lane where a peer answers first; raises as ``_race``."""
-        return await self._race(endpoints, self._connect_repeatedly)
-
-    async def redial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
-        """The same with one short attempt at each endpoint, for a peer that was linked until now."""
-        return await self._race(endpoints, self._connect_briefly)
-
-    def close(self) -> list[asyncio.Task[socket.socket]]:
-        """Cancel all attempts; return them, to be awaited."""
-        for task in self._attempts:
-            task.cancel()
-        return list(self._attempts)
-
-    async def _connect_briefly(self, endpoint: SocketAddress) -> socket.socket:
-        return await self.connect(endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
-
-    async def _connect_repeatedly(self, endpoint: SocketAddress) -> socket.socket:
-        """Connect; a lost SYN is repeated by new attempts, because TCP waits a second."""
-        *short, last = limits.DIAL_ATTEMPTS
-        for within in short:
-            with contextlib.suppress(TimeoutError):
-                return await self.connect(endpoint, Lane.EXPRESS, within)
-        return await self.connect(endpoint, Lane.EXPRESS, last)
-
-    async def _race(
-        self,
-        endpoints: Sequence[SocketAddress],
-        attempt: Callable[[SocketAddress], Coroutine[object, object, socket.socket]],
+    async def dial(
+        self, endpoints: Sequence[SocketAddress], *, briefly: bool = False
     ) -> tuple[socket.socket, SocketAddress]:
-        """Connect to the endpoint that answers first (RFC 8305).
+        """Connect for the express lane where a peer answers first (RFC 8305).
 
         The next endpoint has its turn when the one before it failed, or was silent for ``limits.DIAL_STAGGER``.
+
+        Args:
+            endpoints: Best first.
+            briefly: One short attempt at each, for a peer that was linked until now.
 
         Raises:
             OSError: No endpoint answers; the error is the one that came first.
         """
         left = list(endpoints)
         if len(left) == 1:
-            return await attempt(left[0]), left[0]
+            return await self._attempt(left[0], briefly=briefly), left[0]
         running: dict[asyncio.Task[socket.socket], SocketAddress] = {}
         first: OSError | None = None
         try:
             while left or running:
                 if left:
                     endpoint = left.pop(0)
-                    task = asyncio.get_running_loop().create_task(attempt(endpoint))
+                    task = asyncio.get_running_loop().create_task(self._attempt(endpoint, briefly=briefly))
                     running[task] = endpoint
                     self._attempts.add(task)
                     task.add_done_callback(self._attempts.discard)
@@ -244,92 +218,22 @@ class Dialler:
                 task.cancel()
         raise first if first is not None else OSError(errno.EHOSTUNREACH, os.strerror(errno.EHOSTUNREACH))
 
+    async def _attempt(self, endpoint: SocketAddress, *, briefly: bool) -> socket.socket:
+        """Connect; a lost SYN is repeated by new attempts, because TCP waits a second."""
+        *short, last = (limits.REDIAL_TIMEOUT,) if briefly else limits.DIAL_ATTEMPTS
+        for within in short:
+            with contextlib.suppress(TimeoutError):
+                return await self.connect(endpoint, Lane.EXPRESS, within)
+        return await self.connect(endpoint, Lane.EXPRESS, last)
+
+    def close(self) -> list[asyncio.Task[socket.socket]]:
+        """Cancel all attempts; return them, to be awaited."""
+        for task in self._attempts:
+            task.cancel()
+        return list(self._attempts)
+
 
 def _close_late(task: asyncio.Task[socket.socket]) -> None:
     """Close the socket of an attempt that succeeded although another one was faster."""
     if not task.cancelled() and task.exception() is None:
         task.result().close()
-
-
-# Replaces silent links by new connections to their peers, because TCP retransmits more and more rarely.
-
-
-_log = logging.getLogger(__name__)
-
-
-class Redials:
-    """One attempt for each silent link, repeated until the peer answers on either connection.
-
-    Args:
-        dialler: Opens the connections.
-        start: ``(work, name)``: begins a task that is not awaited.
-        alive: Whether bytes were received on a link lately.
-        endpoints: Where the peer of a link may be reached.
-        secure: Does the TLS handshake of a dialled connection in a secured mesh.
-        opened: ``(link, sock, endpoint, secured)``: a new connection to the peer of a link.
-    """
-
-    def __init__(
-        self,
-        dialler: Dialler,
-        *,
-        start: Callable[[Coroutine[object, object, None], str], asyncio.Task[None]],
-        alive: Callable[[int], bool],
-        endpoints: Callable[[PeerLink], list[SocketAddress]],
-        secure: Callable[[socket.socket], Awaitable[SecuredSocket | None]],
-        opened: Callable[[PeerLink, socket.socket, SocketAddress, SecuredSocket | None], None],
-    ) -> None:
-        self._dialler = dialler
-        self._start = start
-        self._alive = alive
-        self._endpoints = endpoints
-        self._secure = secure
-        self._opened = opened
-        self._tasks: dict[int, asyncio.Task[None]] = {}
-
-    def begin(self, link: PeerLink) -> None:
-        """Try to reach the peer of a silent link by a new connection, unless that is done already."""
-        if link.id not in self._tasks:
-            self._tasks[link.id] = task = self._start(self._redial(link), f"redial {link.name}")
-            task.add_done_callback(lambda _: self._tasks.pop(link.id, None))
-
-    def close(self) -> list[asyncio.Task[None]]:
-        """Cancel all attempts; return their tasks."""
-        tasks = list(self._tasks.values())
-        for task in tasks:
-            task.cancel()
-        return tasks
-
-    async def _redial(self, link: PeerLink) -> None:
-        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
-        while link.used and not self._alive(link.id):
-            try:
-                sock, endpoint = await self._dialler.redial(self._endpoints(link))
-            except OSError as error:
-                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-                continue
-            if is_over(link):
-                # The link and its socket ended meanwhile: the peering machine decides on the next dial.
-                sock.close()
-                return
-            if self._alive(link.id) or not unacknowledged(link.connection.sock):
-                _log.debug("= %s: silent, but not for want of a way to it", link.name)
-                sock.close()
-                return
-            try:
-                secured = await self._secure(sock)
-            except OSError as error:
-                _log.debug("! %s: silent, and no TLS handshake: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-                continue
-            if is_over(link):
-                sock.close()
-                return
-            self._opened(link, sock, endpoint, secured)
-            return
-
-
-def is_over(link: PeerLink) -> bool:
-    """Whether a link was replaced or has ended; to be checked after an ``await``."""
-    return not link.used

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import RefusalLog
     from rmpa.core.identity import Identity
     from rmpa.mesh.frames import Hello
-    from rmpa.mesh.keepalive import SocketAddress
+    from rmpa.mesh.peering import SocketAddress
     from rmpa.runtime.loop import SystemClock
     from rmpa.trust.membership import Membership
 
