@@ -7,13 +7,13 @@ from typing import Any, cast
 
 import pytest
 
-from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, reply_of, unmet_by_trust
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, read_reply, reply_of, unmet_by_rules
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
+from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.trust.permissions import Permissions
 
-AWAY, NEAR = (cast("Any", SimpleNamespace(same_machine=near)) for near in (False, True))
 GRANT = Grant(45225, "/talker", "/talker/get_loggers")
 
 
@@ -81,12 +81,17 @@ def test_only_passing_conditions_are_tried_again_by_time() -> None:
     }
 
 
+def by_trust(gate: PermissionGate, *, same_machine: bool) -> Unmet | None:
+    shared = cast("Any", SimpleNamespace(context=SimpleNamespace(gate=gate)))
+    peer = cast("Any", SimpleNamespace(same_machine=same_machine))
+    return unmet_by_rules(Contract(transport=Transport.AUTO), shared, peer, "this module", "there", "", None)
+
+
 def test_a_secured_mesh_relays_between_machines_unless_the_user_allows_plain_connections() -> None:
     secured = PermissionGate(Permissions(TrustSettings()))
-    unmet = unmet_by_trust(secured, "this module", AWAY)
+    unmet = by_trust(secured, same_machine=False)
     assert unmet is not None
     assert (unmet.condition, unmet.lasting) == (Condition.TRUST, True)
-    assert unmet_by_trust(secured, "this module", NEAR) is None
-    allowed = PermissionGate(Permissions(TrustSettings(direct=True)))
-    assert unmet_by_trust(allowed, "this module", AWAY) is None
-    assert unmet_by_trust(PermissionGate(), "this module", AWAY) is None
+    assert by_trust(secured, same_machine=True) is None
+    assert by_trust(PermissionGate(Permissions(TrustSettings(direct=True))), same_machine=False) is None
+    assert by_trust(PermissionGate(), same_machine=False) is None

@@ -19,7 +19,8 @@ from rmpa.core.contract import Contract, Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from rmpa.bridge.policy import PermissionGate
+    from rmpa.bridge.context import Shared
+    from rmpa.bridge.messages import Origin
     from rmpa.bridge.sessions import PeerSession
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
@@ -104,20 +105,6 @@ class Grant(NamedTuple):
     probe: str = ""
 
 
-def unmet_by_trust(gate: PermissionGate, where: str, session: PeerSession) -> Unmet | None:
-    """The condition that a secured mesh does not meet, if any.
-
-    Args:
-        gate: Whether the mesh is secured, and whether plain connections are let all the same.
-        where: Whose setting that is, as text.
-        session: The peer: on one machine a connection does not leave it.
-    """
-    if gate.plain or session.same_machine:
-        return None
-    text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
-    return Unmet(Condition.TRUST, text)
-
-
 def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
     """The condition that a contract does not meet, if any.
 
@@ -129,6 +116,30 @@ def unmet_by_contract(contract: Contract, where: str) -> Unmet | None:
         return Unmet(Condition.TRANSPORT, f'transport is "relay" in {where}')
     terms = needs_agents(contract)
     return Unmet(Condition.CONTRACT, f"the contract asks for what only agents do: {terms}") if terms else None
+
+
+def unmet_by_rules(
+    contract: Contract, shared: Shared, peer: PeerSession, where: str, owner: str, other: str, origin: Origin | None
+) -> Unmet | None:
+    """The condition that is not met by what both sides of topics and services judge alike, if any.
+
+    Args:
+        contract: That of the side that judges; of a service the transport alone.
+        shared: Whether the mesh is secured, and whether plain connections are let all the same.
+        peer: The peer: on one machine a connection does not leave it.
+        where: Whose rules these are, as text.
+        owner: The owner's module, as text.
+        other: The name that the topic or service has there, if it is another one here; else empty.
+        origin: The module that a relayed one belongs to.
+    """
+    if (unmet := unmet_by_contract(contract, where)) is not None:
+        return unmet
+    if not (shared.context.gate.plain or peer.same_machine):
+        text = f"the mesh is secured, and nothing would protect the connection; trust.direct is false in {where}"
+        return Unmet(Condition.TRUST, text)
+    if origin is not None:
+        return Unmet(Condition.OWN_SOURCE, f"it is {origin.name}'s, and comes by a relay")
+    return Unmet(Condition.NAME, f"it is {other} in {owner}") if other else None
 
 
 # --- messages ------------------------------------------------------------------------------------------------------

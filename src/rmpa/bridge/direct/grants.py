@@ -24,15 +24,14 @@ from rmpa.bridge.direct.conditions import (
     interrupted,
     read_ask,
     reply_of,
-    unmet_by_contract,
-    unmet_by_trust,
+    unmet_by_rules,
 )
 from rmpa.bridge.direct.nodes import NodePorts, end_all, grant_at
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.config.peer_rules import Access
-from rmpa.core.contract import Transport, combine
+from rmpa.core.contract import Contract, Transport, combine
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -329,21 +328,17 @@ class TopicGrants(Grants):
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         if asked.contract is None or not asked.user:
             raise RemoteProtocolError("direct transport: a topic is asked for without a subscriber or its contract")
-        source, where = Source(asked.name, asked.node), "the publisher's module"
-        local = self._exports.local(session.peer, source)
+        source = Source(asked.name, asked.node)
+        local, where = self._exports.local(session.peer, source), "the publisher's module"
         if local is None:
             return Unmet(Condition.OFFERED, f"{source} is not offered")
-        if local != source:
-            return Unmet(Condition.NAME, f"it is {local.topic} in the publisher's module")
-        offered = self._exports.offered[source]
-        if offered.origin is not None:
-            return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
-        if compares_names(offered.type):
-            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
-        contract = combine(self._shared.context.contracts.of(source.topic, offered.type), asked.contract)
-        unmet = unmet_by_contract(contract, where) or unmet_by_trust(self._shared.context.gate, where, session)
+        offered, other = self._exports.offered[local], local.topic if local != source else ""
+        contract = combine(self._shared.context.contracts.of(local.topic, offered.type), asked.contract)
+        unmet = unmet_by_rules(contract, self._shared, session, where, where, other, offered.origin)
         if unmet is not None:
             return unmet
+        if compares_names(offered.type):
+            return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {offered.type}")
         if not self._uri(asked.want):
             return Unmet(Condition.NODE, f"{source.node} has just left")
         if asked.user in self._shared.core.subscribers(source.topic):
@@ -402,12 +397,8 @@ class ServiceGrants(Grants):
             self._servers[service] = server
         if local is None or server is None:
             return Unmet(Condition.OFFERED, f"{service} is not offered")
-        if local != service:
-            return Unmet(Condition.NAME, f"it is {local} in the server's module")
-        if server.origin is not None:
-            return Unmet(Condition.OWN_SOURCE, "it comes by a relay")
         if server.node != asked.node:
             return Unmet(Condition.OFFERED, f"{server.node} provides {service} now")
-        if self._shared.context.services.transport(service) is Transport.RELAY:
-            return Unmet(Condition.TRANSPORT, 'transport is "relay" in the server\'s module')
-        return unmet_by_trust(self._shared.context.gate, "the server's module", session)
+        where, other = "the server's module", local if local != service else ""
+        contract = Contract(transport=self._shared.context.services.transport(service))
+        return unmet_by_rules(contract, self._shared, session, where, where, other, server.origin)

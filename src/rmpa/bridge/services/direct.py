@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.direct.conditions import NO_LINK, Condition, Grant, Unmet, Want, unmet_by_trust
+from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want, unmet_by_contract, unmet_by_rules
 from rmpa.bridge.direct.nodes import end_all
 from rmpa.bridge.direct.paths import Path, Paths
 from rmpa.bridge.policy import Needs
@@ -131,7 +131,10 @@ class ServicePaths(Paths):
         if remote is None:
             return None
         path = self.get(peer, Want(service, remote.node))
-        return path.unmet if path is not None else self._unmet_here(peer, service, remote)
+        if path is not None:
+            return path.unmet
+        contract = Contract(transport=self._shared.context.services.transport(service))
+        return unmet_by_contract(contract, "this module")  # nothing is kept of what is relayed by rule
 
     # --- the local graph -----------------------------------------------------------------------------------------
 
@@ -149,7 +152,7 @@ class ServicePaths(Paths):
             ):
                 self.forget(path)  # nothing is kept of services that are relayed by rule
         if wanted is not Transport.RELAY:
-            self.judge(session, want, Contract(transport=wanted), self._unmet_here(peer, service, remote))
+            self.judge(session, want, Contract(transport=wanted), self._unmet_here(session, remote))
 
     def hidden(self, peer: int, service: str, node: str, *, end: bool = False) -> None:
         """Forget a service that leaves the local graph; clients keep the connections that they have.
@@ -179,21 +182,18 @@ class ServicePaths(Paths):
         if path is not None and path.here is None:
             self.update(path)
 
-    def _unmet_here(self, peer: int, service: str, remote: RemoteService) -> Unmet | None:
-        rules = self._shared.context.services
-        if rules.transport(service) is Transport.RELAY:
-            return Unmet(Condition.TRANSPORT, 'transport is "relay" in this module')
+    def _unmet_here(self, session: PeerSession, remote: RemoteService) -> Unmet | None:
+        rules, service, owner = self._shared.context.services, remote.name, "the server's module"
+        contract, other = Contract(transport=rules.transport(service)), remote.wire if remote.wire != service else ""
+        unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, remote.origin)
+        if unmet is not None:
+            return unmet
         if not self._able:
             return Unmet(Condition.CORE, "this module uses a roscore, which answers all nodes alike")
         if rules.has_timeout(service):
             text = f"its timeout of {rules.timeout(service):g} s is kept by agents: a direct call has none"
             return Unmet(Condition.CONTRACT, text)
-        if remote.origin is not None:
-            return Unmet(Condition.OWN_SOURCE, f"it is {remote.origin.name}'s, and comes by a relay")
-        if remote.wire != service:
-            return Unmet(Condition.NAME, f"it is {remote.wire} in the server's module")
-        session = self._shared.sessions.get(peer)
-        return unmet_by_trust(self._shared.context.gate, "this module", session) if session is not None else NO_LINK
+        return None
 
     # --- links ---------------------------------------------------------------------------------------------------
 

@@ -19,8 +19,7 @@ from rmpa.bridge.direct.conditions import (
     Unmet,
     Want,
     interrupted,
-    unmet_by_contract,
-    unmet_by_trust,
+    unmet_by_rules,
 )
 from rmpa.bridge.direct.nodes import bus_links, end_links, forgotten, kernel_tells, publisher_update, standing
 from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
@@ -121,28 +120,22 @@ class TopicPaths(Paths):
         session, entry = self._shared.sessions.get(peer), self._imports.get(peer, source)
         if session is None or entry is None or not entry.shown or is_own(node):
             return
-        want, contract = (
-            Want(source.topic, source.node, node),
-            self._shared.context.contracts.of(entry.topic, entry.type),
-        )
+        want = Want(source.topic, source.node, node)
+        contract = self._shared.context.contracts.of(entry.topic, entry.type)
         is_known = self.get(peer, want) is not None
         if contract.transport is Transport.RELAY and not is_known:
             return  # nothing is kept of topics that are relayed by rule
-        path = self.judge(session, want, contract, self._unmet_here(session, source, entry, node, uri))
+        path = self.judge(session, want, contract, self._unmet_here(session, want, entry, contract, uri))
         if not is_known and self._is_relayed(path):
             path.place = AGENTS  # until now it was relayed by rule
 
     def _unmet_here(
-        self, session: PeerSession, source: Source, entry: RemoteTopic, node: str, uri: str
+        self, session: PeerSession, want: Want, entry: RemoteTopic, contract: Contract, uri: str
     ) -> Unmet | None:
-        unmet = unmet_by_contract(self._shared.context.contracts.of(entry.topic, entry.type), "this module")
-        unmet = unmet or unmet_by_trust(self._shared.context.gate, "this module", session)
+        node, owner, other = want.user, "the publisher's module", want.name if want.name != entry.topic else ""
+        unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, entry.origin)
         if unmet is not None:
             return unmet
-        if entry.origin is not None:
-            return Unmet(Condition.OWN_SOURCE, f"it is {entry.origin.name}'s, and comes by a relay")
-        if entry.topic != source.topic:
-            return Unmet(Condition.NAME, f"it is {source.topic} in the publisher's module")
         if compares_names(entry.type):
             return Unmet(Condition.ACTION, f"actions compare the names of the nodes at {entry.type}")
         if node.startswith(MEASURING):
