@@ -144,15 +144,10 @@ class ServicePaths(Paths):
         if remote is None or not remote.shown or session is None:
             return
         want, wanted = Want(service, remote.node), self._shared.context.services.transport(service)
-        for path in self:
-            if (
-                path.session is session
-                and path.want.name == service
-                and (path.want != want or wanted is Transport.RELAY)
-            ):
-                self.forget(path)  # nothing is kept of services that are relayed by rule
         if wanted is not Transport.RELAY:
             self.judge(session, want, Contract(transport=wanted), self._unmet_here(session, remote))
+        elif (path := self.get(peer, want)) is not None:
+            self.forget(path)  # nothing is kept of services that are relayed by rule
 
     def hidden(self, peer: int, service: str, node: str, *, end: bool = False) -> None:
         """Forget a service that leaves the local graph; clients keep the connections that they have.
