@@ -462,7 +462,9 @@ class ParamOwner:
             try:
                 found, value = await self._core.get(key)
                 if found:
-                    why = self._why_denied(asker, key, value) or self._why_not_get(key, value)
+                    # What is followed by itself was judged above: the time is shared whatever may be read.
+                    hidden = self._why_not_get(key, value) if isinstance(value, dict) else ""
+                    why = self._why_denied(asker, key, value) or hidden
                     text = None if why else await write_text(key, value)
             except RmpaError as error:  # the core does not answer, or the value is too large to cross
                 _log.warning("! peers are not told of %s: %s", key, error)

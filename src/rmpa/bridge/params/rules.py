@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
@@ -30,19 +31,17 @@ def replaced(names: Iterable[str], at: str, present: XmlRpcValue) -> Iterator[st
         at: The name of the present value, a namespace around them all.
         present: The value; empty if there is none.
     """
-    for name in names:
-        where, value = at, present
-        for part in filter(None, name[len(at) :].split("/")):
-            if not isinstance(value, dict):
-                yield where
-                break
-            where = f"{where.rstrip('/')}/{part}"
-            if part not in value:
-                break
-            value = value[part]
-        else:
-            if isinstance(value, dict):
-                yield from (lost for lost, _ in leaves(name, value))
+    given = set(names)
+    around = set(chain.from_iterable(map(_namespaces, given)))
+    for name, _ in leaves(at, present):
+        if name in around or not given.isdisjoint(_namespaces(name)):
+            yield name
+
+
+def _namespaces(name: str) -> list[str]:
+    """The namespaces around a parameter, without the root."""
+    parts = name.split("/")
+    return ["/".join(parts[:length]) for length in range(2, len(parts))]
 
 
 def key_problem(key: object) -> str:

@@ -512,6 +512,15 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     assert base.params.owner.followed == {"/arm"}
 
 
+async def test_time_is_followed_although_nothing_may_be_read(sides: Any) -> None:
+    simulator = Side("sim", ParamSettings(remote_get=()), TimeSettings(share=True))
+    pad = Side("pad", time=TimeSettings(follow="sim"))
+    sides(simulator, pad)
+    simulator.core.set("/use_sim_time", True)
+    join(simulator, pad)
+    await until(lambda: pad.core.get("/use_sim_time") is True)
+
+
 @pytest.mark.parametrize("before", [None, False])
 async def test_time_that_is_no_longer_followed_is_as_it_was(sides: Any, before: bool | None) -> None:
     simulator, pad = Side("sim", time=TimeSettings(share=True)), Side("pad", time=TimeSettings(follow="sim"))
