@@ -252,10 +252,13 @@ class TopicPaths(Paths):
             self._shared.counters.add("direct.hung_up")
             self._spawn(self._leave(path), f"hang up {path.want.user}")
 
-    async def _leave(self, path: Path) -> None:
-        proxy = path.session.proxies.get(path.want.node)
+    async def _leave(self, path: Path) -> tuple[str, int] | None:
+        """Make a subscriber leave all of its connections to a node; return a direct one that stays."""
+        proxy, publication = path.session.proxies.get(path.want.node), self._publication(path)
         await self._list(path, without=proxy.uri if proxy is not None else "")
-        await self._end_direct(path)
+        if publication is not None:
+            publication.hang_up(path.want.user)
+        return await self._end_direct(path)
 
     # --- carrying out -----------------------------------------------------------------------------------------------
 
@@ -297,13 +300,10 @@ class TopicPaths(Paths):
 
     async def _renew(self, path: Path) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
-        uri, publication, proxy = self._uri(path), self._publication(path), path.session.proxies.get(path.want.node)
-        if not uri or proxy is None or publication is None:
+        uri, proxy = self._uri(path), path.session.proxies.get(path.want.node)
+        if not uri or proxy is None or self._publication(path) is None:
             return False
-        await self._list(path, without=proxy.uri)
-        publication.hang_up(path.want.user)
-        stays = await self._end_direct(path)
-        if stays is not None:
+        if (stays := await self._leave(path)) is not None:
             self._put(path, stays)
             return False
         await forgotten(uri, path.want.name, proxy.uri)
@@ -321,7 +321,7 @@ class TopicPaths(Paths):
             The other end of one that stays: it is ``keep``, its node is stopped, or it cannot be ended (``stuck``).
         """
         uri, topic, proxy = self._uri(path), path.want.name, path.session.proxies.get(path.want.node)
-        address = path.session.address
+        address = (path.endpoint or (path.session.address,))[0]  # the peer may have another one by now
         stand = standing(address) if uri else {}
         if not stand:
             return None

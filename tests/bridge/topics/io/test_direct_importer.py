@@ -79,7 +79,7 @@ class Module:
             proxies=SimpleNamespace(get=lambda _: None),
         )
         self.callers: frozenset[str] = frozenset()
-        publication = SimpleNamespace(callers=self.callers, listeners=())
+        publication = SimpleNamespace(callers=self.callers, listeners=(), hang_up=lambda _: None)
         monkeypatch.setattr(direct_importer, "probe", self._probe)
         monkeypatch.setattr(direct_importer, "standing", lambda *_: {45225: {40_000}} if self.connected else {})
         monkeypatch.setattr(direct_importer, "bus_links", self._bus_links)
@@ -312,3 +312,21 @@ async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_conne
     module.sut.shown(1, SOURCE)
     assert await module.ask() is None
     assert module.connected == []
+
+
+async def test_a_connection_to_an_earlier_address_of_the_peer_ends(
+    module: Module, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def listed(*_: object) -> bool:
+        return True
+
+    monkeypatch.setattr(direct_importer, "publisher_update", listed)
+    monkeypatch.setattr(
+        direct_importer, "standing", lambda address, _=None: {45225: {40_000}} if address == END[0] else {}
+    )
+    module.sut.shown(1, SOURCE)
+    assert await module.ask() == DIRECT
+    module.connected = [LINK]
+    module.session.address = "10.1.0.1"  # its next link came by another network
+    module.sut.hidden(1, SOURCE)
+    await until(lambda: module.connected == [])
