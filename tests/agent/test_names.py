@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.bridge.topics.routes import RemoteTopic
+    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.observe.snapshot import TopicInfo
 
 __all__ = ["settings"]  # the fixture

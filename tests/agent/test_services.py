@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.messages import AdvertiseServices, ServiceOffer
+from rmpa.bridge.messages import ServiceOffer
 from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
     from rmpa.agent.agent import Agent
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
 
 __all__ = ["settings"]
@@ -115,6 +116,11 @@ async def test_a_call_is_counted_on_both_sides(settings: Callable[..., Settings]
     assert provider(b) == ""
 
 
+def offered(agent: Agent, session: PeerSession) -> None:
+    """The peer offers the service again."""
+    agent.services.imports.take_in(session.peer, "/add", ServiceOffer("/add", "/adder"), 0.0)
+
+
 async def test_types_are_told_although_the_offer_came_again_since_the_service_was_opened(
     settings: Callable[..., Settings],
 ) -> None:
@@ -122,10 +128,9 @@ async def test_types_are_told_although_the_offer_came_again_since_the_service_wa
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
         await until(lambda: provider(b))
         (session,) = b.bridge.sessions
-        again = AdvertiseServices(added=(ServiceOffer("/add", "/adder"),))
         for _ in range(2):
             connection = await connect(b)
-            assert b.services.message(session, again)
+            offered(b, session)
             other = await asyncio.wait_for(connect(b), 20.0)
             assert other.description.type == "a/Add"
             assert await other.call(b"1", 20.0) == (True, b"1")
@@ -135,7 +140,7 @@ async def test_types_are_told_although_the_offer_came_again_since_the_service_wa
         server.keeps = True
         asked = asyncio.create_task(connection.call(b"2", 20.0))
         await until(lambda: len(server.calls) == 3)
-        assert b.services.message(session, again)
+        offered(b, session)
         other = await asyncio.wait_for(connect(b), 20.0)
         assert other.description.type == "a/Add"
         server.calls[-1].reply(True, b"kept")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge.offers import CONFLICT
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
@@ -106,7 +107,7 @@ async def test_built_in_rules_and_other_types(settings: Callable[..., Settings])
         assert "time stays home" in text
         await one.advertise("/x", "std_msgs/String")
         await two.advertise("/x", "std_msgs/Bool")
-        await until(lambda: any(entry.conflict for _, _, entry in b.bridge.topics.imports))
+        await until(lambda: any(entry.cause == CONFLICT for _, _, entry in b.bridge.topics.imports))
         stage, text = stopped_at(await ask(b, "/x", "a"))
         assert stage == "type"
         assert "std_msgs/String" in text

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.proxies import Names, PeerNames
+from rmpa.bridge.context import Names, PeerNames
 from rmpa.config.settings import PeerRule, Settings
 
 ROBOT = PeerRule(

@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.actions import (
-    Action,
-    AddRoute,
-    Connect,
-    Describe,
-    Detach,
-    Disconnect,
-    Publish,
-    RemoveRoute,
-    Retract,
-    Send,
-)
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -33,10 +22,22 @@ from rmpa.bridge.messages import (
     encode,
 )
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.routes import RouteState
+from rmpa.bridge.topics.exports import LocalSource
+from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.settings import PolicySettings
+from tests.bridge.recorder import (
+    AddRoute,
+    Connect,
+    Describe,
+    Detach,
+    Disconnect,
+    Exports,
+    Imports,
+    Publish,
+    RemoveRoute,
+    Retract,
+    Send,
+)
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]
 ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
@@ -61,7 +62,7 @@ class World:
         self.act(self.exports.link_up(1))
         self.act(self.imports.link_up(1))
 
-    def act(self, actions: list[Action]) -> None:
+    def act(self, actions: list[Any]) -> None:
         for action in actions:
             match action:
                 case Send(_, Advertise() | RouteOpened() | RouteClosed() as message):

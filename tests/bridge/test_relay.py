@@ -12,16 +12,24 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.context import ServiceRules
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths, may_have
-from rmpa.bridge.services.bodies import ExportAction, ImportAction, LocalService, Provide, Withdraw
-from rmpa.bridge.services.exports import ServiceExports
-from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.services.bodies import LocalService
+from rmpa.bridge.topics.exports import LocalSource
 from rmpa.config.settings import PolicySettings, ServiceSettings
+from tests.bridge.recorder import (
+    Exports,
+    Imports,
+    Provide,
+    Publish,
+    Retract,
+    Send,
+    ServiceExports,
+    ServiceImports,
+    Warn,
+    Withdraw,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -131,7 +139,7 @@ class Map:
             number = module.links[there] = module.numbers
             self.act(here, module.imports.link_up(number, f"m{there}", instance(there), there))
             self.act(here, module.exports.link_up(number, f"m{there}", instance(there)))
-            self.act(here, module.service_imports.link_up(number, f"m{there}", there, instance(there)))
+            self.act(here, module.service_imports.link_up(number, f"m{there}", instance(there), there))
             self.act(here, module.service_exports.link_up(number, f"m{there}", instance(there)))
 
     def unlink(self, one: int, other: int) -> None:
@@ -141,13 +149,13 @@ class Map:
             number = module.links.pop(there)
             self.act(here, module.service_exports.link_down(number))
             self.act(here, module.service_imports.gone(number))
-            self.act(here, module.service_imports.unlinked(number))
             self.act(here, module.exports.link_down(number))
-            self.act(here, list(module.imports.link_down(number)))
             module.relay.peer_gone(number)
-            self.act(here, module.imports.unlinked(number))
+            for key in [key for key in module.shown if key[0] == number]:  # its proxies are closed
+                module.dirty.add(module.shown.pop(key)[0])
+            self.act(here, module.imports.link_down(number) or [Warn("", "", "its proxies are closed")])
 
-    def act(self, here: int, actions: Sequence[Action | ExportAction | ImportAction]) -> None:
+    def act(self, here: int, actions: Sequence[Any]) -> None:
         module = self.modules[here]
         for action in actions:
             match action:

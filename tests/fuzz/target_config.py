@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
+from rmpa.bridge.context import PeerNames
 from rmpa.bridge.messages import OpenRoute, decode, encode
-from rmpa.bridge.proxies import PeerNames
 from rmpa.config import limits
 from rmpa.config.peer_rules import PEER_RULES
 from rmpa.config.read import parse_config

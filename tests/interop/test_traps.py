@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 from lab.bed.processes import eventually
-from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
-from rmpa.bridge.messages import Source
+from rmpa.bridge.messages import RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
+from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import PeerTopics, TopicEvents
-from rmpa.core.contract import Contract
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.core.embedded import RosCore
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
-    from rmpa.bridge.context import Shared
+    from rmpa.bridge.shared import Shared
     from rmpa.mesh.io.link import PeerLink
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
@@ -225,7 +224,7 @@ async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> 
     session = PeerSession(1, cast("PeerLink", SimpleNamespace(routes={})), proxies)
     inbound = PeerTopics(cast("Shared", shared), TopicEvents(), session, {})
     closing.callback(inbound.close)
-    inbound.publish(Publish(1, SOURCE, BYTES))
+    inbound.publish(RemoteTopic(peer=1, wire=SOURCE, name=SOURCE.topic, node=SOURCE.node, type=BYTES))
     await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
     return inbound, listener
 
@@ -234,7 +233,7 @@ def describe(inbound: PeerTopics, route: int, *, latching: bool = False) -> None
     """A route of the source is open."""
     kind = MessageType(BYTES)
     about = About(BYTES, kind.md5sum, kind.definition, latching)
-    inbound.describe(Describe(1, SOURCE, route, about, Contract()))
+    inbound.describe(SOURCE, RouteOpened(route, about))
 
 
 async def heard(

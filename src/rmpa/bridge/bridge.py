@@ -9,13 +9,14 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import BridgeContext, Shared
+from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.messages import decode, op_of
 from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import Needs, PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, guarded
+from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
 from rmpa.config.peer_rules import Access
 from rmpa.core.counters import Counters, RefusalLog

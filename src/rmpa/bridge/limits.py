@@ -39,8 +39,6 @@ when there is room. Further ones come with the peer's next link."""
 ADVERTISED_MAX: Final = 16_384
 """Topics or services in one advertisement of a peer, else it is refused; this module's have at most
 ``ADVERTISED_AT_ONCE``."""
-SHARED_STRINGS: Final = 8192
-"""Names of nodes and types of peers that are remembered to keep each once: 1,000 modules have a few kinds of both."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered, to show them to the user."""
 RELAY_HOPS_MAX: Final = 4

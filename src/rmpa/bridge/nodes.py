@@ -30,10 +30,10 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.service_server import ServiceCall

@@ -1,399 +1,456 @@
-"""What this module offers to its peers, and what each of them has been sent of it. Pure.
+"""What this module offers, what each peer was told of it, and what each peer offers. Pure.
 
-The entries of a catalogue are the topics or services of the local graph that may cross. Changes are gathered for each
-peer and sent a bounded number of entries at a time, so the work depends on the size of a change and not on that of
-the graph.
+Both work by level: the caller notes a fact (what the local graph has, what a peer has said) and has the entry judged,
+again whenever a fact has changed. Work depends on the size of a change, not on that of the graph.
 """
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Warn
+from rmpa.bridge.messages import is_crossing_name
+from rmpa.bridge.policy import Local, PolicyDecision, RelayPaths, may_have
+from rmpa.trust.permissions import PermissionDecision
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
+    from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 
-KeyT = TypeVar("KeyT")
-LocalT = TypeVar("LocalT")
+    from rmpa.bridge.context import BridgeContext
+    from rmpa.bridge.messages import Advertise, AdvertiseServices, Message, Origin
+    from rmpa.config.peer_rules import Access
+
+
+class Effects:
+    """What a part of the bridge does for its books; for subclasses. An effect calls no book back in the same turn."""
+
+    rng: Callable[[], float]
+    """Uniform numbers in [0, 1), for the jitter of a back-off."""
+
+    @property
+    def context(self) -> BridgeContext:
+        """The rules that hold now."""
+        raise NotImplementedError
+
+    def send(self, peer: int, message: Message) -> None:
+        """Send a control message to a peer, if it has a link."""
+
+    def warn(self, kind: str, who: str, text: str) -> None:
+        """Log a warning about ``who`` and count it as ``kind``; repeated ones are only counted."""
+
+    def arm_timer(self) -> None:
+        """Look at ``ImportBook.next_timer`` again."""
+
+
+KeyT = TypeVar("KeyT", bound="Hashable")
+LocalT = TypeVar("LocalT", bound=Local)
 OfferT = TypeVar("OfferT")
-WireT = TypeVar("WireT", bound="Hashable")
 
 
 @dataclass(slots=True)
-class CataloguePeer(Generic[KeyT, LocalT, OfferT, WireT]):
-    """One linked peer, and what it has been sent.
+class Told(Generic[KeyT, LocalT, OfferT]):
+    """One linked peer, and what it was told over this link.
 
     Args:
         name: The peer's name, by which the rules for it are found.
         instance: The peer's run, as 32 hexadecimal digits; nothing that came from this run is relayed back to it.
-        judged: Whether each entry is judged or renamed for this peer. That takes long, so ``portions`` serves only
-            one such peer at a time.
-        news: Keys of the entries to examine for this peer; the entry may have changed (a dict, for its order).
-        told: By key: the offer that the peer was sent, and the local entry that it was made of.
-        by_wire: The keys of ``told``, by name on the wire.
-        behind: By name on the wire: keys of entries that are not sent because an entry in ``by_wire`` has that name.
-        beginning: Whether the peer has not been sent the complete catalogue yet.
-        fresh: Whether the next portion is the first one of a complete catalogue.
+        due: The entries to examine for this peer: they may have changed (a dict, for its order).
+        offers: By key: the offer that the peer was told, and the local entry that it was made of.
+        by_wire: The keys of ``offers``, by name on the wire.
+        behind: By name on the wire: keys of entries that are not told because another entry has that name.
+        begun: Whether the first portion was told.
+        whole: Whether the peer was told everything once.
+        told_at: When the last portion was told, monotonic seconds.
     """
 
     name: str
     instance: str
-    judged: bool
-    news: dict[KeyT, None]
-    told: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
-    by_wire: dict[WireT, KeyT] = field(default_factory=dict)
-    behind: dict[WireT, list[KeyT]] = field(default_factory=dict)
-    beginning: bool = True
-    fresh: bool = True
+    due: dict[KeyT, None]
+    offers: dict[KeyT, tuple[OfferT, LocalT]] = field(default_factory=dict)
+    by_wire: dict[KeyT, KeyT] = field(default_factory=dict)
+    behind: dict[KeyT, list[KeyT]] = field(default_factory=dict)
+    begun: bool = False
+    whole: bool = False
+    told_at: float = -math.inf
 
 
-@dataclass(slots=True)
-class Portion(Generic[KeyT, OfferT, WireT]):
-    """What one peer is to be sent now.
+class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
+    """The entries of the local graph, which of them are offered, and what each linked peer was told of them.
 
-    Args:
-        added: New or changed offers.
-        removed: Names on the wire that are no longer offered.
-        full: Whether the complete catalogue begins with this portion.
-        more: Whether the complete catalogue goes on with the next portion.
-        complete: Whether the complete catalogue ends with this portion.
-        ended: Keys of entries that the peer may no longer have, or now has under another name.
-        taken: Entries that are not sent because another entry has their name on the wire: key, offer, key of the
-            other.
-    """
-
-    added: list[OfferT] = field(default_factory=list)
-    removed: list[WireT] = field(default_factory=list)
-    full: bool = False
-    more: bool = False
-    complete: bool = False
-    ended: list[KeyT] = field(default_factory=list)
-    taken: list[tuple[KeyT, OfferT, KeyT]] = field(default_factory=list)
-
-    @property
-    def is_news(self) -> bool:
-        """Whether there is anything to send."""
-        return bool(self.added or self.removed or self.full or self.complete)
-
-
-class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
-    """The entries that are offered, up to a limit, and the portions in which peers are sent them.
+    Keys are local names; a subclass says what an entry is, whether it may cross, and what its peers are told.
 
     Args:
-        kind: The setting that limits the entries: ``topics`` or ``services``.
-        limit: How many entries are offered.
-        offer: ``(peer, key, local)``: the offer of an entry to this peer; ``None``: the peer may not know of it.
-        wire: ``(offer)``: the offer's name on the wire.
-        renewed: ``(before, now)``: whether a changed entry is sent again although its offer is the same.
+        out: Has the rules (``context``); sends messages and warns.
     """
 
-    def __init__(
-        self,
-        kind: str,
-        limit: int,
-        *,
-        offer: Callable[[CataloguePeer[KeyT, LocalT, OfferT, WireT], KeyT, LocalT], OfferT | None],
-        wire: Callable[[OfferT], WireT],
-        renewed: Callable[[LocalT, LocalT], bool] = lambda _before, _now: False,
-    ) -> None:
-        self._kind = kind
-        self.limit = limit
-        self._offer = offer
-        self._wire = wire
-        self._renewed = renewed
+    kind: ClassVar[str]
+    """The setting that limits the offered entries: ``topics`` or ``services``."""
+    warning: ClassVar[str]
+    """The counter of entries beyond that limit."""
+    access: ClassVar[Access]
+    """What a peer does with an entry."""
+    owner: ClassVar[str]
+    """What provides an entry, for texts."""
+    renews: ClassVar[bool] = False
+    """Whether a changed entry is told again although its offer is the same."""
+
+    def __init__(self, out: Effects) -> None:
+        self._out = out
+        self.seen: dict[KeyT, LocalT] = {}
+        """What the local graph has, whether it crosses or not."""
         self.offered: dict[KeyT, LocalT] = {}
-        """The entries within the limit, by key; which of them a peer is sent is decided by ``offer``."""
-        self._beyond: OrderedDict[KeyT, LocalT] = OrderedDict()
-        self._peers: dict[int, CataloguePeer[KeyT, LocalT, OfferT, WireT]] = {}
-        self._with_news: dict[int, None] = {}
-        """The peers that have, or had when last looked at, entries to examine."""
+        """What peers may have, within the limit; ``judge_for`` decides for each of them."""
+        self.beyond: dict[KeyT, None] = {}
+        """What is offered to no peer because there is more than the limit, the first one first."""
+        self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
+        """The linked peers; the one that has waited longest for its next portion comes first."""
 
-    # --- entries -----------------------------------------------------------------------------------------------
+    # --- what an entry is ----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def judge(self, key: KeyT, local: LocalT) -> PolicyDecision:
+        """Decide whether an entry may cross at all."""
+
+    @abstractmethod
+    def name_of(self, key: KeyT) -> str:
+        """The topic or service, which rules are about."""
+
+    @abstractmethod
+    def offer_for(self, key: KeyT, local: LocalT, wire: str) -> OfferT:
+        """The offer of an entry under a name on the wire."""
+
+    @abstractmethod
+    def wire_of(self, offer: OfferT) -> KeyT:
+        """How peers name the entry of an offer."""
+
+    @abstractmethod
+    def _message(self, added: tuple[OfferT, ...], removed: tuple[KeyT, ...], full: bool, more: bool) -> Message:
+        """The message to a peer with a portion of the entries."""
+
+    @abstractmethod
+    def _ended(self, key: KeyT, reason: str) -> None:
+        """End what uses an entry: it is not offered any more, or another one has its place."""
+
+    def _ended_for(self, peer: int, key: KeyT) -> None:
+        """End what one peer uses of an entry: it may not have it any more, or has it under another name now."""
+
+    def judge_for(
+        self, told: Told[KeyT, LocalT, OfferT], key: KeyT, local: LocalT
+    ) -> PolicyDecision | PermissionDecision:
+        """Decide whether an entry that may cross may cross to one peer."""
+        context, origin = self._out.context, local.origin
+        if origin is not None and not may_have(told.instance, origin):
+            return PolicyDecision(False, f"it comes from {told.name}")
+        name = self.name_of(key)
+        wire = context.names.wire_name(told.name, name)
+        if not is_crossing_name(wire):
+            return PolicyDecision(False, f"its name there would be {wire!r}")
+        decision = context.policy.judge_for(told.name, name, local.type, wire)
+        permission = context.gate.judge(self.access, told.name, name)
+        return decision if permission.allowed or not decision.allowed else permission
+
+    def _offer(self, told: Told[KeyT, LocalT, OfferT], key: KeyT) -> OfferT | None:
+        """The offer of an entry for one peer; ``None`` if the peer may not know of it."""
+        local, context, name = self.offered.get(key), self._out.context, self.name_of(key)
+        if local is None:
+            return None
+        decision = self.judge_for(told, key, local)
+        if decision.allowed:
+            return self.offer_for(key, local, context.names.wire_name(told.name, name))
+        if isinstance(decision, PermissionDecision):
+            context.gate.refused(self.access, told.name, name, decision)
+        return None
 
     @property
-    def beyond(self) -> int:
-        """The count of entries that are offered to no peer because there are more than the limit."""
-        return len(self._beyond)
+    def limit(self) -> int:
+        """How many entries are offered."""
+        most = self._out.context.settings.limits
+        return most.topics if self.kind == "topics" else most.services
 
-    def is_beyond(self, key: KeyT) -> bool:
-        """Whether an entry is offered to no peer because the limit is reached."""
-        return key in self._beyond
+    # --- entries -------------------------------------------------------------------------------------------------
 
-    def put(self, key: KeyT, local: LocalT) -> bool:
-        """Offer an entry, or a changed one; return whether there was room for it.
+    def put(self, key: KeyT, local: LocalT | None) -> None:
+        """Set what the local graph has under a key; ``None``: nothing. ``advertise`` tells peers what changes."""
+        if self.seen.get(key) == local:
+            return
+        if local is None:
+            del self.seen[key]
+        else:
+            self.seen[key] = local
+        self.follow(key)
 
-        Without room the entry waits until ``next_beyond`` returns it. Peers are not notified: call ``note``.
-        """
-        if key not in self.offered and len(self.offered) >= self.limit:
-            self._beyond[key] = local
-            return False
-        self._beyond.pop(key, None)
-        self.offered[key] = local
-        return True
+    def follow(self, key: KeyT) -> None:
+        """Offer an entry, or keep it home, by the facts of now; call it again whenever one has changed."""
+        local, before = self.seen.get(key), self.offered.get(key)
+        if local is None or not self.judge(key, local).allowed:
+            self.beyond.pop(key, None)
+            if before is not None:
+                del self.offered[key]
+                self.note(key)
+                self._ended(key, f"{self.owner} has gone" if local is None else "a rule keeps it home now")
+                if self.beyond and len(self.offered) < self.limit:
+                    self.follow(next(iter(self.beyond)))
+        elif local != before:
+            if before is None and len(self.offered) >= self.limit:
+                self.beyond[key] = None
+                text = f"this module has more {self.kind} than limits.{self.kind} = {self.limit}; the rest is "
+                text += "offered to no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
+                self._out.warn(self.warning, "local", text)
+                return
+            self.beyond.pop(key, None)
+            self.offered[key] = local
+            self.note(key)
+            if before is not None:
+                self._ended(key, f"{self.owner} has restarted")
 
-    def warning(self, what: str) -> Warn:
-        """The warning to the user that there was no room for an entry.
+    def note(self, key: KeyT) -> None:
+        """Have an entry examined for every peer."""
+        for told in self.peers.values():
+            told.due[key] = None
 
-        Args:
-            what: The name of the counter.
-        """
-        text = (
-            f"this module has more {self._kind} than limits.{self._kind} = {self.limit}; the rest is offered to no "
-            "peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
-        )
-        return Warn(what, "local", text)
+    def reload(self) -> Iterator[None]:
+        """Judge by new rules, an entry with each item; then peers are told what has changed for them."""
+        for key in tuple(self.seen):
+            self.follow(key)
+            yield
+        for told in self.peers.values():
+            told.due |= dict.fromkeys(self.offered)
 
-    def remove(self, key: KeyT) -> bool:
-        """Offer an entry no more; return whether it was within the limit."""
-        self._beyond.pop(key, None)
-        return self.offered.pop(key, None) is not None
+    # --- peers ---------------------------------------------------------------------------------------------------
 
-    def next_beyond(self) -> tuple[KeyT, LocalT] | None:
-        """Take the entry beyond the limit that has waited longest; it waits no longer.
-
-        Returns:
-            Its key and value; ``None`` if none waits, or there is no room.
-        """
-        return self._beyond.popitem(last=False) if self._beyond and len(self.offered) < self.limit else None
-
-    # --- peers -------------------------------------------------------------------------------------------------
-
-    def link_up(self, peer: int, name: str, instance: str, *, judged: bool) -> Portion[KeyT, OfferT, WireT]:
-        """Add a linked peer; return the first portion of the complete catalogue. ``portions`` yields the rest.
+    def link_up(self, peer: int, name: str = "", instance: str = "") -> None:
+        """Begin to tell a peer everything; ``advertise`` goes on with it.
 
         Args:
             peer: The peer's number.
-            name: The peer's name.
-            instance: The peer's run, as 32 hexadecimal digits.
-            judged: Whether each entry is judged or renamed for this peer.
+            name: The peer's name, which selects the rules for it.
+            instance: The peer's run, as 32 hexadecimal digits; what came from it is not offered to it.
         """
-        self._peers[peer] = CataloguePeer(name, instance, judged, dict.fromkeys(self.offered))
-        self._with_news[peer] = None
-        return self._portion(self._peers[peer])
+        self.peers[peer] = Told(name, instance, dict.fromkeys(self.offered))
+        self._portion(peer, self.peers[peer])
 
     def link_down(self, peer: int) -> None:
-        """Forget a peer and what it has been sent."""
-        self._peers.pop(peer, None)
-        self._with_news.pop(peer, None)
+        """Forget what a peer was told."""
+        self.peers.pop(peer, None)
 
-    def peer(self, peer: int) -> CataloguePeer[KeyT, LocalT, OfferT, WireT] | None:
-        """The state of a linked peer; ``None`` if it is not linked."""
-        return self._peers.get(peer)
+    def offer(self, peer: int, key: KeyT) -> OfferT | None:
+        """The offer that a peer was told last of an entry; ``None`` if it does not know the entry."""
+        told = self.peers.get(peer)
+        return told.offers[key][0] if told is not None and key in told.offers else None
 
-    def peers(self) -> Iterator[CataloguePeer[KeyT, LocalT, OfferT, WireT]]:
-        """The linked peers."""
-        return iter(self._peers.values())
+    def local(self, peer: int, wire: KeyT) -> KeyT | None:
+        """The entry that a peer means by a name on the wire; ``None`` if none is offered to it by that name."""
+        told = self.peers.get(peer)
+        if told is None:
+            return None
+        key = told.by_wire.get(wire, wire)  # one that it has not been told yet may be on its way
+        local = self.offered.get(key)
+        # Judged anew: after new rules the peer is told a little later.
+        if local is None or not self.judge_for(told, key, local).allowed:
+            return None
+        name = self._out.context.names.wire_name(told.name, self.name_of(key))
+        return key if self.wire_of(self.offer_for(key, local, name)) == wire else None
 
-    def told(self, peer: int, key: KeyT) -> OfferT | None:
-        """The offer that a peer was last sent of an entry; ``None`` if it does not know the entry."""
-        known = self._peers.get(peer)
-        return known.told[key][0] if known is not None and key in known.told else None
-
-    def note(self, key: KeyT) -> None:
-        """Have an entry examined for every peer: it was put, changed or removed."""
-        for number, known in self._peers.items():
-            known.news.setdefault(key)
-            self._with_news[number] = None
-
-    def note_all(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> None:
-        """Have all entries examined for one peer: its rules have changed."""
-        known.news.update(dict.fromkeys(self.offered))
-        self._with_news = dict.fromkeys(self._peers)
+    def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
+        """Whether an entry may cross to a peer, and the rule that decides; ``None``: the graph has no such entry."""
+        local, told = self.seen.get(key), self.peers.get(peer)
+        if local is None:
+            return None
+        decision = self.judge(key, local)
+        if not decision.allowed or told is None:
+            return decision
+        special = self.judge_for(told, key, local)
+        return special if special.rule or not special.allowed else decision
 
     @property
     def pending(self) -> bool:
-        """Whether entries are to be examined for any peer; ``portions`` does it."""
-        return any(self._peers[number].news for number in self._with_news)
+        """Whether a peer was not told everything yet; ``advertise`` does it."""
+        return any(told.due for told in self.peers.values())
 
-    def portions(self, ready: Callable[[int], bool]) -> Iterator[tuple[int, Portion[KeyT, OfferT, WireT]]]:
-        """Yield the number and next portion of each peer with entries to examine that is ready.
+    def advertise(self, now: float = 0.0, busy: Callable[[int], bool] = lambda _: False) -> Iterator[int]:
+        """Tell peers the next portions, one peer with each item, until ``limits.ADVERTISED_AT_ONCE`` are examined.
 
-        Of the peers for which each entry is judged only one is served in a call, in turn, so that the event loop does
-        not wait for all of them.
+        Commands share the lane with advertisements, and must not wait until a whole catalogue was sent. So a portion
+        waits while the lane is busy, but no longer than ``limits.TELL_PATIENCE`` after the one before.
 
         Args:
-            ready: ``(peer)``: whether a portion may be sent to this peer now.
+            now: Monotonic seconds.
+            busy: ``(peer)``: whether a portion would have to wait on the peer's lane.
         """
-        judged = False
-        for number in list(self._with_news):
-            known = self._peers.get(number)
-            if known is None or not known.news:
-                self._with_news.pop(number, None)
+        left = limits.ADVERTISED_AT_ONCE
+        for peer, told in tuple(self.peers.items()):
+            if not told.due or self.peers.get(peer) is not told:
                 continue
-            if (known.judged and judged) or not ready(number):
+            if now < told.told_at + limits.TELL_PATIENCE and busy(peer):
                 continue
-            if known.judged:
-                judged = True
-                del self._with_news[number]
-                self._with_news[number] = None
-            yield number, self._portion(known)
+            if left <= 0:
+                return
+            left -= len(told.due)
+            told.told_at = now
+            self.peers[peer] = self.peers.pop(peer)
+            self._portion(peer, told)
+            yield peer
 
-    def _portion(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> Portion[KeyT, OfferT, WireT]:
-        portion = self._examined(known)
-        portion.full, known.fresh = known.fresh, False
-        portion.more = known.beginning and bool(known.news)
-        portion.complete = known.beginning and not portion.more
-        known.beginning = portion.more
-        return portion
-
-    def _examined(self, known: CataloguePeer[KeyT, LocalT, OfferT, WireT]) -> Portion[KeyT, OfferT, WireT]:
-        """Examines entries for a peer; the portion has what it is to be sent of them."""
-        portion: Portion[KeyT, OfferT, WireT] = Portion()
-        for key in tuple(islice(known.news, limits.ADVERTISED_AT_ONCE)):
-            del known.news[key]
-            local = self.offered.get(key)
-            offer = self._offer(known, key, local) if local is not None else None
-            before = known.told.get(key)
-            if before is not None and (offer is None or self._wire(offer) != self._wire(before[0])):
-                wire = self._wire(before[0])
-                del known.told[key], known.by_wire[wire]
-                portion.removed.append(wire)
-                portion.ended.append(key)
-                known.news.update(dict.fromkeys(known.behind.pop(wire, ())))
+    def _portion(self, peer: int, told: Told[KeyT, LocalT, OfferT]) -> None:
+        added: list[OfferT] = []
+        removed: list[KeyT] = []
+        for key in tuple(islice(told.due, limits.ADVERTISED_AT_ONCE)):
+            del told.due[key]
+            offer, before = self._offer(told, key), told.offers.get(key)
+            if before is not None and (offer is None or self.wire_of(offer) != self.wire_of(before[0])):
+                wire = self.wire_of(before[0])
+                del told.offers[key], told.by_wire[wire]
+                told.due |= dict.fromkeys(told.behind.pop(wire, ()))
+                removed.append(wire)
+                self._ended_for(peer, key)
                 before = None
-            if local is None or offer is None:
+            if offer is None:
                 continue
-            if before is not None and offer == before[0] and not self._renewed(before[1], local):
+            if before is not None and before == (offer, self.offered[key] if self.renews else before[1]):
                 continue
-            holder = known.by_wire.setdefault(self._wire(offer), key)
+            holder = told.by_wire.setdefault(self.wire_of(offer), key)
             if holder != key:
-                known.behind.setdefault(self._wire(offer), []).append(key)
-                portion.taken.append((key, offer, holder))
+                told.behind.setdefault(self.wire_of(offer), []).append(key)
+                name, other = self.name_of(self.wire_of(offer)), self.name_of(holder)
+                text = f"{key} would be {name} at {told.name}, as {other} is already: rename one"
+                self._out.warn("names.taken", f"{peer} {key}", text)
                 continue
-            known.told[key] = (offer, local)
-            portion.added.append(offer)
-        return portion
+            told.offers[key] = (offer, self.offered[key])
+            added.append(offer)
+        full, more = not told.begun, not told.whole and bool(told.due)
+        if added or removed or full or (not told.whole and not more):
+            self._out.send(peer, self._message(tuple(added), tuple(removed), full, more))
+        told.begun, told.whole = True, not more
+
+    def _asked_in_vain(self, peer: int, wire: str) -> None:
+        """Report what a peer asks for without permission; it is answered as if there were none."""
+        told, context = self.peers.get(peer), self._out.context
+        if told is not None and context.gate.on:
+            local = next(iter(context.names.of(told.name).locals_of(wire)), wire)
+            context.gate.admits(self.access, told.name, local)
 
 
-# Which nodes of one peer have a place in the local graph, within ``limits.nodes`` of this module.
+# --- what peers offer ---------------------------------------------------------------------------------------------
+
+CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
+"""Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``."""
 
 
-_Thing = TypeVar("_Thing")
-
-
-class NodePlaces(Generic[_Thing]):
-    """The nodes of one peer that are in the local graph, and what is refused because its node is not.
-
-    A node takes a place as long as one thing of it (a topic, a service) is shown. A lower limit ends nothing that is
-    shown: it holds for the nodes that come.
-
-    Args:
-        limit: How many places there are.
-    """
-
-    __slots__ = ("_shown", "limit", "refused")
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self._shown: Counter[str] = Counter()
-        # Ordered: taking the first item of a plain dict passes over all that were taken before it.
-        self.refused: OrderedDict[str, dict[_Thing, None]] = OrderedDict()
-        """The nodes without a place, and the things of each."""
-
-    def free(self, node: str) -> bool:
-        """Whether a node may show a thing: it has a place, or a place is free."""
-        return node in self._shown or len(self._shown) < self.limit
-
-    def refuse(self, node: str, thing: _Thing) -> None:
-        """Note that a thing is hidden because its node has no place."""
-        self.refused.setdefault(node, {})[thing] = None
-
-    def leave(self, node: str, thing: _Thing) -> None:
-        """Note that a thing is shown, hidden for another reason, or gone."""
-        things = self.refused.get(node)
-        if things is not None:
-            things.pop(thing, None)
-            if not things:
-                del self.refused[node]
-
-    def show(self, node: str) -> None:
-        """Count one more thing of a node that is shown."""
-        self._shown[node] += 1
-
-    def hide(self, node: str) -> None:
-        """Count one thing less of a node that is shown; the last one frees the node's place."""
-        self._shown[node] -= 1
-        if not self._shown[node]:
-            del self._shown[node]
-
-    def admitted(self) -> Iterator[tuple[_Thing, ...]]:
-        """Yield the things that may be shown now, one node's at a time, the first refused one first.
-
-        The caller shows the things before it asks for the next node, or the place still counts as free.
-        """
-        while self.refused and self.free(next(iter(self.refused))):
-            yield tuple(self.refused.popitem(last=False)[1])
-
-    def give_up(self) -> None:
-        """Forget what is refused: the peer is away."""
-        self.refused.clear()
-
-
-def warning(peer: str, kind: str, limit: int) -> str:
-    """The text of the log when a peer first exceeds a limit."""
-    return (
-        f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is room: "
-        f"raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"
-    )
-
-
-# What one peer offers, as far as it is taken: within limits, and confirmed over the present link. Pure.
-
-
-EntryT = TypeVar("EntryT")
-
-HeardT = TypeVar("HeardT")
-
-
-@dataclass(frozen=True, slots=True)
-class Change(Generic[OfferT, HeardT]):
-    """A portion of an advertisement, small enough to be applied in one turn of the event loop.
+@dataclass(slots=True, eq=False, kw_only=True)
+class Remote(Generic[KeyT]):
+    """A topic or service of one node of a peer, as the peer offers it.
 
     Args:
-        added: New or changed offers.
-        removed: Names on the wire that are no longer offered.
+        peer: The peer's number.
+        wire: Its key by wire names.
+        name: Its topic or service here.
+        node: Its node, in the peer's graph.
+        origin: Its module and node, if the peer only relays it.
+        shown: Whether it is in the local graph.
+        cause: The kind of the reason why it is not: ``CONFLICT``, ``DENIED`` or ``CROWDED``; empty: another one.
+        problem: Why its route was not opened or was closed last, or empty.
     """
 
-    added: tuple[OfferT, ...] = ()
-    removed: tuple[HeardT, ...] = ()
+    peer: int
+    wire: KeyT
+    name: str
+    node: str
+    origin: Origin | None = None
+    shown: bool = False
+    cause: str = ""
+    problem: str = ""
+
+
+EntryT = TypeVar("EntryT", bound=Remote[Any])
 
 
 @dataclass(slots=True, kw_only=True)
-class PeerOffers(Generic[HeardT, EntryT, OfferT]):
-    """The offers of one run of a peer.
+class Heard(Generic[KeyT, EntryT, OfferT]):
+    """What one run of a peer offers, over one or more links.
+
+    A node of it takes a place in the local graph as long as one entry of the node is shown. A lower limit ends
+    nothing that is shown: it holds for the nodes that come.
 
     Args:
         name: The peer's name.
-        nodes: Which of its nodes have a place in the local graph, and what is refused for want of one. The owner
-            decides whether the things in it go by their names on the wire or by their local names.
-        entries: The offers that are taken, by name on the wire.
+        entries: What is taken of its offers, by name on the wire.
         refused: The offers beyond the limit, at most ``limits.REFUSED_MAX``; further ones come with its next link.
-        doubtful: Names on the wire that were offered over the last link and are not confirmed over the present one.
+        doubtful: What was offered over the last link and is not confirmed over the present one.
+        shown: How many entries of each node are in the local graph.
+        crowded: The nodes without a place, and the entries of each that wait for one (ordered: taking the first item
+            of a plain dict passes over all that were taken before it).
         away: Whether the peer has no link but may come back.
+        silent: Whether its last link ended by silence.
+        rank: The value of its GUID.
+        routes: The routes that are asked for or open, by number.
+        last_route: The number of the last one.
     """
 
     name: str
-    nodes: NodePlaces[HeardT]
-    entries: dict[HeardT, EntryT] = field(default_factory=dict)
-    refused: OrderedDict[HeardT, OfferT] = field(default_factory=OrderedDict)
-    doubtful: set[HeardT] = field(default_factory=set)
+    entries: dict[KeyT, EntryT] = field(default_factory=dict)
+    refused: OrderedDict[KeyT, OfferT] = field(default_factory=OrderedDict)
+    doubtful: set[KeyT] = field(default_factory=set)
+    shown: Counter[str] = field(default_factory=Counter)
+    crowded: OrderedDict[str, dict[EntryT, None]] = field(default_factory=OrderedDict)
     away: bool = False
+    silent: bool = False
+    rank: int = 0
+    routes: dict[int, EntryT] = field(default_factory=dict)
+    last_route: int = 0
+
+    def free(self, node: str, limit: int) -> bool:
+        """Whether a node may show an entry: it has a place, or a place is free."""
+        return node in self.shown or len(self.shown) < limit
+
+    def wait(self, entry: EntryT, *, crowded: bool) -> None:
+        """Note whether an entry waits for a place of its node."""
+        if crowded:
+            self.crowded.setdefault(entry.node, {})[entry] = None
+        elif (waiting := self.crowded.get(entry.node)) is not None:
+            waiting.pop(entry, None)
+            if not waiting:
+                del self.crowded[entry.node]
+
+    def show(self, entry: EntryT) -> None:
+        """Note that an entry is shown."""
+        entry.shown, entry.cause = True, ""
+        self.shown[entry.node] += 1
+
+    def hide(self, entry: EntryT) -> None:
+        """Note that an entry is shown no more; the last one of its node frees the node's place."""
+        entry.shown = False
+        self.shown[entry.node] -= 1
+        if not self.shown[entry.node]:
+            del self.shown[entry.node]
+
+    def admitted(self, limit: int) -> Iterator[EntryT]:
+        """Yield the entries that have a place now, those first whose node has waited longest.
+
+        The caller shows an entry before it asks for the next one, or the place still counts as free.
+        """
+        while self.crowded and self.free(next(iter(self.crowded)), limit):
+            yield from self.crowded.popitem(last=False)[1]
+
+    def give_up(self) -> None:
+        """Forget all that is refused or waits: the peer does not come back soon."""
+        self.crowded.clear()
+        self.refused.clear()
 
     def changes(
         self,
         added: tuple[OfferT, ...],
-        removed: tuple[HeardT, ...],
-        wire: Callable[[OfferT], HeardT],
+        removed: tuple[KeyT, ...],
+        wire: Callable[[OfferT], KeyT],
         *,
         full: bool,
         more: bool,
-    ) -> Iterator[Change[OfferT, HeardT]]:
-        """Split an advertisement into portions; removals go first.
+    ) -> Iterator[tuple[KeyT, OfferT | None]]:
+        """The changes that an advertisement makes, each with its name on the wire; removals, ``None``, go first.
 
         Args:
             added: The offers that the advertisement adds.
@@ -410,22 +467,172 @@ class PeerOffers(Generic[HeardT, EntryT, OfferT]):
         if self.doubtful and not more:
             removed += tuple(sorted(self.doubtful))  # type: ignore[type-var] # names are in order
             self.doubtful = set()
-        step = limits.APPLIED_AT_ONCE
-        for begin in range(0, len(removed), step):
-            yield Change(removed=removed[begin : begin + step])
-        for begin in range(0, len(added), step):
-            yield Change(added=added[begin : begin + step])
+        yield from ((name, None) for name in removed)
+        yield from ((wire(offer), offer) for offer in added)
 
-    def refuse(self, wire: HeardT, offer: OfferT) -> None:
-        """Remember an offer beyond the limit."""
-        if wire in self.refused or len(self.refused) < limits.REFUSED_MAX:
-            self.refused[wire] = offer
 
-    def admitted(self, limit: int) -> OfferT | None:
-        """Take the first refused offer; ``None`` if there is none, or ``limit`` entries are taken already."""
-        return self.refused.popitem(last=False)[1] if self.refused and len(self.entries) < limit else None
+class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
+    """What peers offer, and what of it is in the local graph.
 
-    def give_up(self) -> None:
-        """Forget all that is refused: the peer does not come back soon."""
-        self.nodes.give_up()
-        self.refused.clear()
+    Args:
+        out: Has the rules (``context``); sends messages, warns, and changes the local graph.
+    """
+
+    kind: ClassVar[str]
+    """The setting that limits the entries of one peer: ``topics`` or ``services``."""
+
+    def __init__(self, out: Effects) -> None:
+        self._out = out
+        self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
+        self.ways = RelayPaths(out.context.gate.may_relay)
+        """Selects the path to each module that relays offer."""
+
+    @abstractmethod
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
+
+    @abstractmethod
+    def handle_timer(self, now: float) -> None:
+        """Handle due timers."""
+
+    @abstractmethod
+    def reload(self, now: float) -> Iterator[None]:
+        """Judge by new rules, an entry with each item; what they do not change goes on untouched."""
+
+    @abstractmethod
+    def wire_of(self, offer: OfferT) -> KeyT:
+        """How the peer names what it offers."""
+
+    @abstractmethod
+    def _entry(self, peer: int, offer: OfferT) -> EntryT:
+        """The entry of an offer."""
+
+    @abstractmethod
+    def _is_same(self, entry: EntryT, offer: OfferT) -> bool:
+        """Whether an offer is what an entry was made of."""
+
+    @abstractmethod
+    def _came(self, entry: EntryT) -> None:
+        """Show an entry that was added, or hide it."""
+
+    @abstractmethod
+    def _came_again(self, entry: EntryT, now: float) -> None:
+        """Take an offer that was taken before, over this link or an earlier one."""
+
+    @abstractmethod
+    def _went(self, entry: EntryT, reason: str) -> None:
+        """End what uses an entry and take it out of the local graph; it is in no list of its peer any more."""
+
+    @abstractmethod
+    def _ways_changed(self, instances: Collection[str]) -> None:
+        """Judge what relays bring of these modules: the best path to them may be another one."""
+
+    @property
+    def limit(self) -> int:
+        """How many entries of one peer are taken."""
+        most = self._out.context.settings.limits
+        return most.topics if self.kind == "topics" else most.services
+
+    def refused(self, peer: int) -> int:
+        """How much a peer offers beyond the limit."""
+        return len(known.refused) if (known := self._peers.get(peer)) is not None else 0
+
+    def refused_nodes(self, peer: int) -> Mapping[str, Collection[EntryT]]:
+        """The nodes of a peer that are hidden because of ``limits.nodes``, with their entries."""
+        return known.crowded if (known := self._peers.get(peer)) is not None else {}
+
+    def peer_name(self, peer: int) -> str:
+        """The name of a peer, for texts."""
+        return known.name if (known := self._peers.get(peer)) is not None else "a peer that is gone"
+
+    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> None:
+        """Register a link, of a new peer or of one that was away; its first message begins a full advertisement.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name, which selects the rules for it.
+            instance: Its run, as 32 hexadecimal digits: what relays offer of it is hidden while it has a link.
+            rank: The value of its GUID.
+        """
+        known = self._peers.setdefault(peer, Heard(name=name))
+        known.away, known.silent, known.rank, known.routes, known.last_route = False, False, rank, {}, 0
+        if instance:
+            self._ways_changed(self.ways.linked(peer, name, instance, rank))
+
+    def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
+        """The changes of an advertisement, one by one, for ``take_in``."""
+        known, added, removed = self._peers.get(peer), cast("Any", message.added), cast("Any", message.removed)
+        if known is None:
+            return iter(())
+        return known.changes(added, removed, self.wire_of, full=message.full, more=message.more)
+
+    def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
+        """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""
+        known = self._peers.get(peer)
+        if known is None:
+            return
+        if offer is not None:
+            self._add(peer, known, offer, now)
+            return
+        known.refused.pop(wire, None)
+        if (entry := known.entries.get(wire)) is not None:
+            self._drop(entry, f"its server at {known.name} has gone")
+        self._admit(peer, known, now)
+
+    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
+        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
+        if not known.refused or len(known.entries) >= self.limit:
+            return False
+        self._add(peer, known, known.refused.popitem(last=False)[1], now)
+        return True
+
+    def _add(self, peer: int, known: Heard[KeyT, EntryT, OfferT], offer: OfferT, now: float) -> None:
+        wire = self.wire_of(offer)
+        entry = known.entries.get(wire)
+        if entry is not None and self._is_same(entry, offer):
+            self._came_again(entry, now)
+            return
+        if entry is not None:
+            self._drop(entry, f"another node of {known.name} provides it now")
+        elif len(known.entries) >= self.limit:
+            if wire in known.refused or len(known.refused) < limits.REFUSED_MAX:
+                known.refused[wire] = offer
+            self._warn_limit(known.name, self.kind, self.limit)
+            return
+        entry = known.entries[wire] = self._entry(peer, offer)
+        if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
+            self._ways_changed({entry.origin.instance})
+        self._came(entry)
+
+    def _warn_limit(self, peer: str, kind: str, limit: int) -> None:
+        text = f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is "
+        text += f"room: raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"
+        self._out.warn(f"{kind}.too_many", peer, text)
+
+    def _drop(self, entry: EntryT, reason: str) -> None:
+        """Forget an entry that is not offered any more, or does not outlive its peer's link."""
+        known = self._peers[entry.peer]
+        del known.entries[entry.wire]
+        known.doubtful.discard(entry.wire)
+        known.wait(entry, crowded=False)
+        another_way = entry.origin is not None and self.ways.count(entry.peer, entry.origin, -1)
+        self._went(entry, reason)
+        if entry.origin is not None and another_way:
+            self._ways_changed({entry.origin.instance})
+
+    def _crowd(self, entry: EntryT) -> str:
+        """Why an entry has no place in the local graph, or empty; see ``Heard``."""
+        known, most = self._peers[entry.peer], self._out.context.settings.limits.nodes
+        if known.free(entry.node, most):
+            return ""
+        return f"{known.name} has more nodes than limits.nodes = {most} of this module"
+
+    def _speaker(self, entry: EntryT) -> tuple[str, str]:
+        """The module that permissions are asked for, and the peer that relays its entry, or empty."""
+        name = self._peers[entry.peer].name
+        return (name, "") if entry.origin is None else (entry.origin.name, name)
+
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        (self.ways.reached_here.add if reached else self.ways.reached_here.discard)(instance)
+        self._ways_changed((instance,))

@@ -357,6 +357,17 @@ class Relay:
         return msgspec.structs.replace(origin, path=(*origin.path, self.instance))
 
 
+class Local:
+    """What a node of this module, or a proxy that is relayed, has in the local graph; for subclasses."""
+
+    __slots__ = ()
+
+    type: str | None
+    """Its message type; ``None`` for a service."""
+    origin: Origin | None
+    """Its module and node, if it is relayed."""
+
+
 def may_have(instance: str, origin: Origin) -> bool:
     """Whether a relayed source may be offered to the peer of this instance: not to one that it came from."""
     return instance != origin.instance and instance not in origin.path

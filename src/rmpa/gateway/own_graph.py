@@ -392,9 +392,9 @@ class AgentGraph(Part):
     def _module_with(self, service: str) -> str:
         """The module of this mesh that has a service of this name; empty if there is none."""
         found = self._agent.services.imports.shown(service)
-        if found is None or (found[1].origin is not None and is_outside(found[1].origin)):
+        if found is None or (found.origin is not None and is_outside(found.origin)):
             return ""
-        return self._agent.services.imports.peer_name(found[0])
+        return self._agent.services.imports.peer_name(found.peer)
 
     def _make_room(self, name: str) -> None:
         for shown in self._services_of(name):

@@ -6,6 +6,7 @@ The peers' part of the snapshot: what discovery, mesh and bridge know of each.
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -24,7 +25,7 @@ from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerI
 from rmpa.observe.topics_section import direct_counts
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
-from rmpa.runtime.loop import SystemClock, yield_to_data
+from rmpa.runtime.loop import SystemClock, yield_to_data, yielding_to_data
 from rmpa.trust.permissions import not_of_this_mesh
 
 if TYPE_CHECKING:
@@ -390,7 +391,7 @@ class PeersSection:
     def _beyond(self, session: PeerSession) -> tuple[BoundInfo, ...]:
         """What of a peer this module refuses because of its limits."""
         topics, services = self._bridge.topics.imports, self._services.imports
-        most, peer, name = topics.limit_settings, session.peer, session.link.name
+        most, peer, name = self._bridge.context.settings.limits, session.peer, session.link.name
         there, here = topics.refused_nodes(peer), services.refused_nodes(peer)
         counts = (
             (len(there.keys() | here.keys()), "nodes", most.nodes),
@@ -411,12 +412,16 @@ class PeersSection:
 
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
         """Modules without a link whose topics a relay passes on; the membership may know them too."""
-        infos = []
+        infos, shown = [], set()
+        for _, _, entry in yielding_to_data(list(self._bridge.topics.imports)):
+            if entry.origin is not None and entry.shown:
+                shown.add((entry.origin.instance, entry.topic))
+        counts = Counter(instance for instance, _ in shown)
         for origin, via in self._bridge.topics.imports.ways:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             info = known.get(origin.instance, blank)
-            topics = self._bridge.topics.imports.relayed_topics(origin.instance)
-            infos.append(msgspec.structs.replace(info, state="relayed", via=via, topics_in=len(topics)))
+            topics = counts[origin.instance]
+            infos.append(msgspec.structs.replace(info, state="relayed", via=via, topics_in=topics))
         return infos
 
     def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
@@ -509,10 +514,10 @@ def _lane(lane: LaneSender, stream: Stream | None) -> LaneInfo:
 
 def own_bounds(bridge: Bridge, services: Services) -> Iterator[str]:
     """What this module offers to no peer because of its limits, ready to read."""
-    most = bridge.topics.imports.limit_settings
+    most = bridge.context.settings.limits
     for hidden, kind, limit in (
-        (bridge.topics.exports.beyond, "topics", most.topics),
-        (services.exports.beyond, "services", most.services),
+        (len(bridge.topics.exports.beyond), "topics", most.topics),
+        (len(services.exports.beyond), "services", most.services),
     ):
         if hidden:
             which = f"{_count(hidden, kind)} of this module are offered to no peer"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge, TwinWatch
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.calls import CallStats
-    from rmpa.bridge.services.exports import RemoteService
+    from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.services.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
@@ -106,8 +106,8 @@ class ServicesSection:
 
     def _export(self, service: str, server: LocalService) -> ServiceInfo:
         exports = self._services.exports
-        about = exports.about(service)
-        decision = self._bridge.context.services.judge(service, server.node)
+        about = exports.about.get(service)
+        decision = exports.judge(service, server)
         callers = tuple(sorted(self._services.imports.peer_name(peer) for peer in exports.callers(service)))
         return ServiceInfo(
             name=service,
@@ -115,7 +115,7 @@ class ServicesSection:
             direction="out",
             state="home" if service not in exports.offered else "open" if callers else "idle",
             type=about.type if about else "",
-            md5=about.md5 if about else "",
+            md5=about.md5sum if about else "",
             callers=callers,
             wanted=self._bridge.context.services.transport(service).value,
             direct_callers=tuple(
@@ -126,7 +126,7 @@ class ServicesSection:
             ),
             crosses=decision.allowed,
             policy=decision.rule,
-            **_figures(self._services.served.get(service)),
+            **_figures(self._services.serving.stats.get(service)),
         )
 
     def _remote(self, wanted: Collection[str] | None) -> Iterator[ServiceInfo]:
@@ -149,10 +149,10 @@ class ServicesSection:
             state=remote.state.name.lower() if remote.shown else "hidden",
             wire=remote.wire if remote.wire != remote.name else "",
             type=remote.about.type if remote.about else "",
-            md5=remote.about.md5 if remote.about else "",
+            md5=remote.about.md5sum if remote.about else "",
             crosses=decision.allowed,
             policy=decision.rule,
-            hidden=remote.hidden,
+            hidden=self._services.imports.why_hidden(remote)[0],
             **self._transport(peer, remote),
             **figures,
         )

@@ -17,8 +17,9 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_secon
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
+from rmpa.bridge.offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
-from rmpa.bridge.topics.routes import RouteState
+from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Transport
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.direct.paths import Path
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.routes import RemoteTopic
+    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.ros.core.external import Core
 
 
@@ -332,7 +333,7 @@ class TopicsSection:
                 continue
             yield_to_data()
             at = sessions[peer]
-            texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
+            texts = [f"{at.link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
             texts += self._bridge.topics.mismatches(source)
             yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts
 
@@ -358,7 +359,7 @@ class TopicsSection:
             latched=latched,
             contract=_contract(entry.contract or self._bridge.context.contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
-            limit="nodes" if entry.crowded else "",
+            limit="nodes" if entry.cause == CROWDED else "",
             **_events(watch, now),
         )
         own = self._bridge.context.contracts.of(entry.topic, entry.type)

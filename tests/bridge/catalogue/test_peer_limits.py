@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
+from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
+from rmpa.bridge.offers import CROWDED
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.proxies import Names
-from rmpa.bridge.services.bodies import ImportAction, LocalService, Provide, Withdraw
-from rmpa.bridge.services.exports import ServiceExports
-from rmpa.bridge.services.imports import ServiceImports
-from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.services.bodies import LocalService
 from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings
 from rmpa.core.contract import Contracts
+from tests.bridge.recorder import (
+    Imports,
+    Provide,
+    Publish,
+    Retract,
+    Send,
+    ServiceExports,
+    ServiceImports,
+    Warn,
+    Withdraw,
+)
 from tests.bridge.services.test_rules import apply_rules, rules
 
 if TYPE_CHECKING:
@@ -41,7 +49,7 @@ def shown(made: Imports) -> set[str]:
     return {source.node for _, source, entry in made if entry.shown}
 
 
-def published(actions: list[Action]) -> list[str]:
+def published(actions: list[Any]) -> list[str]:
     return [action.source.topic for action in actions if isinstance(action, Publish)]
 
 
@@ -55,7 +63,7 @@ def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
     assert {node: len(sources) for node, sources in made.refused_nodes(1).items()} == {"/n2": 3, "/n3": 3}
     entry = made.get(1, Source("/n2/t0", "/n2"))
     assert entry is not None
-    assert entry.crowded
+    assert entry.cause == CROWDED
     assert "limits.nodes = 2 of this module" in entry.hidden
     more = TopicOffer("/late", "/n0", "a/B")
     assert published(made.advertised(1, Advertise(added=(more,)))) == ["/late"], "its node has a place"
@@ -95,7 +103,7 @@ def test_topics_beyond_the_limit_come_when_there_is_room() -> None:
 
 @pytest.mark.parametrize("kind", ["nodes", "topics"])
 def test_a_limit_that_is_raised_holds_at_once_and_a_lower_one_for_what_comes(kind: str) -> None:
-    def reload(value: int) -> list[Action]:
+    def reload(value: int) -> list[Any]:
         most = LimitSettings(**{kind: value})
         policy = Policy(PolicySettings(deny=("/secret",)))
         return [a for some in made.apply_rules(policy, Contracts(), Names(), 0.0, most) for a in some]
@@ -132,8 +140,7 @@ def test_a_short_loss_of_the_link_keeps_all_places() -> None:
     made.advertised(1, Advertise(added=offers(range(5))))
     made.link_away(1, briefly=True)
     made.link_up(1, "far")
-    for portion in made.portions(1, Advertise(added=offers(range(5)), full=True)):
-        assert published(made.take_in(1, portion, 0.0)) == []
+    assert published(made.advertised(1, Advertise(added=offers(range(5)), full=True))) == []
     assert shown(made) == {"/n0"}
     assert (len(made.refused_nodes(1)), made.refused(1)) == (2, 2)
 
@@ -165,7 +172,7 @@ def test_the_limits_hold_and_no_place_stays_empty(
         assert waiting == {source for source, entry in known.items() if not entry.shown}
 
 
-def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Action]]:
+def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Any]]:
     """One reload: another limit of nodes, and all topics of some nodes denied."""
     policy = Policy(PolicySettings(deny=tuple(f"{node}/*" for node in denied)))
     return made.apply_rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
@@ -192,7 +199,7 @@ def test_after_reloads_no_place_is_empty_and_the_rest_is_counted(first: list[Top
     made = imports(nodes=6)
     made.advertised(1, Advertise(added=tuple(first)))
     limit, denied = 6, set[int]()
-    under_way: Iterator[list[Action]] = iter(())
+    under_way: Iterator[list[Any]] = iter(())
     for step in steps:
         if isinstance(step, int):
             list(islice(under_way, step))
@@ -222,7 +229,7 @@ def provided(*names: str, node: str = "/n", removed: tuple[str, ...] = ()) -> Ad
 
 def services(*, nodes: int = 100, count: int = 100) -> ServiceImports:
     made = ServiceImports(rules(), LimitSettings(nodes=nodes, services=count))
-    made.link_up(1, "far", 10)
+    made.link_up(1, "far", rank=10)
     return made
 
 
@@ -232,7 +239,7 @@ def test_services_of_nodes_beyond_the_limit_wait_for_a_place() -> None:
     assert made.advertised(1, provided("/b", "/c", node="/second")) == []
     remote = made.get(1, "/b")
     assert remote is not None
-    assert "limits.nodes = 1 of this module" in remote.hidden
+    assert "limits.nodes = 1 of this module" in made.hidden(remote)
     assert {node: set(names) for node, names in made.refused_nodes(1).items()} == {"/second": {"/b", "/c"}}
     actions = made.advertised(1, provided(removed=("/a",)))
     assert [type(action) for action in actions] == [Withdraw, Provide, Provide]
@@ -241,7 +248,7 @@ def test_services_of_nodes_beyond_the_limit_wait_for_a_place() -> None:
 
 def test_another_peer_provides_what_one_has_no_place_for() -> None:
     made = services(nodes=1)
-    made.link_up(2, "other", 20)
+    made.link_up(2, "other", rank=20)
     made.advertised(1, provided("/a", node="/first"))
     made.advertised(1, provided("/b", node="/second"))
     assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
@@ -264,7 +271,7 @@ def test_the_services_limits_are_reloaded() -> None:
     assert changed == [Provide(1, "/b", "/second"), Provide(1, "/c", "/second")]
 
 
-def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[ImportAction]]:
+def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[Any]]:
     settings = ServiceSettings(deny=tuple(f"{node}/*" for node in denied))
     return made.apply_rules(rules(settings), LimitSettings(nodes=nodes))
 
@@ -274,13 +281,13 @@ def test_a_freed_place_costs_no_pass_over_all_waiting_nodes(monkeypatch: pytest.
     for number in range(200):
         made.advertised(1, provided(f"/s{number}", node=f"/n{number}"))
     chosen: list[str] = []
-    choose = made._choose
+    choose = made.book._choose
 
-    def counted(service: str) -> list[ImportAction]:
+    def counted(service: str) -> None:
         chosen.append(service)
-        return choose(service)
+        choose(service)
 
-    monkeypatch.setattr(made, "_choose", counted)
+    monkeypatch.setattr(made.book, "_choose", counted)
     actions = made.advertised(1, provided(removed=tuple(f"/s{number}" for number in range(8))))
     assert [one.service for one in actions if isinstance(one, Provide)] == [f"/s{n}" for n in range(8, 16)]
     assert chosen == [f"/s{number}" for number in range(8, 16)]
@@ -296,9 +303,9 @@ def test_after_reloads_each_service_has_one_provider(
     steps: list[tuple[bool, int, int, int] | tuple[int, set[int]] | int],
 ) -> None:
     made = services(nodes=3)
-    made.link_up(2, "other", 20)
+    made.link_up(2, "other", rank=20)
     limit, denied = 3, set[int]()
-    under_way: Iterator[list[ImportAction]] = iter(())
+    under_way: Iterator[list[Any]] = iter(())
     for step in steps:
         if isinstance(step, int):
             list(islice(under_way, step))
@@ -333,10 +340,10 @@ def test_own_services_beyond_the_limit_are_offered_later() -> None:
     (warning,) = made.graph("/mul", mul)
     assert isinstance(warning, Warn)
     assert "limits.services = 1" in warning.text
-    assert made.beyond == 1
+    assert set(made.beyond) == {"/mul"}
     made.graph("/add", None)
     assert dict(made.offered) == {"/mul": mul}
-    assert made.beyond == 0
+    assert not made.beyond
     told = [action.message for action in made.advertise() if isinstance(action, Send)]
     assert told == [AdvertiseServices(added=(ServiceOffer("/mul", "/multiplier"),))]
     made.graph("/add", add)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -14,15 +13,16 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.bodies import EndRoute, LocalService, Probe, ServerGone, ServeRoute, ServiceAbout
-from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.bodies import LocalService
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.wire.tcpros import ServiceDescription
+from tests.bridge.recorder import EndRoute, Probe, Send, ServerGone, ServeRoute, ServiceExports
 from tests.bridge.services.test_rules import apply_rules, rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
-ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
+ABOUT = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
 ROUTE = limits.SERVICE_ROUTES + 1
 
 
@@ -39,7 +39,7 @@ def opened(exports: ServiceExports) -> int:
     assert exports.opened(1, OpenService(ROUTE, "/add", 2.0)) == [Probe("/add", ADD)]
     serve, send = exports.described("/add", ADD, ABOUT)
     assert isinstance(serve, ServeRoute)
-    assert send == Send(1, ServiceOpened(ROUTE, serve.requests, ABOUT.type, ABOUT.md5))
+    assert send == Send(1, ServiceOpened(ROUTE, serve.requests, ABOUT.type, ABOUT.md5sum))
     assert serve == ServeRoute(1, ROUTE, serve.requests, "/add", ADD, 2.0)
     return serve.requests
 
@@ -84,7 +84,7 @@ def test_a_server_at_another_address_is_told_again_and_its_routes_end(exports: S
     requests = opened(exports)
     again = LocalService("/adder", "rosrpc://127.0.0.1:7")
     assert exports.graph("/add", again) == [
-        EndRoute(1, ROUTE, requests),
+        EndRoute(1, requests),
         Send(1, ServiceClosed(ROUTE, "/add: its server has restarted")),
         ServerGone("/add"),
     ]
@@ -114,7 +114,7 @@ def test_a_service_is_opened_at_once_when_its_server_is_known(exports: ServiceEx
     assert isinstance(send, Send)
     assert (serve.peer, serve.timeout, send.peer) == (2, config_limits.SERVICE_TIMEOUT, 2)
     assert exports.callers("/add") == (1, 2)
-    assert exports.closed(1, CloseService(ROUTE)) == [EndRoute(1, ROUTE, first)]
+    assert exports.closed(1, CloseService(ROUTE)) == [EndRoute(1, first)]
     assert exports.closed(1, CloseService(ROUTE)) == [], "words that crossed"
     assert exports.callers("/add") == (2,)
 
@@ -143,7 +143,7 @@ def test_requests_never_share_a_route_and_are_even(exports: ServiceExports) -> N
 
 def test_a_link_that_is_gone_ends_its_routes(exports: ServiceExports) -> None:
     requests = opened(exports)
-    assert exports.link_down(1) == [EndRoute(1, ROUTE, requests)]
+    assert exports.link_down(1) == [EndRoute(1, requests)]
     assert exports.link_down(1) == []
     assert exports.described("/add", ADD, ABOUT) == []
 
@@ -184,5 +184,5 @@ def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> Non
     assert told(exports) == [AdvertiseServices(removed=("/sub",))]
     assert exports.callers("/add") == (1,)
     gone = apply_rules(exports, rules(ServiceSettings(deny=("/add",))))
-    assert EndRoute(1, ROUTE, requests) in gone
+    assert EndRoute(1, requests) in gone
     assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/adder"),), ("/add",))]

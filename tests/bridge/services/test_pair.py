@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -21,29 +21,30 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.services.bodies import (
+from rmpa.bridge.services.bodies import LocalService
+from rmpa.bridge.services.imports import ServiceRouteState
+from rmpa.config.settings import ServiceSettings
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.wire.tcpros import ServiceDescription
+from tests.bridge.recorder import (
     EndedService,
     EndRoute,
-    ExportAction,
     ForgetAbout,
-    ImportAction,
-    LocalService,
     OpenedService,
     Probe,
     Provide,
+    Send,
     ServerGone,
     ServeRoute,
-    ServiceAbout,
+    ServiceExports,
+    ServiceImports,
+    Warn,
     Withdraw,
 )
-from rmpa.bridge.services.exports import ServiceExports, ServiceRouteState
-from rmpa.bridge.services.imports import ServiceImports
-from rmpa.config.settings import ServiceSettings
-from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import apply_rules, rules
 
 SERVICES = ["/a", "/b", "/c"]
-ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
+ABOUT = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
 OPEN, STRICT = rules(), rules(ServiceSettings(deny=("/b",)))
 
 
@@ -68,7 +69,7 @@ class World:
         self.starts = 0
         self.link()
 
-    def act(self, actions: list[ExportAction] | list[ImportAction]) -> None:
+    def act(self, actions: list[Any]) -> None:
         for action in actions:
             match action:
                 case Send(_, AdvertiseServices() | ServiceOpened() | ServiceClosed() as message):
@@ -86,7 +87,7 @@ class World:
                 case _:
                     self.act_shown(action)
 
-    def act_shown(self, action: ExportAction | ImportAction) -> None:
+    def act_shown(self, action: Any) -> None:
         match action:
             case Provide():
                 assert action.service not in self.visible
@@ -100,8 +101,8 @@ class World:
                 assert action.service in self.visible
                 self.open[action.service] = (action.route, action.requests)
             case EndedService():
-                if action.requests:
-                    assert self.open.pop(action.service) == (action.route, action.requests)
+                if action.service in self.open:
+                    assert self.open.pop(action.service)[0] == action.route
                 assert action.reason
             case ServerGone() | ForgetAbout() | Warn():
                 pass
@@ -144,7 +145,7 @@ class World:
     def link(self, _service: str = "") -> None:
         if not self.linked:
             self.linked = self.known = True
-            self.act(self.imports.link_up(1, "base", 10))
+            self.act(self.imports.link_up(1, "base", rank=10))
             self.act(self.exports.link_up(1, "pc"))
 
     def cut(self, _service: str = "") -> None:
@@ -264,7 +265,7 @@ _anything = st.one_of(
         st.booleans(),
     ),
     st.builds(OpenService, _routes, st.sampled_from(SERVICES)),
-    st.builds(ServiceOpened, _routes, _routes, st.just("a/Add"), st.just(ABOUT.md5)),
+    st.builds(ServiceOpened, _routes, _routes, st.just("a/Add"), st.just(ABOUT.md5sum)),
     st.builds(CloseService, _routes),
     st.builds(ServiceClosed, _routes, st.just("why not")),
 )

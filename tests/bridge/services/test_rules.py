@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
-from rmpa.bridge.context import ServiceRules
+from rmpa.bridge.context import Names, ServiceRules
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.proxies import Names
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceRule, ServiceSettings
 from rmpa.core.contract import Transport
-
-if TYPE_CHECKING:
-    from rmpa.bridge.services.exports import ServiceExports
-    from rmpa.bridge.services.imports import ServiceImports
 
 
 def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] = ()) -> ServiceRules:
     return ServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
 
 
-def apply_rules(plan: ServiceExports | ServiceImports, changed: ServiceRules) -> list[Any]:
+def apply_rules(plan: Any, changed: ServiceRules) -> list[Any]:
     """Everything that other rules bring."""
     return [action for portion in plan.apply_rules(changed) for action in portion]
 

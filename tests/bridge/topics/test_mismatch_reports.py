@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 
-from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import Mismatch, Source
 from rmpa.bridge.topics.subscribers import MismatchReports
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from rmpa.bridge.actions import Action
+from tests.bridge.recorder import Send
 
 CMD = Source("/cmd", "/joy")
 BASE = 1
@@ -24,23 +19,18 @@ class Reports(MismatchReports):
     """Reports of a module that offers ``/cmd`` to the peer *base*, or has it of that peer."""
 
     def __init__(self) -> None:
-        self.done: list[Action] = []
+        self.done: list[Any] = []
         self.warnings: list[str] = []
         self.offered = {CMD}
         exports = SimpleNamespace(
             offered=self.offered, local=lambda _peer, source: source if source in self.offered else None
         )
-        imports = SimpleNamespace(
-            at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [],
-            knows=lambda _: False,
-            mismatched=lambda peer, source, who, text: [Send(peer, Mismatch(source.topic, source.node, who, text))],
+        imports = SimpleNamespace(at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [], knows=lambda _: False)
+        out = SimpleNamespace(
+            send=lambda peer, message: self.done.append(Send(peer, message)),
+            warn=lambda *args: self.warnings.append(args[2]),
         )
-        super().__init__(
-            cast("Any", exports), cast("Any", imports), self.act, lambda *args: self.warnings.append(args[2])
-        )
-
-    def act(self, actions: Sequence[Action]) -> None:
-        self.done += actions
+        super().__init__(cast("Any", out), cast("Any", exports), cast("Any", imports))
 
     def hear(self, text: str, subscriber: str = "/viewer") -> None:
         self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))
@@ -55,6 +45,7 @@ def test_a_refused_subscriber_is_shown_here_and_told_to_the_peer(reports: Report
     reports.refused(BASE, CMD, "/viewer", "other md5")
     assert reports.texts(CMD) == ("other md5",)
     assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", "other md5"))]
+    assert reports.warnings == ["other md5"]
 
 
 def test_a_subscriber_that_registers_again_is_mended_at_the_peer_too_and_once(reports: Reports) -> None:

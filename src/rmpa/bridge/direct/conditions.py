@@ -19,9 +19,9 @@ from rmpa.core.contract import Contract, Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 _TEXT_MAX: Final = 300

@@ -41,10 +41,10 @@ from rmpa.runtime.kernel_tcp import connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.exports import ServiceExports
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.ros.node.slave_node import SlaveNode
 

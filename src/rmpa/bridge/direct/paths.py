@@ -26,8 +26,8 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
 
 _log = logging.getLogger(__name__)
 _UNSTABLE: Final = Unmet(

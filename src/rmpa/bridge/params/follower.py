@@ -22,8 +22,8 @@ from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.config.settings import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 

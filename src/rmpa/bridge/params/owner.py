@@ -36,9 +36,9 @@ from rmpa.trust.permissions import refusal
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode

@@ -13,13 +13,7 @@ from rmpa.bridge.services.bodies import (
     BodyReceiver,
     BodySender,
     Budget,
-    EndRoute,
-    ExportAction,
     LocalService,
-    Probe,
-    ServerGone,
-    ServeRoute,
-    ServiceAbout,
     ServicePool,
 )
 from rmpa.core.errors import ConfigError, RmpaError
@@ -32,13 +26,12 @@ from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Coroutine, Mapping
+    from collections.abc import Collection, Coroutine, Mapping
 
     from rmpa.bridge.data.reception import LinkTime
-    from rmpa.bridge.services.exports import ServiceExports
-    from rmpa.bridge.sessions import PeerSessions
+    from rmpa.bridge.services.exports import ServiceExports, ServiceRoute
+    from rmpa.bridge.shared import Shared
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.core.external import Core
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.tls import Buffer
 
@@ -47,11 +40,6 @@ _FAILED: Final = b"\x00"
 _RECENT: Final = 64
 """How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave
 within a link's lease, so only the latest can be lost."""
-
-
-def description_of(about: ServiceAbout) -> ServiceDescription:
-    """The types that a peer tells of its service, as clients get them."""
-    return ServiceDescription(about.type, about.md5, about.request_type, about.response_type)
 
 
 def _text(body: Buffer) -> str:
@@ -306,29 +294,19 @@ _LOOK_SHARE: Final = 50
 
 
 class Serving:
-    """Carries out the actions of the outbound plan.
+    """The servers that peers call, and what they say of their services.
 
     Args:
-        core: The local core.
-        exports: The outbound plan; it gets the servers' answers.
-        sessions: The peers' sessions.
+        shared: The local core, and the peers.
+        exports: What peers may call; it gets the servers' answers.
         budgets: The budgets of the links, by peer number.
-        act: Carries out the actions that the plan returns for a server's answer.
     """
 
-    def __init__(
-        self,
-        core: Core,
-        exports: ServiceExports,
-        sessions: PeerSessions,
-        budgets: Mapping[int, Budgets],
-        act: Callable[[list[ExportAction]], None],
-    ) -> None:
-        self._core = core
+    def __init__(self, shared: Shared, exports: ServiceExports, budgets: Mapping[int, Budgets]) -> None:
+        self._core = shared.core
+        self._sessions = shared.sessions
         self._exports = exports
-        self._sessions = sessions
         self._budgets = budgets
-        self._act = act
         self.stats: dict[str, CallStats] = {}
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
@@ -354,25 +332,34 @@ class Serving:
         if self._exports.offered:
             self._offering.set()
 
-    def do(self, action: ExportAction) -> None:
-        """Carry out one action."""
-        self.changed()
-        match action:
-            case Probe():
-                self._spawn(self._ask_server(action), f"describe {action.service}")
-            case ServeRoute():
-                self._serve(action)
-            case EndRoute():
-                server = self._servers.pop((action.peer, action.requests), None)
-                if server is not None:
-                    server.close()
-                session = self._sessions.get(action.peer)
-                if session is not None:
-                    session.link.routes.pop(action.requests, None)
-            case ServerGone():
-                pool = self._pools.pop(action.service, None)
-                if pool is not None:
-                    pool.close("its server has gone")
+    def probe(self, service: str, server: LocalService) -> None:
+        """Ask a server for its types; the answer goes to the exports."""
+        self._spawn(self._ask_server(service, server), f"describe {service}")
+
+    def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
+        """Serve a peer's calls: requests come in on ``route.requests``, replies go out on the route ``number``."""
+        session = self._sessions.get(peer)
+        if session is None or not session.linked:
+            return
+        pool, stats = self._pool(route.service, server), self.stats.setdefault(route.service, CallStats())
+        budgets = self._budgets[peer]
+        served = Server(session.link, number, pool, route.timeout, budgets, stats, session.time)
+        self._servers[peer, route.requests] = session.link.routes[route.requests] = served
+
+    def end_route(self, peer: int, requests: int) -> None:
+        """End an open route: no more requests come, and replies of calls under way are dropped."""
+        server = self._servers.pop((peer, requests), None)
+        if server is not None:
+            server.close()
+        session = self._sessions.get(peer)
+        if session is not None:
+            session.link.routes.pop(requests, None)
+
+    def server_gone(self, service: str) -> None:
+        """Close the connections to a server that left or was replaced."""
+        pool = self._pools.pop(service, None)
+        if pool is not None:
+            pool.close("its server has gone")
 
     def lane_lost(self, peer: int) -> None:
         """Report the calls whose replies may be lost: the bulk lane's connection to a peer is gone."""
@@ -408,34 +395,17 @@ class Serving:
             self._pools[service] = pool
         return pool
 
-    async def _ask_server(self, action: Probe) -> None:
+    async def _ask_server(self, service: str, server: LocalService) -> None:
         try:
-            told = await self._pool(action.service, action.server).describe()
+            told = await self._pool(service, server).describe()
         except RmpaError as error:
-            self._act(self._exports.refused(action.service, action.server, str(error)))
+            self._exports.refused(service, server, str(error))
             return
         if not is_type_name(told.type) or len(told.md5sum) != _MD5_LENGTH:
-            text = f"service [{action.service}]: its server says neither type nor md5 sum (but {told})"
-            self._act(self._exports.refused(action.service, action.server, text))
+            text = f"service [{service}]: its server says neither type nor md5 sum (but {told})"
+            self._exports.refused(service, server, text)
             return
-        about = ServiceAbout(told.type, told.md5sum, told.request_type, told.response_type)
-        self._act(self._exports.described(action.service, action.server, about))
-
-    def _serve(self, action: ServeRoute) -> None:
-        session = self._sessions.get(action.peer)
-        if session is None or not session.linked:
-            return
-        server = Server(
-            session.link,
-            action.route,
-            self._pool(action.service, action.server),
-            action.timeout,
-            self._budgets[action.peer],
-            self.stats.setdefault(action.service, CallStats()),
-            session.time,
-        )
-        self._servers[action.peer, action.requests] = server
-        session.link.routes[action.requests] = server
+        self._exports.described(service, server, told)
 
     async def _look_after(self) -> None:
         """Find killed servers: a node with an offered service whose port has no listener is suspected."""

@@ -23,10 +23,9 @@ from rmpa.runtime.kernel_tcp import connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.context import Shared
-    from rmpa.bridge.services.exports import RemoteService
-    from rmpa.bridge.services.imports import ServiceImports
+    from rmpa.bridge.services.imports import RemoteService, ServiceImports
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
 
 _log = logging.getLogger(__name__)
 _OWN_TOOLS: Final = "/rmpa_service"

@@ -39,11 +39,10 @@ from rmpa.ros.wire.xmlrpc import RosReply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.imports import Imports
+    from rmpa.bridge.shared import Shared
+    from rmpa.bridge.topics.imports import Imports, RemoteTopic
     from rmpa.bridge.topics.peer_topics import PeerTopics
-    from rmpa.bridge.topics.routes import RemoteTopic
     from rmpa.ros.node.publication import Publication
 
 MEASURING: Final = "/rmpa_topic_"

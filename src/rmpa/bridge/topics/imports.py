@@ -1,112 +1,181 @@
 """Which sources of the peers appear in the local graph, and which routes are open for them.
 
-Sans-I/O: the driver passes in the peers' advertisements and whether local nodes listen. Each call returns the
-actions to carry out. The states of a source's route are in ``topics.remote_topic``.
+The state of a source's route follows from its facts (``RemoteTopic.state``); ``Imports.follow`` does what they ask
+for::
 
-The cost of a method depends on its arguments, not on the number of peers and sources. Only a long advertisement takes
-long, so it is split (``portions``).
+    idle ──wanted──► opening ──opened──► open ──unwanted──► lingering ──time──► idle
+      ▲                 │ closed, time      │ closed             │ wanted ──► open
+      │ unwanted        ▼                   ▼
+      └────────────── waiting ◄─────────────┘    time ──► opening
 
-Sources are keyed by their wire names. ``RemoteTopic.topic`` is the name of the topic in the local graph
-(``bridge.proxies``); all arguments about the local graph use that one.
+The cost of a method depends on its arguments, not on the number of peers and sources. Sources are keyed by their wire
+names; all arguments about the local graph use the names there (``bridge.proxies``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from itertools import chain, islice
-from typing import TYPE_CHECKING, Final
+import itertools
+import sys
+from dataclasses import dataclass
+from enum import Enum, auto
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING
+
+from msgspec import UnsetType
 
 from rmpa.bridge import limits
-from rmpa.bridge import offers as peer_limits
-from rmpa.bridge.actions import Action, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import (
-    Advertise,
+    CloseRoute,
+    Description,
     Mismatch,
+    OpenRoute,
     RouteClosed,
     RouteOpened,
     Source,
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.offers import NodePlaces, PeerOffers
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate, RelayPaths
-from rmpa.bridge.proxies import Names, PeerNames
-from rmpa.bridge.topics.routes import ImportRoutes, RemoteTopic, RouteState
+from rmpa.bridge.offers import CONFLICT, CROWDED, DENIED, Effects, ImportBook, Remote
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
-from rmpa.config.settings import LimitSettings
-from rmpa.core.contract import Contracts
+from rmpa.core import limits as core_limits
+from rmpa.core.contract import Contract, Reliability
+from rmpa.core.counters import Backoff
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.offers import Change
-    from rmpa.bridge.policy import Policy
 
 
-def _nothing(_peer: int, _source: Source) -> None:
-    """Returns ``None``: no route outlives its link."""
+class RouteState(Enum):
+    """The state of a remote source's route."""
+
+    IDLE = auto()
+    """No route: the source has no local listener."""
+    OPENING = auto()
+    """Requested; the peer has not answered yet."""
+    OPEN = auto()
+    """Data flows."""
+    LINGERING = auto()
+    """Data still flows after the last listener has left; for ``limits.ROUTE_LINGER``."""
+    WAITING = auto()
+    """The route was lost although a node listens; it will be requested again."""
 
 
-_NO_NAMES: Final = Names()
-_DEFAULT_LIMITS: Final = LimitSettings()
-
-
-@dataclass(slots=True, kw_only=True)
-class _ImportPeer(PeerOffers[Source, RemoteTopic, TopicOffer]):
-    """The sources that one run of a peer offers, over one or more links.
-
-    Args:
-        names: Translates the peer's names to local ones.
-        topics: The offered sources by their local topic (dicts, for their order).
-        places: The sources shown in the local graph, by local topic and the peer's node.
-        silent: Whether its last link ended by silence.
-        relayed: The sources that it only relays, by the instance of their own module (dicts, for their order).
-    """
-
-    names: PeerNames
-    topics: dict[str, dict[Source, None]] = field(default_factory=dict)
-    places: dict[tuple[str, str], Source] = field(default_factory=dict)
-    silent: bool = False
-    relayed: dict[str, dict[Source, None]] = field(default_factory=dict)
-
-
-class Imports:
-    """The inbound half of the bridge.
+@dataclass(slots=True, eq=False, kw_only=True)
+class RemoteTopic(Remote[Source]):
+    """One source of one peer.
 
     Args:
-        policy: Decides which sources may cross; both ends judge.
-        rng: Uniform numbers in [0, 1) for the back-off's jitter.
-        contracts: The contracts that this module asks for.
-        position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
-        names: Translates the peers' names to local ones.
-        limit_settings: Bounds the topics and nodes that are taken from one peer.
-        gate: Decides which topics each module may publish here.
+        type: Its message type.
+        hidden: Why it is not in the local graph, or empty.
+        wanted: Whether a local node listens.
+        route: The route's id while it is requested or open, else 0.
+        open: Whether the peer has opened the route.
+        until: When the present state is over, monotonic seconds; ``None``: it lasts. A source without route that is
+            wanted waits for the peer's next link then.
+        asked: The contract that was last requested.
+        contract: The contract of the last open route; ``None`` before the first one.
+        description: The header of the publisher, once known.
+        backoff: Delays between attempts to open a route, after the first one that failed.
+        direct: Whether a local node is connected to its publisher directly, and only the peer's agent has died.
     """
 
-    def __init__(
-        self,
-        policy: Policy,
-        rng: Callable[[], float],
-        contracts: Contracts | None = None,
-        position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
-        names: Names = _NO_NAMES,
-        limit_settings: LimitSettings = _DEFAULT_LIMITS,
-        gate: PermissionGate = OPEN_GATE,
+    type: str
+    hidden: str = ""
+    wanted: bool = False
+    route: int = 0
+    open: bool = False
+    until: float | None = None
+    asked: Contract | None = None
+    contract: Contract | None = None
+    description: Description | None = None
+    backoff: Backoff | None = None
+    direct: bool = False
+
+    @property
+    def topic(self) -> str:
+        """The topic in the local graph."""
+        return self.name
+
+    @property
+    def state(self) -> RouteState:
+        """The state of the route."""
+        if not self.route:
+            return RouteState.WAITING if self.wanted else RouteState.IDLE
+        if not self.open:
+            return RouteState.OPENING
+        return RouteState.OPEN if self.wanted else RouteState.LINGERING
+
+    @property
+    def reliable(self) -> bool:
+        """Whether no message is to be lost, as far as its contract is known."""
+        return self.contract is not None and self.contract.reliability is Reliability.RELIABLE
+
+    @property
+    def outage(self) -> float:
+        """For how many seconds it outlives its link: the contract's outage, or the default if it is not reliable."""
+        return self.contract.outage if self.contract is not None and self.reliable else core_limits.RESUME_WINDOW
+
+    def outlives(self, *, silent: bool) -> bool:
+        """Whether the source stays in the local graph when its peer's link is gone.
+
+        Only a source with a listener does. A reliable one stays, so that no message is lost. A latched one stays if
+        the link fell silent (``silent``): its subscribers stay connected and do not get the same message again when
+        the peer is back, and new subscribers get it meanwhile. A relayed one does not stay, because another relay may
+        offer it. A source with direct subscribers stays if only its agent has died: its messages go on.
+        """
+        if self.direct or not self.wanted or self.origin is not None:
+            return self.direct
+        latching = self.description is not None and self.description.latching
+        return self.reliable or (silent and latching)
+
+
+class ImportEffects(Effects):
+    """What is done for sources of peers; for subclasses."""
+
+    def publish(self, entry: RemoteTopic) -> None:
+        """Publish a source in the local graph."""
+
+    def retract(self, entry: RemoteTopic) -> None:
+        """Remove a source from the local graph: unregister it and close its sockets."""
+
+    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:  # noqa: ARG002 - for subclasses
+        """Epoch and last message of a reliable route that outlived its link, or ``None``."""
+        return None
+
+    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
+        """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description."""
+
+    def detach(
+        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
     ) -> None:
-        self._gate = gate
-        self._policy = policy
-        self.limit_settings = limit_settings
-        self._names = names
-        self._contracts = contracts if contracts is not None else Contracts()
-        self._routes = ImportRoutes(self.get, self._contracts, position, rng)
-        self._peers: dict[int, _ImportPeer] = {}
-        self.ways = RelayPaths(gate.may_relay)
-        """Selects the path to each module that relays offer."""
+        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
+
+        Args:
+            entry: The source and its route.
+            keep: The link is gone, and the next one will continue after the last message that came.
+            missed: Local nodes still listen, so they miss what is published before a route is open again.
+            last: If the publisher has gone: the sequence of its last message.
+        """
+
+
+class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
+    """The inbound half of topics."""
+
+    kind = "topics"
+
+    def __init__(self, out: ImportEffects) -> None:
+        super().__init__(out)
+        self._out: ImportEffects = out
+        self._topics: dict[int, dict[str, dict[Source, None]]] = {}
+        """The sources of each peer by their local topic (dicts, for their order)."""
         self._local_types: dict[str, str] = {}
-        self._strings: dict[str, str] = {}
-        """Names of nodes and types that many sources share, so that each is kept once."""
+        self._timers: list[tuple[float, int, RemoteTopic]] = []
+        """A heap; an item that is not its source's time any more is skipped."""
+        self._serials = itertools.count()
 
     def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:
         """Every known source with its peer; changes during the iteration may be missed."""
@@ -124,147 +193,35 @@ class Imports:
 
     def at(self, topic: str) -> Iterator[tuple[int, Source]]:
         """The sources that peers offer for a local topic, each with its peer."""
-        return ((peer, source) for peer, known in self._peers.items() for source in known.topics.get(topic, ()))
+        return ((peer, source) for peer, topics in self._topics.items() for source in topics.get(topic, ()))
 
     def offered_by(self, peer: int) -> Mapping[str, Collection[Source]]:
         """The topics that a peer offers, by their local names, each with its sources."""
-        return known.topics if (known := self._peers.get(peer)) is not None else {}
+        return self._topics.get(peer, {})
 
-    def relayed_topics(self, instance: str) -> set[str]:
-        """The shown topics of a module that is reached by relays, by their local names."""
-        return {
-            known.entries[source].topic
-            for known in self._peers.values()
-            for source in known.relayed.get(instance, ())
-            if known.entries[source].shown
-        }
+    # --- links ---------------------------------------------------------------------------------------------------
 
-    def local_type(self, topic: str, type_name: str | None) -> list[Action]:
-        """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
-
-        Remote sources of another type are hidden, and the conflict is reported.
-        """
-        if self._local_types.get(topic) == type_name:
-            return []
-        if type_name is None:
-            del self._local_types[topic]
-        else:
-            self._local_types[topic] = type_name
-        actions: list[Action] = []
-        for peer, known in self._peers.items():
-            for source in known.topics.get(topic, ()):
-                entry = known.entries[source]
-                shown, conflict = entry.shown, entry.conflict
-                actions += self._show_or_hide(peer, source, entry)
-                if shown and not entry.shown:
-                    actions += self._report_conflict(peer, source, entry)
-                elif conflict and not entry.conflict:
-                    actions.append(Send(peer, Mismatch(source.topic, source.node, "", "")))
-        return actions
-
-    def refused(self, peer: int) -> int:
-        """How many topics a peer offers beyond ``limits.topics``."""
-        return len(known.refused) if (known := self._peers.get(peer)) is not None else 0
-
-    def refused_nodes(self, peer: int) -> Mapping[str, Collection[Source]]:
-        """The nodes of a peer that are hidden because of ``limits.nodes``, with their sources."""
-        return known.nodes.refused if (known := self._peers.get(peer)) is not None else {}
-
-    def apply_rules(
-        self,
-        policy: Policy,
-        contracts: Contracts,
-        names: Names,
-        now: float,
-        limit_settings: LimitSettings = _DEFAULT_LIMITS,
-    ) -> Iterator[list[Action]]:
-        """Takes new rules; sources and routes that they do not change go on untouched.
-
-        Returns:
-            The actions, source by source; each source is judged when its item is taken.
-        """
-        self._policy, self._contracts, self._names, self.limit_settings = policy, contracts, names, limit_settings
-        self._routes.contracts = contracts
-        for known in self._peers.values():
-            known.names = names.of(known.name)
-            known.nodes.limit = limit_settings.nodes
-        # Shown ones first: what another relay brings from now on has the same proxies.
-        sources = sorted(self, key=lambda one: not one[2].shown) if self._gate.on else self
-        return chain(
-            (self._rejudge(peer, source, now) for peer, source, _ in sources),
-            (actions for peer in list(self._peers) for actions in self._admit(peer, now)),
-        )
-
-    def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
-        """Adds the refused offers beyond ``limits.topics``, one at a time, while there is room."""
-        while (known := self._peers.get(peer)) and (offer := known.admitted(self.limit_settings.topics)):
-            yield self._add(peer, offer, now)
-
-    def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
-        entry = self.get(peer, source)
-        if entry is None:
-            return []
-        known = self._peers[peer]
-        actions: list[Action] = []
-        topic = self._names_of(known, entry.origin).local_name(source.topic)
-        if topic != entry.topic:
-            actions += self._hide(peer, source, entry) if entry.shown else []
-            self._unlist(known, source, entry)
-            entry.topic = topic
-            known.topics.setdefault(topic, {})[source] = None
-        actions += self._show_or_hide(peer, source, entry)
-        contract = self._contracts.of(entry.topic, entry.type)
-        if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
-            actions += self._routes.close(peer, source, entry, missed=entry.wanted)
-            actions += self._routes.open(peer, source, entry, now) if entry.wanted else []
-        return actions
-
-    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> list[Action]:
-        """Registers a link, of a new peer or of one that was away; its first message begins a full advertisement.
-
-        Args:
-            peer: The peer's number.
-            name: The peer's name, which selects the rules for it.
-            instance: Its run: sources of it that relays offer are hidden while it has a link of its own.
-            rank: Its GUID, as a number, which ranks it among relays.
-        """
-        new = _ImportPeer(name=name, nodes=NodePlaces(self.limit_settings.nodes), names=self._names.of(name))
-        known = self._peers.setdefault(peer, new)
-        known.away = known.silent = False
-        self._routes.link_up(peer)
-        return self._ways_changed(self.ways.linked(peer, name, instance, rank)) if instance else []
-
-    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
-        """Suspends the routes of a peer that may come back; sources that do not outlive the link are dropped.
+    def link_away(self, peer: int, *, briefly: bool = False) -> Iterator[None]:
+        """Suspend the routes of a peer that may come back, and drop what does not outlive the link, one by one.
 
         Args:
             peer: The peer's number.
             briefly: Drop nothing yet: the link fell silent, and most silent peers are back soon. The method is
                 called again without it if the peer is not.
-
-        Returns:
-            The actions, and whether a source waits for the peer; if none does, call ``link_down`` next.
         """
-        actions: list[Action] = []
         known = self._peers[peer]
-        known.away = True
-        known.silent = known.silent or briefly
-        self._routes.link_down(peer)
+        known.away, known.silent, known.routes = True, known.silent or briefly, {}
         if not briefly:
             known.give_up()
-        for source, entry in list(known.entries.items()):
+        for entry in list(known.entries.values()):
             keep = briefly or entry.outlives(silent=known.silent)
             if entry.route:
                 # A lingering route has no listener, so it is not continued.
-                goes_on = keep and entry.state is not RouteState.LINGERING
-                missed = entry.wanted and entry.state is not RouteState.LINGERING
-                actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
-            entry.route = 0
-            if keep:
-                self._routes.suspend(entry)
-            else:
-                actions += self._drop(peer, source, entry)
-        return actions, bool(known.entries)
+                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+            entry.route, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
+            if not keep:
+                self._outlived(entry)
+            yield
 
     def waits_for(self, peer: int) -> bool:
         """Whether a source outlives the peer's link: one with a local listener that is reliable or latched."""
@@ -275,296 +232,332 @@ class Imports:
         """The outages, in seconds, of the sources that are kept for a peer."""
         return {entry.outage for entry in self._peers[peer].entries.values()}
 
-    def outlasted(self, peer: int, seconds: float) -> list[Action]:
-        """Drops the sources whose outage is over: their peer has been away for ``seconds``."""
-        gone = [one for one in self._peers[peer].entries.items() if one[1].outage <= seconds]
-        return [action for source, entry in gone for action in self._drop(peer, source, entry)]
+    def outlasted(self, peer: int, seconds: float) -> None:
+        """Drop the sources whose outage is over: their peer has been away for ``seconds``."""
+        for entry in [one for one in self._peers[peer].entries.values() if one.outage <= seconds]:
+            self._outlived(entry)
 
-    def detached(self, peer: int) -> list[Action]:
-        """Detaches the open routes of a peer for which nothing waits; ``link_down`` is called next."""
-        gone = [(source, entry) for source in self._routes.link_down(peer) if (entry := self.get(peer, source))]
-        return [Detach(peer, source, entry.route, missed=entry.wanted) for source, entry in gone if entry.route]
+    def _outlived(self, entry: RemoteTopic) -> None:
+        entry.wanted = False  # its flow ends with its publication
+        self._drop(entry, "")
 
-    def link_down(self, peer: int) -> Iterator[Action]:
-        """Forgets a peer for good; the actions remove its sources from the local graph.
+    def detached(self, peer: int) -> None:
+        """Detach the open routes of a peer for which nothing waits; ``link_down`` is called next."""
+        known = self._peers[peer]
+        for entry in known.routes.values():
+            self._out.detach(entry, missed=entry.wanted)
+        known.routes = {}
 
-        The peer is unknown as soon as this returns. Its entries are freed as the actions are taken, because freeing
-        thousands at once takes long.
+    def link_down(self, peer: int) -> Iterator[None]:
+        """Forget a peer for good; other relays may now bring its sources, and those that it relayed.
+
+        The peer is unknown as soon as this returns; closing its proxies takes its sources out of the local graph. Its
+        entries are freed as the items are taken, because freeing thousands at once takes long.
         """
-        self._routes.link_down(peer)
         known = self._peers.pop(peer, None)
-        return _gone(peer, known.entries) if known is not None else iter(())
+        self._topics.pop(peer, None)
+        self._ways_changed(self.ways.unlinked(peer))
+        for other, source in list(self.at(CLOCK)):
+            self._judge_at(other, source)
+        return _freed(known.entries if known is not None else {})
 
-    def unlinked(self, peer: int) -> list[Action]:
-        """Call after ``link_down``: other relays may now bring the peer's sources, and those that it relayed."""
-        return self._ways_changed(self.ways.unlinked(peer))
+    # --- what peers offer ----------------------------------------------------------------------------------------
 
-    def reached_here(self, instance: str, *, reached: bool) -> list[Action]:
-        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
-        if reached:
-            self.ways.reached_here.add(instance)
-        else:
-            self.ways.reached_here.discard(instance)
-        return self._ways_changed((instance,))
+    def wire_of(self, offer: TopicOffer) -> Source:
+        """As of ``ImportBook``."""
+        return offer.source
 
-    def _ways_changed(self, instances: Collection[str]) -> list[Action]:
-        """Judges sources of modules whose path may have changed; shown ones first, so that their names get free."""
-        touched = [
-            (not entry.shown, peer, source)
-            for instance in instances
-            for peer, known in self._peers.items()
-            for source in known.relayed.get(instance, ())
-            if (entry := known.entries.get(source)) is not None
-        ]
-        return [
-            action
-            for _, peer, source in sorted(touched)
-            if (entry := self.get(peer, source)) is not None
-            for action in self._show_or_hide(peer, source, entry)
-        ]
+    def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
+        # Many sources share the names of nodes and types, and each is kept once.
+        source, kind = Source(offer.topic, sys.intern(offer.node)), sys.intern(offer.type)
+        name = self._local_name(peer, source, offer.origin)
+        entry = RemoteTopic(peer=peer, wire=source, name=name, node=source.node, origin=offer.origin, type=kind)
+        self._topics.setdefault(peer, {}).setdefault(name, {})[source] = None
+        return entry
 
-    def _names_of(self, known: _ImportPeer, origin: Origin | None) -> PeerNames:
-        """The naming rules of a source: those for its own module, not those for the relay."""
-        return known.names if origin is None else self._names.of(origin.name)
+    def _local_name(self, peer: int, source: Source, origin: Origin | None) -> str:
+        """The topic here, by the rules for the source's own module, not by those for the relay."""
+        module = self._peers[peer].name if origin is None else origin.name
+        return self._out.context.names.local_name(module, source.topic)
 
-    def portions(self, peer: int, message: Advertise) -> Iterator[Change[TopicOffer, Source]]:
-        """Split an advertisement into portions, each small enough for one call of ``take_in``."""
-        known, full, more = self._peers[peer], message.full, message.more
-        return known.changes(message.added, message.removed, lambda offer: offer.source, full=full, more=more)
+    def _is_same(self, entry: RemoteTopic, offer: TopicOffer) -> bool:
+        return (entry.type, entry.origin) == (offer.type, offer.origin)
 
-    def take_in(self, peer: int, change: Change[TopicOffer, Source], now: float) -> list[Action]:
-        """Applies a portion of an advertisement: sources that the peer has added or removed."""
-        known = self._peers[peer]
-        actions: list[Action] = []
-        for source in change.removed:
-            known.refused.pop(source, None)
-            actions += self._forget(peer, source)
-        for offer in change.added:
-            actions += self._add(peer, offer, now)
-        admitted = islice(self._admit(peer, now), limits.APPLIED_AT_ONCE)
-        return actions + [action for one in admitted for action in one]
+    def _came(self, entry: RemoteTopic) -> None:
+        self._judge(entry)
 
-    def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
-        """Applies a whole advertisement at once."""
-        return [action for change in self.portions(peer, message) for action in self.take_in(peer, change, now)]
+    def _came_again(self, entry: RemoteTopic, now: float) -> None:
+        if not entry.route and entry.until is None:
+            entry.problem = ""  # the peer was away, and is back
+        self.follow(entry, now)
 
-    # --- routes ------------------------------------------------------------------------------------------------
+    def _went(self, entry: RemoteTopic, reason: str) -> None:  # noqa: ARG002 - as of ImportBook
+        self._close(entry)
+        self._unlist(entry)
+        if entry.shown:
+            self._retract(entry)
 
-    def opened(self, peer: int, message: RouteOpened, now: float) -> list[Action]:
-        """Takes the peer's answer that a route is open; ignored if the route was closed here meanwhile."""
-        return self._routes.opened(peer, message, now)
+    def _unlist(self, entry: RemoteTopic) -> None:
+        topics = self._topics[entry.peer]
+        del topics[entry.name][entry.wire]
+        if not topics[entry.name]:
+            del topics[entry.name]
 
-    def closed(self, peer: int, message: RouteClosed, now: float) -> list[Action]:
-        """Handles a route that the peer has refused or closed."""
-        return self._routes.closed(peer, message, now)
+    # --- what is shown -------------------------------------------------------------------------------------------
 
-    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Action]:
-        """Reports the first local listener of a source, or that the last one has gone."""
-        entry = self.get(peer, source)
-        return self._routes.demand(peer, source, entry, now, wanted=wanted) if entry is not None else []
+    def local_type(self, topic: str, type_name: str | None) -> None:
+        """Set the type with which local nodes publish a topic; ``None`` if none publishes it.
 
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
-        return self._routes.next_timer()
-
-    def handle_timer(self, now: float) -> list[Action]:
-        """Handle due timers, a bounded number of them; if some remain, ``next_timer`` is in the past."""
-        return self._routes.handle_timer(now)
-
-    def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> list[Action]:
-        """Reports, here and to the peer, a local subscriber that was refused because its definition differs."""
-        return [
-            Warn("mismatch.md5", str(source), text),
-            Send(peer, Mismatch(source.topic, source.node, subscriber, text)),
-        ]
-
-    def _add(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
-        known = self._peers[peer].entries
-        source = Source(offer.topic, self._shared(offer.node))
-        actions: list[Action] = []
-        if source in known:
-            entry = known[source]
-            if (entry.type, entry.origin) == (offer.type, offer.origin):
-                # It was offered over an earlier link: open the route again that ended with that link.
-                waits = entry.state is RouteState.WAITING and entry.timer is None
-                if waits or entry.state is RouteState.IDLE:
-                    entry.problem = ""  # the peer was away, and is back
-                return self._routes.open(peer, source, entry, now) if waits else []
-            actions += self._forget(peer, source)
-        elif len(known) >= self.limit_settings.topics:
-            name = self._peers[peer].name
-            self._peers[peer].refuse(source, offer)
-            return [Warn("topics.too_many", name, peer_limits.warning(name, "topics", self.limit_settings.topics))]
-        topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic)
-        entry = known[source] = RemoteTopic(self._shared(offer.type), topic, origin=offer.origin)
-        self._peers[peer].topics.setdefault(topic, {})[source] = None
-        if offer.origin is not None:
-            self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
-            if self.ways.count(peer, offer.origin, 1):
-                actions += self._ways_changed({offer.origin.instance})
-        actions += self._show_or_hide(peer, source, entry)
-        if entry.crowded:
-            name = self._peers[peer].name
-            actions.append(
-                Warn("nodes.too_many", name, peer_limits.warning(name, "nodes", self.limit_settings.nodes))
-            )
-        return actions + self._report_conflict(peer, source, entry)
-
-    def _shared(self, text: str) -> str:
-        if len(self._strings) >= limits.SHARED_STRINGS:
-            self._strings.clear()  # the strings live on where they are used
-        return self._strings.setdefault(text, text)
-
-    def _show_or_hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        nodes = self._peers[peer].nodes
-        entry.hidden, entry.conflict = self._why_hidden(peer, source, entry)
-        self._judge_permission(peer, entry)
-        entry.crowded = not entry.hidden and not nodes.free(source.node)
-        if entry.crowded:
-            entry.hidden = f"{self._peers[peer].name} has more nodes than limits.nodes = {nodes.limit} of this module"
-            nodes.refuse(source.node, source)
-        else:
-            nodes.leave(source.node, source)
-        if entry.shown is not bool(entry.hidden):
-            return []
-        if entry.hidden:
-            return self._hide(peer, source, entry)
-        entry.shown = True
-        nodes.show(source.node)
-        self._peers[peer].places[entry.topic, source.node] = source
-        topic = entry.topic if entry.topic != source.topic else ""
-        return [Publish(peer, source, entry.type, topic, entry.origin)]
-
-    def _judge_permission(self, peer: int, entry: RemoteTopic) -> None:
-        """Hides a source that its module may not publish here, and reports it if it was not so before."""
-        known, origin = self._peers[peer], entry.origin
-        module, relay = (known.name, "") if origin is None else (origin.name, known.name)
-        before, entry.denied = entry.denied, False
-        if entry.hidden and not entry.conflict:
-            return  # by a rule that does not depend on permissions
-        decision = self._gate.judge(Access.PUBLISH, module, entry.topic, relay=relay)
-        if decision.allowed:
+        Remote sources of another type are hidden, and the conflict is reported.
+        """
+        if self._local_types.get(topic) == type_name:
             return
-        entry.denied, entry.conflict, entry.hidden = True, False, decision.rule
-        if not before:
-            self._gate.refused(Access.PUBLISH, module, entry.topic, decision, relay=relay)
+        if type_name is None:
+            del self._local_types[topic]
+        else:
+            self._local_types[topic] = type_name
+        for peer, source in list(self.at(topic)):
+            self._judge_at(peer, source)
 
-    def _hide(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        entry.shown = False
-        entry.wanted = False
-        return [
-            *self._routes.close(peer, source, entry),
-            Retract(peer, source),
-            *self._yield_place(peer, source, entry),
-        ]
+    def reload(self, now: float) -> Iterator[None]:
+        """Judge by new rules, a source with each item; what they do not change goes on untouched."""
+        # Shown ones first: what another relay brings from now on has the same proxies.
+        for peer, source, _ in sorted(self, key=lambda one: not one[2].shown):
+            if (entry := self.get(peer, source)) is not None:
+                self._rejudge(entry, now)
+            yield
+        for peer, known in list(self._peers.items()):
+            while self._peers.get(peer) is known and self._admit(peer, known, now):
+                yield
 
-    def _yield_place(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """Frees the place of a source that has left the local graph, and shows sources that were refused."""
-        known = self._peers[peer]
-        del known.places[entry.topic, source.node]
-        known.nodes.hide(source.node)
-        actions = self._behind(peer, source, entry)
-        for sources in known.nodes.admitted():
-            actions += [a for s in sources for a in self._show_or_hide(peer, s, known.entries[s])]
-        return actions
+    def _rejudge(self, entry: RemoteTopic, now: float) -> None:
+        name = self._local_name(entry.peer, entry.wire, entry.origin)
+        if name != entry.name:
+            if entry.shown:
+                self._hide(entry)
+            self._unlist(entry)
+            entry.name = name
+            self._topics[entry.peer].setdefault(name, {})[entry.wire] = None
+        self._judge(entry)
+        contract = self._out.context.contracts.of(entry.name, entry.type)
+        if entry.route and not (entry.asked is not None and entry.asked.same_route(contract)):
+            self._close(entry, missed=entry.wanted)
+            self.follow(entry, now)
 
-    def _behind(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """Judges again the sources that could not be shown beside this one."""
-        known = self._peers[peer]
-        if entry.topic == CLOCK:
-            entry.shown = False
-            waiting = [(p, s) for p, k in self._peers.items() for s in k.topics.get(CLOCK, ()) if s != source]
-            return [a for p, s in waiting for a in self._show_or_hide(p, s, self._peers[p].entries[s])]
-        if self._names_of(known, entry.origin).plain:
-            return []
-        behind = [s for s in known.topics.get(entry.topic, ()) if s.node == source.node and s != source]
-        return [action for s in behind for action in self._show_or_hide(peer, s, known.entries[s])]
+    def _ways_changed(self, instances: Collection[str]) -> None:
+        """Judge sources of modules whose path may have changed; shown ones first, so that their names get free."""
+        wanted = {instance for instance in instances if instance in self.ways}
+        touched = [one for one in self if (o := one[2].origin) and o.instance in wanted] if wanted else []
+        for peer, source, _ in sorted(touched, key=lambda one: not one[2].shown):
+            self._judge_at(peer, source)
 
-    @staticmethod
-    def _unlist(known: _ImportPeer, source: Source, entry: RemoteTopic) -> None:
-        del known.topics[entry.topic][source]
-        if not known.topics[entry.topic]:
-            del known.topics[entry.topic]
+    def _judge_at(self, peer: int, source: Source) -> None:
+        if (entry := self.get(peer, source)) is not None:
+            self._judge(entry)
 
-    def _report_conflict(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        """Reports a conflict, if there is one, in the log and to the peer: see ``RemoteTopic.conflict``."""
-        if not entry.conflict:
-            return []
-        return [
-            Warn("mismatch.type", str(source), f"{source}: {entry.hidden}"),
-            Send(peer, Mismatch(source.topic, source.node, "", entry.hidden)),
-        ]
+    def _judge(self, entry: RemoteTopic) -> None:
+        """Show a source or hide it, by the facts of now; call it again whenever one has changed."""
+        known, before = self._peers[entry.peer], entry.cause
+        entry.hidden, entry.cause = self.why_hidden(entry)
+        known.wait(entry, crowded=entry.cause == CROWDED)
+        if entry.hidden and entry.shown:
+            self._hide(entry)
+        elif not entry.hidden and not entry.shown:
+            known.show(entry)
+            self._out.publish(entry)
+        if entry.cause != before and CONFLICT in {entry.cause, before}:
+            text = entry.hidden if entry.cause == CONFLICT else ""
+            if text:
+                self._out.warn("mismatch.type", str(entry.wire), f"{entry.wire}: {text}")
+            self._out.send(entry.peer, Mismatch(entry.wire.topic, entry.node, "", text))
+        if entry.cause == DENIED != before:
+            module, relay = self._speaker(entry)
+            self._out.context.gate.admits(Access.PUBLISH, module, entry.name, relay=relay)
+        if entry.cause == CROWDED != before:
+            self._warn_limit(known.name, "nodes", self._out.context.settings.limits.nodes)
 
-    def _why_hidden(self, peer: int, source: Source, entry: RemoteTopic) -> tuple[str, bool]:
-        known, topic, type_name = self._peers[peer], entry.topic, entry.type
-        origin = entry.origin
-        if origin is not None and (why := self.ways.why_not(peer, origin)):
-            return why, False
+    def why_hidden(self, entry: RemoteTopic) -> tuple[str, str]:
+        """Why a source is not in the local graph, and the cause (see ``Remote``); empty if it is."""
+        context, origin, topic = self._out.context, entry.origin, entry.name
+        if origin is not None and (why := self.ways.why_not(entry.peer, origin)):
+            return why, ""
         if topic == CLOCK:
-            return self._why_no_time(peer, source, entry)
-        decision = self._policy.judge(topic, type_name, source.node if origin is None else origin.node)
+            why, conflict = self._why_no_time(entry)
+        elif why := self._why_kept_out(entry):
+            conflict = False
+        else:
+            local = self._local_types.get(topic, entry.type)
+            conflict = local != entry.type
+            why = f"its type is {entry.type}, but a local node publishes {topic} as {local}; "
+            why = why + "rename one of the topics or use one type" if conflict else ""
+        if why and not conflict:
+            return why, ""
+        module, relay = self._speaker(entry)
+        decision = context.gate.judge(Access.PUBLISH, module, topic, relay=relay)
+        if not decision.allowed:
+            return decision.rule, DENIED
+        if conflict:
+            return why, CONFLICT
+        crowd = self._crowd(entry)
+        return crowd, CROWDED if crowd else ""
+
+    def _why_kept_out(self, entry: RemoteTopic) -> str:
+        """Why rules or another source of its node keep a source out, or empty."""
+        policy, origin, topic = self._out.context.policy, entry.origin, entry.name
+        known = self._peers[entry.peer]
+        decision = policy.judge(topic, entry.type, entry.node if origin is None else origin.node)
         for name in (known.name,) if origin is None else (known.name, origin.name):
             if decision.allowed:
-                decision = self._policy.judge_for(name, topic, type_name, source.topic)
+                decision = policy.judge_for(name, topic, entry.type, entry.wire.topic)
         if not decision.allowed:
-            return decision.rule, False
+            return decision.rule
         if not is_crossing_name(topic):
-            return f"its name here would be {topic}, which is too long", False
-        if (holder := known.places.get((topic, source.node), source)) != source:
-            return f"it would be {topic} here, as {holder.topic} of this node is already; rename one", False
-        local = self._local_types.get(topic, type_name)
-        if local == type_name:
-            return "", False
-        why = f"its type is {type_name}, but a local node publishes {topic} as {local}; "
-        return why + "rename one of the topics or use one type", True
+            return f"its name here would be {topic}, which is too long"
+        for other in self._topics[entry.peer][topic]:
+            if other.node == entry.node and other != entry.wire and known.entries[other].shown:
+                return f"it would be {topic} here, as {other.topic} of this node is already; rename one"
+        return ""
 
-    def _why_no_time(self, peer: int, source: Source, entry: RemoteTopic) -> tuple[str, bool]:
+    def _why_no_time(self, entry: RemoteTopic) -> tuple[str, bool]:
         """Why a peer's ``/clock`` is hidden, or empty, and whether that is a conflict.
 
         Time has one source: one node of the followed peer, or one of this module.
         """
         if entry.origin is not None:
             return "time does not come by a relay", False
-        decision = self._policy.judge_clock(self._peers[peer].name)
+        decision = self._out.context.policy.judge_clock(self._peers[entry.peer].name)
         if not decision.allowed:
             return decision.rule, False
         if CLOCK in self._local_types:
             return "a node of this module publishes /clock, and time has one source: end that one", True
-        for other, known in self._peers.items():
-            for one in known.topics.get(CLOCK, ()):
-                if known.entries[one].shown and (other, one) != (peer, source):
-                    return f"time comes from {one.node} of {known.name} already, and has one source", True
+        for peer, source in self.at(CLOCK):
+            other = self._peers[peer].entries[source]
+            if other.shown and other is not entry:
+                name = self._peers[peer].name
+                return f"time comes from {source.node} of {name} already, and has one source", True
         return "", False
 
-    def _forget(self, peer: int, source: Source) -> list[Action]:
-        entry = self._peers[peer].entries.get(source)
-        if entry is None:
-            return []
-        return self._routes.close(peer, source, entry) + self._drop(peer, source, entry)
+    def _hide(self, entry: RemoteTopic) -> None:
+        self._close(entry)
+        entry.wanted = False
+        self._retract(entry)
 
-    def _drop(self, peer: int, source: Source, entry: RemoteTopic) -> list[Action]:
-        known = self._peers[peer]
-        actions: list[Action] = []
-        known.nodes.leave(source.node, source)
-        if entry.shown:
-            actions += [Retract(peer, source), *self._yield_place(peer, source, entry)]
-        del known.entries[source]
-        known.doubtful.discard(source)
-        self._unlist(known, source, entry)
-        if entry.origin is not None:
-            instance = entry.origin.instance
-            del known.relayed[instance][source]
-            if not known.relayed[instance]:
-                del known.relayed[instance]
-            if self.ways.count(peer, entry.origin, -1):
-                actions += self._ways_changed({instance})
-        return actions
+    def _retract(self, entry: RemoteTopic) -> None:
+        """Take a source out of the local graph, and show those that could not stand beside it."""
+        known = self._peers[entry.peer]
+        known.hide(entry)
+        self._out.retract(entry)
+        if entry.name == CLOCK:
+            behind = [(peer, source) for peer, source in self.at(CLOCK) if (peer, source) != (entry.peer, entry.wire)]
+        else:
+            same = self._topics[entry.peer].get(entry.name, ())
+            behind = [(entry.peer, s) for s in same if s.node == entry.node and s != entry.wire]
+        for peer, source in behind:
+            self._judge_at(peer, source)
+        for waiting in known.admitted(self._out.context.settings.limits.nodes):
+            self._judge(waiting)
 
+    # --- routes --------------------------------------------------------------------------------------------------
 
-def _gone(peer: int, sources: dict[Source, RemoteTopic]) -> Iterator[Action]:
-    while sources:
-        source, entry = sources.popitem()
+    def follow(self, entry: RemoteTopic, now: float) -> None:
+        """Open, keep or close a source's route, by the facts of now; call it again whenever one has changed."""
+        known, due = self._peers[entry.peer], entry.until is not None and entry.until <= now
+        match entry.state:
+            case RouteState.OPENING if due:
+                self._out.send(entry.peer, CloseRoute(entry.route))
+                self._fail(entry, "the peer has not answered", now)
+            case RouteState.OPENING if not entry.wanted:
+                self._close(entry)
+            case RouteState.LINGERING if due:
+                self._close(entry)
+            case RouteState.LINGERING if entry.until is None:
+                self._wait(entry, now + limits.ROUTE_LINGER)
+            case RouteState.WAITING if not known.away and (due or entry.until is None):
+                known.last_route += 1
+                entry.route, known.routes[known.last_route] = known.last_route, entry
+                self._wait(entry, now + limits.ROUTE_OPEN_TIMEOUT)
+                entry.asked = self._out.context.contracts.of(entry.name, entry.type)
+                epoch, after = self._out.position(entry) or (0, 0)
+                asked = OpenRoute(entry.route, entry.wire.topic, entry.node, entry.asked, epoch, after)
+                self._out.send(entry.peer, asked)
+            case RouteState.OPEN | RouteState.IDLE:
+                entry.until = None
+
+    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> None:
+        """Note the first local listener of a source, or that the last one has gone."""
+        if (entry := self.get(peer, source)) is None:
+            return
+        if not wanted and entry.state is RouteState.WAITING:
+            self._close(entry)
+        entry.wanted = wanted
+        self.follow(entry, now)
+
+    def opened(self, peer: int, message: RouteOpened, now: float) -> None:
+        """Take the peer's answer that a route is open; ignored if the route was closed here meanwhile.
+
+        A description of another type than the offered one closes the route.
+        """
+        entry = self._peers[peer].routes.get(message.route)
+        if entry is None or entry.open:
+            return
+        if message.description.type != entry.type:
+            why = f"it is offered as {entry.type}, but its publisher sends {message.description.type}"
+            self._out.send(peer, CloseRoute(message.route))
+            self._out.warn("mismatch.type", str(entry.wire), f"{entry.wire}: {why}")
+            self._fail(entry, why, now)
+            return
+        entry.open, entry.until, entry.problem, entry.backoff = True, None, "", None
+        entry.description, entry.contract = message.description, message.contract
+        self._out.describe(entry, message)
+
+    def closed(self, peer: int, message: RouteClosed, now: float) -> None:
+        """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
+        if (entry := self._peers[peer].routes.get(message.route)) is not None:
+            self._fail(entry, message.reason, now, None if isinstance(message.last, UnsetType) else message.last)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
+        while self._timers:
+            until, _, entry = self._timers[0]
+            if entry.until == until and entry.peer in self._peers:
+                return until
+            heappop(self._timers)
+        return None
+
+    def handle_timer(self, now: float) -> None:
+        """Handle due timers, at most ``limits.APPLIED_AT_ONCE``; if some remain, ``next_timer`` is in the past."""
+        for _ in range(limits.APPLIED_AT_ONCE):
+            if (due := self.next_timer()) is None or due > now:
+                return
+            self.follow(heappop(self._timers)[2], now)
+
+    def _wait(self, entry: RemoteTopic, until: float) -> None:
+        entry.until = until
+        heappush(self._timers, (until, next(self._serials), entry))
+        self._out.arm_timer()
+
+    def _close(self, entry: RemoteTopic, *, missed: bool = False) -> None:
+        """End a source's route in any state; ``missed``: local nodes still listen, and miss messages from now on."""
         if entry.route:
-            yield Detach(peer, source, entry.route)
-        if entry.shown:
-            yield Retract(peer, source)
+            self._peers[entry.peer].routes.pop(entry.route, None)
+            self._out.send(entry.peer, CloseRoute(entry.route))
+            self._out.detach(entry, missed=missed)
+        elif entry.wanted and entry.until is None:
+            self._out.detach(entry)  # it waited for a new link
+        entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
+
+    def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
+        """A route is refused or lost: it is opened again after the back-off if a node still listens."""
+        self._peers[entry.peer].routes.pop(entry.route, None)
+        self._out.detach(entry, missed=entry.wanted, last=last)
+        entry.route, entry.open, entry.until, entry.problem = 0, False, None, reason
+        if entry.wanted:
+            if entry.backoff is None:
+                entry.backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._out.rng)
+            self._wait(entry, now + entry.backoff.delay())
+
+
+def _freed(entries: dict[Source, RemoteTopic]) -> Iterator[None]:
+    while entries:
+        entries.popitem()
+        yield

@@ -23,15 +23,17 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
     from rmpa.bridge.data.export import RouteSender
+    from rmpa.bridge.offers import Effects
     from rmpa.bridge.policy import Relay
+    from rmpa.bridge.shared import Shared
+    from rmpa.bridge.topics.exports import ExportRoute, Exports
+    from rmpa.bridge.topics.peer_topics import LossReports
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.external import Core
     from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import TopicConnection
 
 
@@ -103,39 +105,26 @@ class LocalSubscriptions:
     """Subscriptions to local publishers, as the agent's own node.
 
     Args:
-        core: The local core; the agent's subscriptions are registered there, so that ROS tools show them.
-        node: The agent's own node.
-        on_described: Called with a source and its publisher's header.
-        on_lost: Called with a source, a reason and, by peer, the last message of each reliable route when its
-            publisher is no longer connected.
-        on_given_up: ``(peer, messages by source)``: called when messages are not kept any more for an absent peer.
-        on_missed: Called with a source, a peer, and the number of messages that it has missed over an outage.
-        on_oversized: Called with a source and its flow when a message that is too long was left out.
-        on_malformed: Called with a source and a text when its publisher breaks TCPROS; ``on_lost`` follows.
+        shared: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
+        exports: Is told what publishers say.
+        losses: Reports what peers miss.
+        out: Warns of publishers that break TCPROS.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
     """
 
     def __init__(
         self,
-        core: Core,
-        node: SlaveNode,
-        *,
-        on_described: Callable[[Source, Description], None],
-        on_lost: Callable[[Source, str, Mapping[int, int]], None],
-        on_given_up: Callable[[int, Mapping[Source, int]], None],
-        on_missed: Callable[[Source, int, int], None],
-        on_oversized: Callable[[Source, ExportFlow], None],
-        on_malformed: Callable[[Source, str], None],
+        shared: Shared,
+        exports: Exports,
+        losses: LossReports,
+        out: Effects,
         find: Callable[[str, str, str], Publication | None] = lambda *_: None,
     ) -> None:
+        self._core = shared.core
+        self._node = shared.node
+        self._exports, self._losses, self._out = exports, losses, out
         self._find = find
-        self._on_malformed = on_malformed
-        self._on_oversized = on_oversized
-        self._core = core
-        self._node = node
-        self._on_described = on_described
-        self._on_lost = on_lost
         self._connections: dict[Source, TopicConnection] = {}
         self.flows: dict[Source, ExportFlow] = {}
         """The flow of each connected source, for snapshots."""
@@ -143,22 +132,19 @@ class LocalSubscriptions:
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
-        self._on_given_up = on_given_up
-        self._on_missed = on_missed
 
     @property
     def connections(self) -> Iterable[TopicConnection]:
         """The connections to local publishers."""
         return self._connections.values()
 
-    def connect(self, action: Connect) -> None:
-        """Subscribe to one publisher; ``on_described`` or ``on_lost`` reports the outcome."""
-        source = action.source
+    def connect(self, source: Source, uri: str) -> None:
+        """Subscribe to a publisher at its slave API; the exports are told its header later, or that it is lost."""
         flow = self.flows[source] = ExportFlow()
         if sum(s.topic == source.topic for s in self.flows) == 1:
             self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
-        _log.debug("> subscribe to %s at %s", source, action.uri)
-        connection = self._connections[source] = self._connection(source, action.uri, flow)
+        _log.debug("> subscribe to %s at %s", source, uri)
+        connection = self._connections[source] = self._connection(source, uri, flow)
         connection.start()
 
     def _connection(self, source: Source, uri: str, flow: ExportFlow) -> TopicConnection:
@@ -191,43 +177,42 @@ class LocalSubscriptions:
             connection.close()
         self._drop(source)
 
-    def add_route(self, action: AddRoute, link: PeerLink) -> None:
+    def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
 
         Raises:
             RemoteProtocolError: The peer resumes after a message that was never sent.
         """
-        flow = self.flows[action.source]
-        route_sender = flow.by_peer.get(action.peer)
-        self._claim(action.peer, action.source)
-        if (
-            action.after is not None
-            and isinstance(route_sender, ReliableRouteSender)
-            and route_sender.sender.epoch == action.epoch
-        ):
+        flow = self.flows[source]
+        sender = flow.by_peer.get(peer)
+        self._claim(peer, source)
+        resumes = isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch
+        if isinstance(sender, ReliableRouteSender) and resumes and route.after is not None:
             try:
-                route_sender.resume(link, action.route, action.after)
+                sender.resume(link, route.number, route.after)
             except RemoteProtocolError:
-                flow.remove(action.peer)  # the caller closes the link; the next one gets a new numbering
+                flow.remove(peer)  # the caller closes the link; the next one gets a new numbering
                 raise
-            if missed := route_sender.missed():
-                self._on_missed(action.source, action.peer, missed)
+            if missed := sender.missed():
+                self._losses.missed(source, peer, missed)
         else:
-            self._end(action.source, action.peer)
-            route_sender = flow.add(action.peer, link, action.route, action.contract, action.epoch)
-        self._senders[action.peer, action.route] = route_sender
+            self._end(source, peer)
+            sender = flow.add(peer, link, route.number, route.contract, route.epoch)
+        self._senders[peer, route.number] = sender
 
-    def suspend_route(self, action: SuspendRoute) -> None:
-        """Keep a reliable source's messages for a peer whose link is gone; does nothing for best effort."""
-        flow = self.flows.get(action.source)
+    def suspend_route(self, source: Source, peer: int, outage: float) -> None:
+        """Keep a reliable source's messages for an absent peer, for a time in seconds; best effort keeps none."""
+        flow = self.flows.get(source)
         if flow is not None:
-            route_sender = flow.by_peer.get(action.peer)
-            self._forget(route_sender, action.peer)
+            route_sender = flow.by_peer.get(peer)
+            self._forget(route_sender, peer)
             if isinstance(route_sender, ReliableRouteSender):
-                key = (action.peer, action.source)
+                key = (peer, source)
                 route_sender.suspend(self._keeper(key))
-                until = asyncio.get_running_loop().time() + action.outage
-                self._give_up(self._parked.park(key, route_sender.sender, until))
+                until = asyncio.get_running_loop().time() + outage
+                if full := self._parked.park(key, route_sender.sender, until):
+                    # Later: the exports are at work on these routes now.
+                    asyncio.get_running_loop().call_soon(self._give_up, full)
                 self._timer.arm()
 
     def _keeper(self, key: tuple[int, Source]) -> Callable[[bytes, int], object]:
@@ -245,10 +230,10 @@ class LocalSubscriptions:
         keys = [(peer, source) for source in self.flows]
         self._give_up([key for key in keys if self._parked.claim(key) is not None])
 
-    def remove_route(self, action: RemoveRoute) -> None:
+    def remove_route(self, source: Source, peer: int) -> None:
         """End a source's route to a peer."""
-        self._claim(action.peer, action.source)
-        self._end(action.source, action.peer)
+        self._claim(peer, source)
+        self._end(source, peer)
 
     def numbering(self, source: Source, peer: int) -> ReliableSender | None:
         """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
@@ -273,10 +258,12 @@ class LocalSubscriptions:
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
-                route_sender = self.flows[source].by_peer.get(peer)
+                route_sender = flow.by_peer.get(peer) if (flow := self.flows.get(source)) is not None else None
                 if isinstance(route_sender, ReliableRouteSender):
                     counts[source] = route_sender.missed() + route_sender.sender.pending
-            self._on_given_up(peer, counts)
+            self._losses.given_up(peer, counts)
+            for source in counts:
+                self._exports.given_up(source, peer)
 
     def sender(self, peer: int, route: int) -> RouteSender | None:
         """The sender of a peer's route; ``None`` if the route is not open."""
@@ -307,11 +294,11 @@ class LocalSubscriptions:
             return
         if description.latching:
             self.flows[source].latch()
-        self._on_described(source, description)
+        self._exports.described(source, description)
 
     def _left_out(self, source: Source, flow: ExportFlow, size: int) -> None:
         flow.left_out(size)
-        self._on_oversized(source, flow)
+        self._losses.oversized(source, flow)
 
     def _gone(self, source: Source, connection: TopicConnection, reason: str) -> None:
         if self._connections.get(source) is not connection:
@@ -320,11 +307,11 @@ class LocalSubscriptions:
         short = DESCRIPTORS.problem  # reported once for the process; the node itself may be well
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
         if connection.malformed:
-            self._on_malformed(source, reason)
+            self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
         numberings = {peer: self.numbering(source, peer) for peer in self.flows[source].by_peer}
         self._drop(source)  # first: what follows may connect the source anew
         lasts = {peer: numbering.last for peer, numbering in numberings.items() if numbering is not None}
-        self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
+        self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:
             self._core.suspect(source.node)
 

@@ -11,6 +11,8 @@ import logging
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import UnsetType
+
 from rmpa.bridge import limits
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.data.reception import ImportFlow
@@ -28,12 +30,13 @@ from rmpa.runtime.loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Mapping
 
-    from rmpa.bridge.actions import Describe, Detach, Publish
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent, QosWatch
+    from rmpa.bridge.messages import RouteOpened
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.core.counters import RefusalLog
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply
@@ -66,13 +69,13 @@ class PeerTopic(PublicationEvents):
 
     Args:
         peer: All topics of the peer.
-        action: The source, its local name and its type.
+        entry: The source.
     """
 
-    def __init__(self, peer: PeerTopics, action: Publish) -> None:
+    def __init__(self, peer: PeerTopics, entry: RemoteTopic) -> None:
         self._peer = peer
-        self.source, self.type = action.source, action.type
-        self.topic = action.topic or action.source.topic
+        self.source, self.type = entry.wire, entry.type
+        self.topic = entry.name
         """The name in the local graph."""
         self.node: SlaveNode
         self.publication: Publication
@@ -141,12 +144,12 @@ class PeerTopic(PublicationEvents):
         for delay in limits.CALL_BACK_DELAYS:
             asyncio.get_running_loop().call_later(delay, self.register)
 
-    def open(self, action: Describe) -> ImportFlow:
+    def open(self, opened: RouteOpened) -> ImportFlow:
         """Take the data of a newly opened route; a reliable flow continues where the last link ended.
 
         The count of a reliable source goes on in any case. Where it cannot know what was lost, that is an event.
         """
-        contract, flow, session = action.contract, self.flow, self._peer.session
+        contract, flow, session = opened.contract, self.flow, self._peer.session
         past, missed_at = self._peer.pasts.pop(self.source, (None, ""))
         if flow is not None and flow.contract.reliability is Reliability.RELIABLE:
             past, missed_at = flow.watch, self.topic
@@ -158,15 +161,15 @@ class PeerTopic(PublicationEvents):
             time, counters = session.time, self._peer.counters
             flow = ImportFlow(self.publication, contract, time, counters, self.occurred, self.torn, past)
         self.flow, flow.contract = flow, contract
-        goes_on = flow.bind(session.link, action.route, action.epoch, action.first)
+        goes_on = flow.bind(session.link, opened.route, opened.epoch, opened.first)
         self.publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.publication.keep(contract.kept)
-        if goes_on and action.following is not None:
-            flow.skip(action.following)
-        elif reliable and not goes_on and (missed_at or action.unknown):
+        if goes_on and not isinstance(opened.following, UnsetType):
+            flow.skip(opened.following)
+        elif reliable and not goes_on and (missed_at or opened.unknown is True):
             flow.missed_unknown("an agent was restarted, or the route had ended")
-        about = action.description
+        about = opened.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
         if self.publication.describe(TopicDescription(about.type, about.md5, text, about.latching)):
             self.torn()
@@ -239,10 +242,10 @@ class PeerTopics:
         flow = self.flow(source)
         return flow.position if flow is not None else None
 
-    def publish(self, action: Publish) -> None:
+    def publish(self, entry: RemoteTopic) -> None:
         """Publish a source at its proxy, in a later turn of the loop."""
-        topic = PeerTopic(self, action)
-        self.session.proxies.hold(action.source.node, action.source, topic.ready, topic.left)
+        topic = PeerTopic(self, entry)
+        self.session.proxies.hold(entry.node, entry.wire, topic.ready, topic.left)
 
     def retract(self, source: Source) -> None:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
@@ -250,25 +253,27 @@ class PeerTopics:
             topic.end(missed=True)
         self.session.proxies.release(source.node, source)
 
-    def describe(self, action: Describe) -> None:
+    def describe(self, source: Source, opened: RouteOpened) -> None:
         """Prepare for data on a newly opened route, and answer the waiting subscribers with its description."""
-        if (topic := self.topics.get(action.source)) is not None:
-            self.flows[action.route] = self.session.link.routes[action.route] = topic.open(action)
+        if (topic := self.topics.get(source)) is not None:
+            self.flows[opened.route] = self.session.link.routes[opened.route] = topic.open(opened)
 
-    def detach(self, action: Detach) -> None:
-        """End a route's data; with ``keep`` its flow waits for the peer's next link."""
-        flow = self.flows.pop(action.route, None)
-        self.session.link.routes.pop(action.route, None)
-        topic = self.topics.get(action.source)
-        if action.keep or topic is None:
+    def detach(
+        self, source: Source, route: int, *, keep: bool = False, missed: bool = False, last: int | None = None
+    ) -> None:
+        """End a route's data; with ``keep`` its flow waits for the peer's next link; see ``ImportEffects.detach``."""
+        flow = self.flows.pop(route, None)
+        self.session.link.routes.pop(route, None)
+        topic = self.topics.get(source)
+        if keep or topic is None:
             return
-        if flow is not None and action.last is not None:
-            flow.skip(serial_add(action.last, 1))
-        missed = action.missed and action.last is None
+        if flow is not None and last is not None:
+            flow.skip(serial_add(last, 1))
+        missed = missed and last is None
         if topic.flow is not None:
             topic.end(missed=missed)
-        elif not missed and (past := self.pasts.get(action.source)) is not None:
-            self.pasts[action.source] = past[0], ""
+        elif not missed and (past := self.pasts.get(source)) is not None:
+            self.pasts[source] = past[0], ""
         topic.publication.forget_latched()
 
     def link_down(self) -> int:
@@ -334,7 +339,7 @@ class LossReports:
             peer: The peer's number.
             counts: By source: how many messages it misses until now.
         """
-        if not (count := sum(counts.values())):
+        if not (count := sum(counts.values())) or peer not in self._peers:
             return
         name, seconds = self.away(peer)
         shown = ", ".join(map(str, islice(counts, _NAMED)))

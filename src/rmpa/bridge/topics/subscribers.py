@@ -16,24 +16,21 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import Audience, Mismatch, encode, is_crossing_name
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
-from rmpa.bridge.topics.routes import RouteState
+from rmpa.bridge.topics.imports import Imports, RouteState
 from rmpa.config.peer_rules import Access
 from rmpa.core.identity import OWN_NODE, proxied_node, proxy_name
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.actions import Action
     from rmpa.bridge.messages import Message, Source
-    from rmpa.bridge.sessions import PeerSession, PeerSessions
+    from rmpa.bridge.offers import Effects
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
-    from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import PeerTopics
-    from rmpa.core.counters import RefusalLog
 
 _GOAL: Final = "ActionGoal"
 _CANCEL: Final = "actionlib_msgs/GoalID"
@@ -113,23 +110,13 @@ class MismatchReports:
     """The mismatches of local subscribers with peers' sources, and of peers' subscribers with local sources.
 
     Args:
+        out: Sends messages and warns.
         exports: Finds the local source that a peer means.
-        imports: Makes the message for the peer of a source; knows the peers that have a source.
-        act: Carries out actions.
-        on_warning: ``(counter, where, text)``: logs and counts a mismatch that a peer reports.
+        imports: Knows the peers that have a source.
     """
 
-    def __init__(
-        self,
-        exports: Exports,
-        imports: Imports,
-        act: Callable[[Sequence[Action]], None],
-        on_warning: Callable[[str, str, str], None],
-    ) -> None:
-        self._exports = exports
-        self._imports = imports
-        self._act = act
-        self._on_warning = on_warning
+    def __init__(self, out: Effects, exports: Exports, imports: Imports) -> None:
+        self._out, self._exports, self._imports = out, exports, imports
         self._mismatches = Mismatches()
 
     def texts(self, source: Source) -> tuple[str, ...]:
@@ -139,7 +126,8 @@ class MismatchReports:
     def refused(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         """A local subscriber does not fit a peer's source: remember it, and tell the peer."""
         self._mismatches.add(source, subscriber, text)
-        self._act(self._imports.mismatched(peer, source, subscriber, text))
+        self._out.warn("mismatch.md5", str(source), text)
+        self._out.send(peer, Mismatch(source.topic, source.node, subscriber, text))
 
     def reported(self, peer: int, name: str, message: Mismatch) -> None:
         """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
@@ -152,7 +140,7 @@ class MismatchReports:
             return
         self._mismatches.add(source, subscriber, message.text)
         where = f"{name}: {source}"
-        self._on_warning("mismatch.remote", where, f"{where}: {message.text}")
+        self._out.warn("mismatch.remote", where, f"{where}: {message.text}")
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
@@ -160,7 +148,7 @@ class MismatchReports:
             return
         for peer, source in list(self._imports.at(topic)):
             if self._mismatches.mended(source, subscriber):
-                self._act([Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
+                self._out.send(peer, Mismatch(source.topic, source.node, subscriber, ""))
 
     def peer_gone(self, name: str) -> None:
         """Forget all subscribers at a peer that is gone."""
@@ -201,29 +189,18 @@ class RemoteSubscribers:
     """The names of listeners, sent and received, for all peers.
 
     Args:
+        shared: The peers, and the rules about modules behind a relay.
+        out: Warns of too many.
         exports: Finds the source of a peer's route.
         imports: Finds the route of a peer's source.
-        sessions: The peers.
-        topics: The peers' topics in the local graph, by the numbers of their sessions.
-        refusals: Logs and counts ``audience.too_many``.
-        gate: Decides which modules behind a relay may listen.
+        peers: The peers' topics in the local graph, by the numbers of their sessions.
     """
 
     def __init__(
-        self,
-        exports: Exports,
-        imports: Imports,
-        sessions: PeerSessions,
-        topics: Mapping[int, PeerTopics],
-        refusals: RefusalLog,
-        gate: PermissionGate = OPEN_GATE,
+        self, shared: Shared, out: Effects, exports: Exports, imports: Imports, peers: Mapping[int, PeerTopics]
     ) -> None:
-        self._gate = gate
-        self._exports = exports
-        self._imports = imports
-        self._sessions = sessions
-        self._topics = topics
-        self._refusals = refusals
+        self._shared, self._out = shared, out
+        self._exports, self._imports, self._peers = exports, imports, peers
         self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
         """Route id and listeners as they were last sent to each peer, by source."""
         self._changed: dict[tuple[int, Source], None] = {}
@@ -251,11 +228,11 @@ class RemoteSubscribers:
         self._soon = None
         changed, self._changed = self._changed, {}
         for peer, source in changed:
-            session, entry = self._sessions.get(peer), self._imports.get(peer, source)
+            session, entry = self._shared.sessions.get(peer), self._imports.get(peer, source)
             if session is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
                 self._told.pop((peer, source), None)
                 continue
-            publication = self._topics[peer].publication(source)
+            publication = self._peers[peer].publication(source)
             names = audience(publication.listeners) if publication is not None else ()
             before, known = self._told.get((peer, source), (0, ()))
             if names != (known if before == entry.route else ()):
@@ -281,8 +258,7 @@ class RemoteSubscribers:
         for name in sorted(names - shown.keys()):
             if self._count(session.peer) >= limits.AUDIENCES_MAX:
                 text = f"{session.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
-                now = asyncio.get_running_loop().time()
-                self._refusals.refuse(now, "audience.too_many", session.link.name, text)
+                self._out.warn("audience.too_many", session.link.name, text)
                 break
             shown[name] = self._connect(source, local.uri, name)
         if not shown:
@@ -297,7 +273,7 @@ class RemoteSubscribers:
         relay = session.link.name
         if not any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways):
             return ""
-        return node if self._gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
+        return node if self._shared.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
     def _count(self, peer: int) -> int:
         return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)

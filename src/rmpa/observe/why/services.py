@@ -14,6 +14,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
+from rmpa.bridge.offers import CONFLICT, DENIED
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.routes import RemoteTopic
+    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.external import Core
@@ -307,9 +308,9 @@ class TopicEvidence:
             proxies[node] = ProxyState(
                 name=name,
                 permission=self._permission(session.link.name, entry),
-                denied=entry.denied,
+                denied=entry.cause == DENIED,
                 registered=node in standing and publishers.get(name) == standing[node].uri,
-                conflict=entry.conflict,
+                conflict=entry.cause == CONFLICT,
                 connections=self._connections(session, source),
                 mismatches=self._bridge.topics.mismatches(source),
             )
@@ -357,7 +358,7 @@ class TopicEvidence:
             return TopicAtPublisher(permitted=False)
         for topic in topics:
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
-            sources += [self._report(session, Source(topic, node), wire) for node in nodes]
+            sources += [self._report(session, Source(topic, node)) for node in nodes]
             subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
         return TopicAtPublisher(
             sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
@@ -392,15 +393,13 @@ class TopicEvidence:
             and local.origin.instance == instance
         ]
 
-    def _report(self, session: PeerSession, source: Source, wire: str) -> PublisherReport:
+    def _report(self, session: PeerSession, source: Source) -> PublisherReport:
         exports = self._bridge.topics.exports
-        local = exports.offered.get(source)
+        local = exports.seen.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
-        node = source.node if local is None or local.origin is None else local.origin.node
-        decision = self._bridge.context.policy.judge(source.topic, kind, node)
-        if decision.allowed:
-            special = self._bridge.context.policy.judge_for(session.link.name, source.topic, kind, wire)
-            decision = special if special.rule else decision
+        decision = exports.decision(session.peer, source)
+        if decision is None:  # it has just come, or cannot be reached
+            decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
         flow = self._bridge.topics.outbound.flows.get(source)
         numbering = self._bridge.topics.outbound.numbering(source, session.peer)
         contract = exports.contract(source, session.peer)
@@ -418,7 +417,7 @@ class TopicEvidence:
             lost=numbering.lost if numbering is not None else 0,
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
-            beyond=self._bridge.topics.imports.limit_settings.topics if exports.is_beyond(source) else 0,
+            beyond=exports.limit if source in exports.beyond else 0,
             unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
         )
 
@@ -485,17 +484,16 @@ class ServiceEvidence:
         if remote is None:
             return ServiceAtClient(wire=wire)
         shown = self._services.shown(session.peer, service)
+        hidden, cause = self._services.imports.why_hidden(remote)
         if shown is None or shown.proxy is None:
-            return ServiceAtClient(
-                wire=wire, offered=True, node=remote.node, hidden=remote.hidden, denied=remote.denied
-            )
+            return ServiceAtClient(wire=wire, offered=True, node=remote.node, hidden=hidden, denied=cause == DENIED)
         uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
         answer, refusal = await _probe(uri, service) if uri else ("", "")
         return ServiceAtClient(
             wire=wire,
             offered=True,
             node=remote.node,
-            hidden=remote.hidden,
+            hidden=hidden,
             registered=bool(uri),
             transport=self._transport(session.peer, service),
             answer=answer,
@@ -541,17 +539,13 @@ class ServiceEvidence:
                         refusal = f"it cannot be reached at {found.api} ({found.problem})"
                         return ServiceAtServer(node=node, service=service, refusal=refusal)
                 continue
-            rules, origin = self._bridge.context.services, server.origin
-            decision = rules.judge(service, server.node if origin is None else origin.node)
-            if decision.allowed:
-                special = rules.judge_for(peer, service, wire)
-                decision = special if special.rule else decision
+            decision = self._services.exports.decision(session.peer, service)
             _, refusal = await _probe(server.uri, service)
             return ServiceAtServer(
                 node=server.node,
                 service=service,
-                crosses=decision.allowed,
-                rule=decision.rule,
+                crosses=decision is None or decision.allowed,
+                rule=decision.rule if decision is not None else "",
                 refusal=refusal,
                 permitted=True if gate.on else None,
             )

@@ -28,8 +28,8 @@ from tests.bridge.services.io.test_calls import Wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.context import Shared
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 OURS = "http://127.0.0.1:1/"

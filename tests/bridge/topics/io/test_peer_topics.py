@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.actions import Describe, Detach, Publish
 from rmpa.bridge.data.quality import QosEventKind
-from rmpa.bridge.messages import Description, Source
+from rmpa.bridge.messages import Description, RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
+from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import PeerTopics
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
 from rmpa.core.counters import Counters
@@ -95,7 +95,7 @@ class Proxied:
         self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, {})
 
     async def publish(self) -> Publication:
-        self.topics.publish(Publish(1, CMD, "a/B"))
+        self.topics.publish(RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B"))
         await asyncio.sleep(0.01)
         publication = self.topics.publication(CMD)
         assert publication is not None
@@ -113,7 +113,7 @@ class Proxied:
         **told: Any,
     ) -> ImportFlow:
         about = Description("a/B", MD5, definition, latching)
-        self.topics.describe(Describe(1, CMD, route, about, contract, epoch, first, **told))
+        self.topics.describe(CMD, RouteOpened(route, about, contract, epoch, first, **told))
         return self.topics.flows[route]
 
     def kinds(self) -> list[QosEventKind]:
@@ -143,7 +143,7 @@ def test_a_source_appears_flows_and_disappears() -> None:
         assert proxied.demands == [True]
         flow = proxied.describe(Contract())
         flow.message(1, 0, framed("one"))
-        proxied.topics.detach(Detach(1, CMD, 1))
+        proxied.topics.detach(CMD, 1)
         assert proxied.topics.flows == {}
         proxied.topics.retract(CMD)
         await asyncio.sleep(0.01)
@@ -157,7 +157,7 @@ def test_a_source_appears_flows_and_disappears() -> None:
 def test_a_description_without_a_proxy_has_no_effect() -> None:
     async def scene(proxied: Proxied) -> None:
         about = Description("a/B", MD5, "", False)
-        proxied.topics.describe(Describe(1, CMD, 1, about, Contract()))
+        proxied.topics.describe(CMD, RouteOpened(1, about))
         assert proxied.topics.flows == {}
 
     play(scene)
@@ -200,7 +200,7 @@ def test_a_changed_header_reconnects_the_subscribers() -> None:
         listener = Heard(publication)
         proxied.describe(Contract(), latching=True)
         proxied.topics.flows[1].message(1, 0, framed("map"))
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         proxied.named.clear()
         flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
         assert listener.closed
@@ -223,7 +223,7 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
         flow.message(1, 0, framed("one"))
         flow.part(2, 0, FIRST, framed("half", 1000)[:500])
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         assert proxied.topics.position(CMD) == (5, 1)
         assert proxied.topics.flow(CMD) is flow
         assert proxied.describe(SURE, route=4, epoch=5) is flow
@@ -244,7 +244,7 @@ def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
         flow = proxied.describe(SURE, epoch=5, latching=True)
         flow.message(1, 0, framed("map"))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         assert proxied.describe(SURE, epoch=6, latching=True) is flow
         flow.message(1, 0, framed("map"))
         flow.message(2, 0, framed("new map"))
@@ -263,7 +263,7 @@ def test_what_a_sender_says_that_it_has_given_up_is_lost(
         flow = proxied.describe(SURE, epoch=5)
         flow.message(1, 0, framed("one"))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         assert proxied.describe(SURE, route=2, **told) is flow
         assert (lost(flow), proxied.kinds()) == (count, kinds)
 
@@ -303,7 +303,7 @@ def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(last: int) -> No
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
         proxied.describe(SURE, epoch=5).message(1, 0, framed("one"))
-        proxied.topics.detach(Detach(1, CMD, 1, missed=True, last=last))
+        proxied.topics.detach(CMD, 1, missed=True, last=last)
         new = proxied.describe(SURE, route=2, epoch=6)
         assert (lost(new), proxied.kinds()) == (
             last - 1,
@@ -318,7 +318,7 @@ def test_another_transport_continues_the_flow() -> None:
         await proxied.publish()
         old = proxied.describe(SURE, epoch=5)
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         changed = Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
         assert proxied.describe(changed, epoch=5) is old
         assert old.contract == changed
@@ -332,7 +332,7 @@ def test_a_changed_contract_makes_a_new_flow() -> None:
         old = proxied.describe(SURE, epoch=5)
         old.message(1, 0, framed("one"))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=6)
         assert new is not old
         new.message(1, 0, framed("two"))
@@ -349,9 +349,9 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
         flow = proxied.describe(SURE, epoch=5, latching=True)
         flow.message(1, 0, framed("one"))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         if how == "detach":
-            proxied.topics.detach(Detach(1, CMD, 0))
+            proxied.topics.detach(CMD, 0)
             assert publication.latched == ()
         else:
             proxied.topics.retract(CMD)
@@ -372,7 +372,7 @@ def test_a_short_silence_repeats_no_latched_message() -> None:
         listener = Heard(publication)
         proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         late = Heard(publication)
         flow = proxied.describe(Contract(), latching=True)
         flow.message(1, 0, framed("map"))
@@ -398,7 +398,7 @@ def test_a_missed_deadline_is_said_when_it_is_missed() -> None:
         assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
             (1.9, QosEventKind.DEADLINE_MISSED)
         ]
-        proxied.topics.detach(Detach(1, CMD, 1))
+        proxied.topics.detach(CMD, 1)
         await asyncio.sleep(60.0)
         assert len(proxied.occurred) == 1, "nobody waits for it any more"
 
@@ -410,7 +410,7 @@ def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
         await proxied.publish()
         proxied.describe(Contract(deadline=0.2))
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         await asyncio.sleep(0.5)
         assert proxied.kinds() == [QosEventKind.DEADLINE_MISSED] * 2
         proxied.topics.retract(CMD)
@@ -427,11 +427,11 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> Non
         proxied.describe(ALIVE)
         proxied.topics.link_down()
         if silent:
-            proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+            proxied.topics.detach(CMD, 1, keep=True)
             await asyncio.sleep(mesh_limits.AWAY_GRACE)
             assert proxied.occurred == []
         else:
-            proxied.topics.detach(Detach(1, CMD, 1))
+            proxied.topics.detach(CMD, 1)
         proxied.topics.retract(CMD)
         assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
         await asyncio.sleep(60.0)
@@ -446,7 +446,7 @@ def test_a_source_that_is_back_within_its_lease_was_never_lost() -> None:
         contract = Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0)
         proxied.describe(contract, epoch=5)
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         await asyncio.sleep(4.0)
         proxied.describe(contract, epoch=5)
         await asyncio.sleep(60.0)
@@ -462,7 +462,7 @@ def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None
         await asyncio.sleep(10.0)
         began = proxied.loop.time()
         proxied.topics.link_down()
-        proxied.topics.detach(Detach(1, CMD, 1, keep=True))
+        proxied.topics.detach(CMD, 1, keep=True)
         await asyncio.sleep(20.0)
         [(lost, occurred)] = proxied.occurred
         assert occurred.kind is QosEventKind.LIVELINESS_LOST

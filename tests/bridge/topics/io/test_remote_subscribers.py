@@ -25,12 +25,12 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import subscribers as module
-from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
 from rmpa.trust.permissions import Permissions
+from tests.bridge.recorder import Exports, Imports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,11 +83,11 @@ class World:
         link = SimpleNamespace(name="base", send_control=lambda payload: self.sent.append(decode(payload)))
         proxies = SimpleNamespace(prefix="/rmpa/base")
         self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, proxies=proxies))
-        topics = {1: SimpleNamespace(publication=self._publication)}
-        refusals = SimpleNamespace(refuse=lambda _now, kind, _who, _text: self.warned.append(kind))
-        self.presence = RemoteSubscribers(
-            self.exports, self.imports, cast("Any", {1: self.peer}), cast("Any", topics), cast("Any", refusals), gate
-        )
+        peers: Any = {1: SimpleNamespace(publication=self._publication)}
+        out: Any = SimpleNamespace(warn=lambda kind, _who, _text: self.warned.append(kind))
+        exports, imports = cast("Any", self.exports), cast("Any", self.imports)
+        shared = SimpleNamespace(sessions={1: self.peer}, context=SimpleNamespace(gate=gate))
+        self.presence = RemoteSubscribers(cast("Any", shared), out, exports, imports, peers)
         self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 

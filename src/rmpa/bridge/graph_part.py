@@ -1,0 +1,280 @@
+"""What the parts for topics and for services have in common."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from abc import abstractmethod
+from collections import OrderedDict, deque
+from itertools import chain, islice
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+from rmpa.bridge import limits
+from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
+from rmpa.bridge.offers import Effects
+from rmpa.bridge.sessions import Part, UnchangedGraph
+from rmpa.core.counters import RefusalLog
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.runtime.loop import MachineTimer, yield_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from rmpa.bridge.context import BridgeContext
+    from rmpa.bridge.direct.grants import Grants
+    from rmpa.bridge.direct.paths import Paths
+    from rmpa.bridge.messages import Message
+    from rmpa.bridge.offers import ImportBook, OfferBook
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.shared import Shared
+
+_log = logging.getLogger(__name__)
+
+_END: Final = object()
+
+
+class GraphPart(Part, Effects):
+    """Offers to peers what the local graph has, and shows in it what they offer.
+
+    A graph of thousands of names must not delay a message. Names to look at, advertisements to apply and entries to
+    judge by new rules are therefore queued. A slice of them is done in each turn of the event loop, and data may be
+    handled between any two. Nothing else lets data pass: what ``exports`` and ``imports`` have done here (a message
+    is sent, a topic is published) is done at once, and calls neither of them back in the same turn.
+
+    Args:
+        shared: The core, the peers and the rules.
+        exports: The class of ``exports``.
+        imports: The class of ``imports``.
+    """
+
+    exports: OfferBook[Any, Any, Any]
+    """What is offered."""
+    imports: ImportBook[Any, Any, Any]
+    """What peers offer."""
+    direct_exports: Grants
+    """Direct connections of peers' nodes to local ones."""
+    direct_imports: Paths
+    """Direct connections of local nodes to peers' ones."""
+    verb: ClassVar[str]
+    """What a peer does with its entries, for the log."""
+
+    def __init__(
+        self, shared: Shared, exports: type[OfferBook[Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
+    ) -> None:
+        self._shared = shared
+        self.rng = shared.rng
+        self.refusals = RefusalLog(_log, shared.counters)
+        """Logs and counts warnings, and peers that break the protocol."""
+        self.exports = exports(self)
+        self.imports = imports(self)
+        self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)
+        # Ordered: in a plain dict, taking the first item skips over the places of all items taken before.
+        self._changed: OrderedDict[str, None] = OrderedDict()
+        self._advertisements: deque[tuple[PeerSession, bytes | Iterator[None]]] = deque()
+        self._unread_bytes = 0
+        self._rejudging: Iterator[None] = iter(())
+        self._freeing: deque[Iterator[None]] = deque()
+        self._scan_handle: asyncio.Handle | None = None
+        self._unchanged = UnchangedGraph()
+        self._closed = False
+
+    @property
+    def context(self) -> BridgeContext:
+        """The rules that hold now."""
+        return self._shared.context
+
+    @property
+    def idle(self) -> bool:
+        """Whether all changes of the local graph were looked at."""
+        return not self._changed
+
+    async def close(self) -> None:
+        """Stop all slices and the timer."""
+        self._closed = True
+        self._timer.close()
+        if self._scan_handle is not None:
+            self._scan_handle.cancel()
+
+    # --- effects -------------------------------------------------------------------------------------------------
+
+    def send(self, peer: int, message: Message) -> None:
+        """As of ``Effects``."""
+        session = self._shared.sessions.get(peer)
+        if session is not None and session.linked:
+            session.link.send_control(encode(message))
+
+    def warn(self, kind: str, who: str, text: str) -> None:
+        """As of ``Effects``."""
+        self.refusals.refuse(self.now(), kind, who, text)
+
+    def arm_timer(self) -> None:
+        """As of ``Effects``."""
+        self._timer.arm()
+
+    def refuse(self, session: PeerSession, error: RemoteProtocolError) -> None:
+        """Log that a peer broke the protocol, and close its link."""
+        text = f"{session.link.name} broke the protocol: {error}"
+        self.warn("link.malformed", session.link.remote_endpoint[0], text)
+        session.link.abort(text)
+
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return asyncio.get_running_loop().time()
+
+    # --- peers ---------------------------------------------------------------------------------------------------
+
+    def link_up(self, session: PeerSession) -> None:
+        """Begin the advertisement to a peer, and wait for the peer's own."""
+        peer, identity = session.peer, session.link.identity
+        instance = identity.instance.hex()
+        self.imports.ways.instance = self._shared.relay.instance
+        self.imports.link_up(peer, identity.name, instance, identity.guid.value)
+        self.exports.link_up(peer, identity.name, instance)
+        self.direct_imports.link_up(session)
+        self.direct_exports.link_up(session)
+        self.schedule()
+
+    def link_down(self, session: PeerSession) -> None:
+        """Drop the peer's advertisements that are not applied yet."""
+        self.direct_imports.link_down(session)
+        self.direct_exports.link_down(session)
+        self._advertisements = deque(one for one in self._advertisements if one[0] is not session)
+        self._unread_bytes = sum(len(waiting) for _, waiting in self._advertisements if isinstance(waiting, bytes))
+
+    def gone(self, session: PeerSession) -> None:
+        """Forget a peer."""
+        self.direct_imports.gone(session)
+        self.direct_exports.gone(session)
+
+    def depends(self, session: PeerSession) -> bool:
+        """Whether an advertisement of a peer is not applied yet."""
+        return any(one is session for one, _ in self._advertisements)
+
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        self.imports.reached_here(instance, reached=reached)
+
+    def advertised(self, session: PeerSession, payload: bytes) -> None:
+        """Queue a peer's advertisement. Parsing takes long, so it is done later, unless too many bytes wait.
+
+        Raises:
+            LimitExceeded: It is longer than ``limits.ADVERTISEMENT_MAX``.
+        """
+        if len(payload) > limits.ADVERTISEMENT_MAX:
+            raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
+        self._advertisements.append((session, payload))
+        self._unread_bytes += len(payload)
+        self.schedule()
+        while self._unread_bytes > limits.ADVERTISED_WAITING_BYTES:
+            self._apply_next()
+
+    def _apply_next(self) -> None:
+        """Parse the advertisement that has waited longest, or apply the next entry of it if it is parsed."""
+        session, waiting = self._advertisements[0]
+        if not isinstance(waiting, bytes):
+            if next(waiting, _END) is _END:
+                self._advertisements.popleft()
+            return
+        self._advertisements.popleft()
+        self._unread_bytes -= len(waiting)
+        try:
+            message = decode(waiting)
+        except RemoteProtocolError as error:
+            self.refuse(session, error)
+            return
+        if isinstance(message, Advertise | AdvertiseServices):
+            self._advertisements.appendleft((session, self._applied(session, message)))
+
+    def _applied(self, session: PeerSession, message: Advertise | AdvertiseServices) -> Iterator[None]:
+        if message.added or message.removed:
+            more, less = len(message.added), len(message.removed)
+            _log.info("< %s %s %d more %s, %d less", session.link.name, self.verb, more, self.exports.kind, less)
+        for wire, offer in self.imports.changes(session.peer, message):
+            self.imports.take_in(session.peer, wire, offer, self.now())
+            yield
+
+    # --- the local graph -----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _look_at(self, name: str) -> None:
+        """Take the present state of a name in the local graph."""
+
+    @abstractmethod
+    def _names(self) -> Iterable[str]:
+        """All names of the local graph, and those that were seen in it."""
+
+    def _settled(self) -> None:
+        """Nothing is left to do after a change."""
+
+    def start(self) -> None:
+        """Follow the local graph."""
+        self.look(self._names())
+
+    def look(self, names: Iterable[str]) -> None:
+        """Queue names under which the local graph may have changed."""
+        self._changed |= dict.fromkeys(names)
+        self.schedule()
+
+    def look_again(self) -> bool:
+        """Queue all names, unless nothing can have changed since they were; return whether it was done."""
+        due = self._unchanged.is_due(self._shared.core.state(), steady=not self._shared.core.unreachable())
+        if due:
+            self.look(self._names())
+        return due
+
+    def reload(self) -> None:
+        """Judge by new rules; entries and routes that they do not change go on untouched."""
+        self._rejudging = chain(self.exports.reload(), self.imports.reload(self.now()))
+        self.schedule()
+
+    # --- a slice of it -------------------------------------------------------------------------------------------
+
+    def run(self, steps: Iterator[object]) -> None:
+        """Take all items now; data is handled between any two."""
+        for _ in steps:
+            yield_to_data()
+
+    def schedule(self, delay: float = 0.0) -> None:
+        """Do a slice of the queued work in the next turn of the loop, or after a delay in seconds."""
+        if self._scan_handle is None and not self._closed:
+            loop = asyncio.get_running_loop()
+            self._scan_handle = loop.call_later(delay, self._scan) if delay else loop.call_soon(self._scan)
+
+    def _scan(self) -> None:
+        self._scan_handle = None
+        try:
+            self._do_slice()
+        except Exception:  # noqa: BLE001 - the rest must not wait for the next change
+            _log.exception("! a slice of work failed; the rest goes on")
+            if self._changed or self._advertisements or self._freeing:  # of which each slice takes some: it ends
+                self.schedule()
+
+    def _do_slice(self) -> None:
+        for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
+            yield_to_data()
+            self._look_at(self._changed.popitem(last=False)[0])
+        told = False
+        for _ in self.exports.advertise(self.now(), self._is_busy):
+            told = True
+            yield_to_data()
+        for _ in range(limits.APPLIED_AT_ONCE):
+            if self._advertisements:
+                self._apply_next()
+                yield_to_data()
+        if self._freeing and not tuple(islice(self._freeing[0], limits.APPLIED_AT_ONCE)):
+            self._freeing.popleft()
+        rejudged = False
+        for _ in islice(self._rejudging, limits.APPLIED_AT_ONCE):
+            rejudged = True
+            yield_to_data()
+        pending = self.exports.pending
+        if self._changed or self._advertisements or self._freeing or rejudged or (told and pending):
+            self.schedule()
+        elif pending:  # earlier portions are still on their way
+            self.schedule(limits.TELL_PAUSE)
+        else:
+            self._settled()
+
+    def _is_busy(self, peer: int) -> bool:
+        session = self._shared.sessions.get(peer)
+        return session is not None and session.link.busy

@@ -1,0 +1,429 @@
+"""What the exports and imports of topics and services do, written down in the order in which they did it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from rmpa.bridge.context import BridgeContext, Names, ServiceRules
+from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
+from rmpa.bridge.services import exports as service_exports
+from rmpa.bridge.services import imports as service_imports
+from rmpa.bridge.topics import exports as topic_exports
+from rmpa.bridge.topics import imports as topic_imports
+from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings, Settings
+from rmpa.core import limits as core_limits
+from rmpa.core.contract import Contract, Contracts
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
+    from rmpa.bridge.services.bodies import LocalService
+    from rmpa.bridge.services.exports import ServiceRoute
+    from rmpa.bridge.services.imports import RemoteService
+    from rmpa.bridge.topics.exports import ExportRoute
+    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.ros.wire.tcpros import ServiceDescription
+
+
+class Send(NamedTuple):
+    peer: int
+    message: Message
+
+
+class Warn(NamedTuple):
+    kind: str
+    who: str
+    text: str
+
+
+class Connect(NamedTuple):
+    source: Source
+    uri: str
+
+
+class Disconnect(NamedTuple):
+    source: Source
+
+
+class AddRoute(NamedTuple):
+    source: Source
+    peer: int
+    route: int
+    contract: Contract
+    epoch: int = 0
+    after: int | None = None
+
+
+class RemoveRoute(NamedTuple):
+    source: Source
+    peer: int
+    route: int
+
+
+class SuspendRoute(NamedTuple):
+    source: Source
+    peer: int
+    outage: float = core_limits.RESUME_WINDOW
+
+
+class Publish(NamedTuple):
+    peer: int
+    source: Source
+    type: str
+    topic: str = ""
+    origin: Origin | None = None
+
+
+class Retract(NamedTuple):
+    peer: int
+    source: Source
+
+
+class Describe(NamedTuple):
+    peer: int
+    source: Source
+    route: int
+    description: Description
+    contract: Contract
+    epoch: int = 0
+    first: int = 1
+
+
+class Detach(NamedTuple):
+    peer: int
+    source: Source
+    route: int
+    keep: bool = False
+    missed: bool = False
+    last: int | None = None
+
+
+class Probe(NamedTuple):
+    service: str
+    server: LocalService
+
+
+class ServeRoute(NamedTuple):
+    peer: int
+    route: int
+    requests: int
+    service: str
+    server: LocalService
+    timeout: float
+
+
+class EndRoute(NamedTuple):
+    peer: int
+    requests: int
+
+
+class ServerGone(NamedTuple):
+    service: str
+
+
+class Provide(NamedTuple):
+    peer: int
+    service: str
+    node: str
+
+
+class Withdraw(NamedTuple):
+    peer: int
+    service: str
+    node: str
+    reason: str
+
+
+class OpenedService(NamedTuple):
+    peer: int
+    service: str
+    route: int
+    requests: int
+    about: ServiceDescription | None
+
+
+class EndedService(NamedTuple):
+    peer: int
+    service: str
+    route: int
+    reason: str
+
+
+class ForgetAbout(NamedTuple):
+    peer: int
+    service: str
+
+
+class Out(
+    topic_exports.ExportEffects,
+    topic_imports.ImportEffects,
+    service_exports.ServiceExportEffects,
+    service_imports.ServiceImportEffects,
+):
+    """What a part of the bridge does for its exports and imports."""
+
+    def __init__(
+        self,
+        context: BridgeContext,
+        rng: Callable[[], float] = lambda: 1.0,
+        position: Callable[[int, Source], tuple[int, int] | None] = lambda *_: None,
+        numbering: Callable[[Source, int], Any] = lambda *_: None,
+    ) -> None:
+        self.rules = context
+        self.rng = rng
+        self._numbering = numbering
+        self.done: list[Any] = []
+        self._position = position
+
+    @property
+    def context(self) -> BridgeContext:
+        return self.rules
+
+    def numbering(self, source: Source, peer: int) -> Any:
+        return self._numbering(source, peer)
+
+    def take(self) -> list[Any]:
+        """What was done since the last call."""
+        done, self.done = self.done, []
+        return done
+
+    def send(self, peer: int, message: Message) -> None:
+        self.done.append(Send(peer, message))
+
+    def warn(self, kind: str, who: str, text: str) -> None:
+        self.done.append(Warn(kind, who, text))
+
+    def connect(self, source: Source, uri: str) -> None:
+        self.done.append(Connect(source, uri))
+
+    def disconnect(self, source: Source) -> None:
+        self.done.append(Disconnect(source))
+
+    def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
+        self.done.append(AddRoute(source, peer, route.number, route.contract, route.epoch, route.after))
+
+    def remove_route(self, source: Source, peer: int, number: int) -> None:
+        self.done.append(RemoveRoute(source, peer, number))
+
+    def suspend_route(self, source: Source, peer: int, outage: float) -> None:
+        self.done.append(SuspendRoute(source, peer, outage))
+
+    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
+        return self._position(entry.peer, entry.wire)
+
+    def publish(self, entry: RemoteTopic) -> None:
+        topic = entry.name if entry.name != entry.wire.topic else ""
+        self.done.append(Publish(entry.peer, entry.wire, entry.type, topic, entry.origin))
+
+    def retract(self, entry: RemoteTopic) -> None:
+        self.done.append(Retract(entry.peer, entry.wire))
+
+    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
+        terms = (opened.contract, opened.epoch, opened.first)
+        self.done.append(Describe(entry.peer, entry.wire, opened.route, opened.description, *terms))
+
+    def detach(
+        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
+    ) -> None:
+        self.done.append(Detach(entry.peer, entry.wire, entry.route, keep, missed, last))
+
+    def probe(self, service: str, server: LocalService) -> None:
+        self.done.append(Probe(service, server))
+
+    def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
+        self.done.append(ServeRoute(peer, number, route.requests, route.service, server, route.timeout))
+
+    def end_route(self, peer: int, requests: int) -> None:
+        self.done.append(EndRoute(peer, requests))
+
+    def server_gone(self, service: str) -> None:
+        self.done.append(ServerGone(service))
+
+    def provide(self, remote: RemoteService) -> None:
+        self.done.append(Provide(remote.peer, remote.name, remote.node))
+
+    def withdraw(self, remote: RemoteService, reason: str) -> None:
+        self.done.append(Withdraw(remote.peer, remote.name, remote.node, reason))
+
+    def opened(self, remote: RemoteService) -> None:
+        self.done.append(OpenedService(remote.peer, remote.name, remote.route, remote.requests, remote.about))
+
+    def ended(self, remote: RemoteService, route: int, reason: str) -> None:
+        self.done.append(EndedService(remote.peer, remote.name, route, reason))
+
+    def forget_about(self, remote: RemoteService) -> None:
+        self.done.append(ForgetAbout(remote.peer, remote.name))
+
+
+def context(
+    policy: Policy | None = None,
+    contracts: Contracts | None = None,
+    names: Names | None = None,
+    limits: LimitSettings | None = None,
+    gate: PermissionGate = OPEN_GATE,
+    services: ServiceRules | None = None,
+) -> BridgeContext:
+    """Rules of a module; those that are left out allow everything."""
+    policy = policy or (services._policy if services is not None else Policy(PolicySettings()))
+    names = names or (services._names if services is not None else Names())
+    rules = services or ServiceRules(ServiceSettings(), policy, names)
+    settings = Settings(limits=limits or LimitSettings())
+    return BridgeContext(settings, policy, rules, names, contracts or Contracts(), gate)
+
+
+_STEPS: Final = {"advertise", "link_away", "link_down", "reload", "gone"}
+"""Methods whose work is done as their items are taken; in some books they do it at once."""
+
+
+_QUESTIONS: Final = {"get", "next_timer", "offer", "contract", "description", "source", "shown", "decision"}
+"""Methods that may answer ``None``."""
+
+
+class Recorded:
+    """A book whose methods return what was done by them; questions are answered."""
+
+    questions = _QUESTIONS
+
+    def __init__(self, book: Any, out: Out) -> None:
+        self.book = book
+        self.out = out
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.book)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.book, name)
+        if not callable(value) or name in self.questions:
+            return value
+
+        def call(*args: Any, **named: Any) -> Any:
+            result = value(*args, **named)
+            if result is not None and name not in _STEPS:
+                return result
+            for _ in result if result is not None else ():
+                pass
+            return self.out.take()
+
+        return call
+
+    def advertised(self, peer: int, message: Any, now: float = 0.0) -> list[Any]:
+        """Take a whole advertisement."""
+        for wire, offer in self.book.changes(peer, message):
+            self.book.take_in(peer, wire, offer, now)
+        return self.out.take()
+
+    def rejudge(self, rules: BridgeContext, *now: float) -> Iterator[list[Any]]:
+        """Take new rules: what is done at once, and with each item."""
+        self.out.rules = rules
+        steps = self.book.reload(*now)
+        yield self.out.take()
+        for _ in steps:
+            yield self.out.take()
+        yield self.out.take()
+
+
+class Exports(Recorded):
+    questions = _QUESTIONS | {"local"}
+
+    def __init__(
+        self,
+        policy: Policy | None = None,
+        contracts: Contracts | None = None,
+        names: Names | None = None,
+        limit_settings: LimitSettings | None = None,
+        numbering: Callable[[Source, int], Any] = lambda *_: None,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        out = Out(context(policy, contracts, names, limit_settings, gate), numbering=numbering)
+        super().__init__(topic_exports.Exports(out), out)
+
+    def link_away(self, peer: int) -> tuple[list[Any], bool]:
+        """What is done, and whether a route waits."""
+        for _ in self.book.link_away(peer):
+            pass
+        return self.out.take(), self.book.waits_for(peer)
+
+    def apply_rules(
+        self,
+        policy: Policy,
+        contracts: Contracts | None = None,
+        names: Names | None = None,
+        limits: LimitSettings | None = None,
+    ) -> list[Any]:
+        rules = context(policy, contracts, names, limits, self.out.context.gate)
+        return [done for some in self.rejudge(rules) for done in some]
+
+
+class Imports(Recorded):
+    def __init__(
+        self,
+        policy: Policy | None = None,
+        rng: Callable[[], float] = lambda: 1.0,
+        contracts: Contracts | None = None,
+        position: Callable[[int, Source], tuple[int, int] | None] = lambda *_: None,
+        names: Names | None = None,
+        limit_settings: LimitSettings | None = None,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        out = Out(context(policy, contracts, names, limit_settings, gate), rng, position)
+        super().__init__(topic_imports.Imports(out), out)
+
+    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Any], bool]:
+        """What is done, and whether a source waits."""
+        for _ in self.book.link_away(peer, briefly=briefly):
+            pass
+        return self.out.take(), bool(self.book._peers[peer].entries)
+
+    def refused_nodes(self, peer: int) -> dict[str, list[Source]]:
+        """The sources that wait for a place, by node."""
+        return {node: [one.wire for one in waiting] for node, waiting in self.book.refused_nodes(peer).items()}
+
+    def apply_rules(
+        self,
+        policy: Policy,
+        contracts: Contracts | None = None,
+        names: Names | None = None,
+        now: float = 0.0,
+        limits: LimitSettings | None = None,
+    ) -> Iterator[list[Any]]:
+        return self.rejudge(context(policy, contracts, names, limits, self.out.context.gate), now)
+
+
+class ServiceExports(Recorded):
+    questions = _QUESTIONS | {"local"}
+
+    def __init__(
+        self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        out = Out(context(limits=limit_settings, gate=gate, services=rules))
+        super().__init__(service_exports.ServiceExports(out), out)
+
+    def apply_rules(self, rules: ServiceRules, limits: LimitSettings | None = None) -> Iterator[list[Any]]:
+        return self.rejudge(context(limits=limits, gate=self.out.context.gate, services=rules))
+
+    def graph(self, service: str, server: LocalService | None) -> list[Any]:
+        """Set a service's server."""
+        self.book.put(service, server)
+        return self.out.take()
+
+
+class ServiceImports(Recorded):
+    def __init__(
+        self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
+    ) -> None:
+        out = Out(context(limits=limit_settings, gate=gate, services=rules))
+        super().__init__(service_imports.ServiceImports(out), out)
+
+    def hidden(self, remote: RemoteService) -> str:
+        """Why a service is not shown."""
+        why, _ = self.book.why_hidden(remote)
+        assert remote.shown is not bool(why)
+        return str(why)
+
+    def refused_nodes(self, peer: int) -> dict[str, list[str]]:
+        """The services that wait for a place, by node."""
+        return {node: [one.name for one in waiting] for node, waiting in self.book.refused_nodes(peer).items()}
+
+    def apply_rules(self, rules: ServiceRules, limits: LimitSettings | None = None) -> Iterator[list[Any]]:
+        return self.rejudge(context(limits=limits, gate=self.out.context.gate, services=rules), 0.0)
