@@ -5,16 +5,15 @@ from __future__ import annotations
 import ssl
 import tempfile
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from cryptography.hazmat.primitives import serialization
 
-from rmpa.runtime.tls import DataSocket, SecureSocket, TlsHandshake
+from rmpa.runtime.tls import SecureSocket, TlsHandshake
 from tests.trust.authority import Authority, new_key
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Sequence
 
     from rmpa.runtime.tls import Buffer
 
@@ -51,9 +50,11 @@ def shake(contexts: Contexts) -> tuple[TlsHandshake, TlsHandshake]:
     return client, server
 
 
-def secure_pair(contexts: Contexts, one: DataSocket, other: DataSocket) -> tuple[SecureSocket, SecureSocket]:
+def secure_pair(
+    contexts: Contexts, one: socket.socket | Slow, other: socket.socket | Slow
+) -> tuple[SecureSocket, SecureSocket]:
     client, server = shake(contexts)
-    return client.secure(one), server.secure(other)
+    return client.secure(cast("socket.socket", one)), server.secure(cast("socket.socket", other))
 
 
 class Slow:
@@ -62,8 +63,8 @@ class Slow:
     def __init__(self, sock: socket.socket, most: int) -> None:
         self._sock, self._most = sock, most
 
-    def sendmsg(self, buffers: Sequence[Buffer], /) -> int:
-        return self._sock.send(b"".join(buffers)[: self._most])
+    def send(self, data: Buffer, /) -> int:
+        return self._sock.send(data[: self._most])
 
     def recv_into(self, buffer: memoryview, /) -> int:
         return self._sock.recv_into(buffer[: self._most])

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.runtime.tls import RecordIncomplete, SecureSocket, TlsHandshake
+from rmpa.runtime.tls import INCOMPLETE, SecureSocket, TlsHandshake
 from tests.runtime.secure_pairs import Slow, make_context, make_contexts, secure_pair
 from tests.trust.authority import Authority
 
@@ -60,7 +60,7 @@ def _transfer(sender: SecureSocket, receiver: SecureSocket, messages: list[list[
         try:
             count = receiver.recv_into(view)
             assert count
-            got += view[:count]
+            got += view[: max(count, 0)]
         except BlockingIOError:
             continue
     return bytes(got)
@@ -74,9 +74,8 @@ def test_a_message_is_one_record(contexts: tuple[ssl.SSLContext, ssl.SSLContext]
     view = memoryview(bytearray(4096))
     assert other.recv_into(view) == 88
     assert view[:88] == b"h" * 24 + b"x" * 64
-    with pytest.raises(BlockingIOError) as caught:
+    with pytest.raises(BlockingIOError):
         other.recv_into(view)
-    assert not isinstance(caught.value, RecordIncomplete)
 
 
 def test_nothing_is_readable_on_the_way(contexts: tuple[ssl.SSLContext, ssl.SSLContext], sockets: Sockets) -> None:
@@ -111,7 +110,7 @@ def test_parts_are_taken_in_order_and_at_most_so_many(
         if one.pending:
             one.flush()
         try:
-            got += view[: other.recv_into(view)]
+            got += view[: max(other.recv_into(view), 0)]
         except BlockingIOError:
             continue
     assert got == whole[:taken]
@@ -147,8 +146,7 @@ def test_a_part_of_a_record_is_a_sign_of_life(
     one, other = secure_pair(contexts, Slow(sockets[0], 10), sockets[1])
     one.sendmsg((b"x" * 100,))
     view = memoryview(bytearray(4096))
-    with pytest.raises(RecordIncomplete):
-        other.recv_into(view)
+    assert other.recv_into(view) == INCOMPLETE
     while not one.flush():
         pass
     assert other.recv_into(view) == 100
@@ -188,8 +186,7 @@ def test_an_end_in_the_middle_is_the_end(contexts: tuple[ssl.SSLContext, ssl.SSL
     one.sendmsg((b"x" * 100,))
     one.close()
     view = memoryview(bytearray(100))
-    with pytest.raises(RecordIncomplete):
-        other.recv_into(view)
+    assert other.recv_into(view) == INCOMPLETE
     assert other.recv_into(view) == 0
 
 

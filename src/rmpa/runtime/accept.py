@@ -1,7 +1,5 @@
 """What takes from the system: connections, descriptors, listening sockets and threads.
 
-Accepts the connections of a listening socket, for every server of this process.
-
 A connection for which no file descriptor is left is closed at once. Where accept(2) itself fails, the listening
 socket stays readable, and the loop would call the server again and again: an ``Acceptor`` pauses then.
 """
@@ -20,6 +18,7 @@ import socket
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -125,14 +124,12 @@ class Descriptors:
     @property
     def limit(self) -> int:
         """The soft limit, which may be changed while the process runs (prlimit(1))."""
-        soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        return sys.maxsize if soft == resource.RLIM_INFINITY else soft
+        return _file_limits()[0]
 
     @property
     def hard_limit(self) -> int:
         """The highest soft limit that needs no privileges."""
-        hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-        return sys.maxsize if hard == resource.RLIM_INFINITY else hard
+        return _file_limits()[1]
 
     @property
     def reserve(self) -> int:
@@ -224,19 +221,27 @@ def _count_open(limit: int) -> int:
         return limit  # no descriptor is left for the listing: all are open
 
 
+def _file_limits() -> tuple[int, int]:
+    """The soft and the hard limit of open files."""
+    soft, hard = (
+        sys.maxsize if limit == resource.RLIM_INFINITY else limit
+        for limit in resource.getrlimit(resource.RLIMIT_NOFILE)
+    )
+    return soft, hard
+
+
 def _reserve(soft: int) -> int:
     return min(limits.DESCRIPTORS_RESERVED, soft // limits.DESCRIPTORS_RESERVED_PART)
 
 
 def raise_file_limit() -> int:
     """Raise the soft limit of open files to the hard one, or ``limits.OPEN_FILES``; return the new limit."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = limits.OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, limits.OPEN_FILES)
-    if soft == resource.RLIM_INFINITY or soft >= wanted:
-        return soft
+    soft, hard = _file_limits()
+    wanted = min(hard, limits.OPEN_FILES)
     with contextlib.suppress(OSError, ValueError):  # some sandboxes forbid it; then the old limit stays
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        return wanted
+        if soft < wanted:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+            return wanted
     return soft
 
 
@@ -264,25 +269,16 @@ async def in_thread(function: Callable[[], _T], name: str) -> _T:
     result: asyncio.Future[_T] = loop.create_future()
 
     def run() -> None:
+        settle: Callable[[], None]
         try:
-            value = function()
-        except Exception as error:  # noqa: BLE001 - handed on
-            end(None, error if not isinstance(error, StopIteration) else RuntimeError(f"StopIteration: {error}"))
-        except BaseException as error:  # noqa: BLE001 - it ends this function, not the process
-            end(None, RuntimeError(f"{type(error).__name__}: {error}"))
-        else:
-            end(value, None)
-
-    def end(value: _T | None, error: Exception | None) -> None:
-        def settle() -> None:
-            if not result.done():
-                if error is not None:
-                    result.set_exception(error)
-                else:
-                    result.set_result(value)  # type: ignore[arg-type] # a value, for there is no error
-
+            settle = partial(result.set_result, function())
+        except BaseException as error:  # noqa: BLE001 - handed on; what ends a process ends this function alone
+            raised = error
+            if not isinstance(error, Exception) or isinstance(error, StopIteration):
+                raised = RuntimeError(f"{type(error).__name__}: {error}")
+            settle = partial(result.set_exception, raised)
         with contextlib.suppress(RuntimeError):  # the loop ended before this thread
-            loop.call_soon_threadsafe(settle)
+            loop.call_soon_threadsafe(lambda: None if result.done() else settle())
 
     context = contextvars.copy_context()
     threading.Thread(target=context.run, args=(run,), name=name, daemon=True).start()

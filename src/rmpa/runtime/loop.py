@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import functools
 import heapq
 import logging
@@ -23,15 +24,13 @@ import random
 import select
 import selectors
 import struct
-import sys
 import time
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, TypeVarTuple, cast
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, TypeVarTuple
 
 if TYPE_CHECKING:
-    import ctypes
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
     from types import TracebackType
 
     from _typeshed import FileDescriptorLike
@@ -60,18 +59,8 @@ def call_at_tick(period: float, callback: Callable[[], object]) -> asyncio.Timer
 
 async def sleep_to_tick(period: float) -> None:
     """Like ``asyncio.sleep``, until the time that ``call_at_tick`` would call at."""
-    loop = asyncio.get_running_loop()
-    ticked = loop.create_future()
-    handle = loop.call_at(next_tick(period, loop.time()), _resolve, ticked)
-    try:
-        await ticked
-    finally:
-        handle.cancel()
-
-
-def _resolve(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)
+    now = asyncio.get_running_loop().time()
+    await asyncio.sleep(next_tick(period, now) - now)
 
 
 # The machine's own clocks.
@@ -134,9 +123,10 @@ class MachineTimer:
 
     def close(self) -> None:
         """Cancel the timer, and drop the references to the machine, whose owner may hold this timer (a cycle)."""
-        self._closed = True
         self._cancel()
-        self._next_timer, self._on_due = _never, _nothing
+        if not self._closed:
+            self._closed = True
+            del self._next_timer, self._on_due
 
     def _cancel(self) -> None:
         self._due = None
@@ -151,19 +141,10 @@ class MachineTimer:
         self.arm()
 
 
-def _never() -> float | None:
-    """The ``next_timer()`` of a timer that is closed."""
-    return None
-
-
-def _nothing(_now: float) -> None:
-    """The ``on_due`` of a timer that is closed."""
-
-
 # A timer as a file descriptor (timerfd_create(2)): due at an absolute time, to the microsecond.
 #
 # The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of
-# 50 µs. A timerfd has neither fault. Python supports it since 3.13; with older versions the C library is called.
+# 50 µs. A timerfd has neither fault. Python supports it since 3.13 only, so the C library is called.
 
 
 _CLOCK_MONOTONIC: Final = 1
@@ -185,11 +166,7 @@ class TimerFd:
     """
 
     def __init__(self, *, blocking: bool) -> None:
-        flags = _CLOEXEC | (0 if blocking else _NONBLOCK)
-        if sys.version_info >= (3, 13):
-            self._fd = os.timerfd_create(_CLOCK_MONOTONIC, flags=flags)
-        else:
-            self._fd = _check(_libc().timerfd_create(_CLOCK_MONOTONIC, flags))
+        self._fd = _check(_libc().timerfd_create(_CLOCK_MONOTONIC, _CLOEXEC | (0 if blocking else _NONBLOCK)))
 
     def fileno(self) -> int:
         """The descriptor, which is readable from the due time until ``wait`` or ``set``; -1 once closed."""
@@ -201,12 +178,8 @@ class TimerFd:
         Raises:
             OSError: The timer is closed.
         """
-        nanoseconds = max(1, round(due * _NANO))
-        if sys.version_info >= (3, 13):
-            os.timerfd_settime_ns(self._fd, flags=os.TFD_TIMER_ABSTIME, initial=nanoseconds)
-        else:
-            spec = _ITIMERSPEC.pack(0, 0, *divmod(nanoseconds, _NANO))
-            _check(_libc().timerfd_settime(self._fd, _ABSTIME, spec, None))
+        spec = _ITIMERSPEC.pack(0, 0, *divmod(max(1, round(due * _NANO)), _NANO))
+        _check(_libc().timerfd_settime(self._fd, _ABSTIME, spec, None))
 
     def wait(self) -> bool:
         """Reset a timer that is due; a blocking timer first sleeps until its due time.
@@ -237,15 +210,11 @@ class TimerFd:
 
 @functools.cache
 def _libc() -> ctypes.CDLL:
-    import ctypes  # noqa: PLC0415 - only programs with timers load it
-
     return ctypes.CDLL(None, use_errno=True)
 
 
 def _check(result: int) -> int:
     if result < 0:
-        import ctypes  # noqa: PLC0415 - likewise
-
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
     return result
@@ -284,28 +253,28 @@ _NOT_WRITABLE: Final = ~select.EPOLLOUT
 _NOT_READABLE: Final = ~select.EPOLLIN
 
 
-class DirectSelector(selectors.BaseSelector):
+class DirectSelector(selectors.EpollSelector):
     """An epoll selector that calls some readers and writers itself: those of the data path."""
 
+    # The base class has them in every supported Python.
+    _selector: select.epoll
+    _fd_to_key: dict[int, selectors.SelectorKey]
+
     def __init__(self) -> None:
-        self._epoll = select.epoll()
+        super().__init__()
         # A second epoll for the direct descriptors alone: the cost of polling them does not depend on all others.
         self._data = select.epoll()
         self._poll_direct = self._data.poll
-        self._keys: dict[int, selectors.SelectorKey] = {}
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
         self.in_direct_call = False
         """Whether a direct reader or writer is running."""
         self.polled_at = self.previous_poll_at = time.monotonic()
 
-    def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
-        """Call ``reader`` when ``fd`` (registered for reading) is readable; ``None``: report it to asyncio."""
-        if reader is None:
-            self._remove_direct(fd)
-            return
+    def call_directly(self, fd: int, reader: Callable[[], None]) -> None:
+        """Call ``reader`` when ``fd`` (registered for reading) is readable, until it is registered no more."""
         if fd not in self._readers:
-            self._data.register(fd, _epoll_events(self._keys[fd].events))
+            self._data.register(fd, _epoll_events(self._fd_to_key[fd].events))
         self._readers[fd] = reader
 
     def write_directly(self, fd: int, writer: Callable[[], None] | None) -> None:
@@ -320,57 +289,19 @@ class DirectSelector(selectors.BaseSelector):
         if not self.in_direct_call and (events := self._poll_direct(0, _MAX_EVENTS)):
             self._call(events)
 
-    def register(
-        self,
-        fileobj: FileDescriptorLike,
-        events: int,
-        data: Any = None,
-    ) -> selectors.SelectorKey:
-        """Watch a file object.
-
-        Raises:
-            KeyError: It is watched already.
-        """
-        fd = _fd(fileobj)
-        if fd in self._keys:
-            raise KeyError(f"{fileobj!r} (FD {fd}) is already registered")
-        self._epoll.register(fd, _epoll_events(events))
-        key = self._keys[fd] = selectors.SelectorKey(fileobj, fd, events, data)
-        return key
-
     def unregister(self, fileobj: FileDescriptorLike) -> selectors.SelectorKey:
-        """Stop watching a file object.
-
-        Raises:
-            KeyError: It is not watched.
-        """
-        key = self._keys.pop(_fd(fileobj))
+        """Stop watching a file object; as in ``selectors``."""
+        key = super().unregister(fileobj)
         self._remove_direct(key.fd)
-        try:
-            self._epoll.unregister(key.fd)
-        except OSError:
-            _log.debug("FD %d was closed before it was unregistered", key.fd)
         return key
 
-    def modify(
-        self,
-        fileobj: FileDescriptorLike,
-        events: int,
-        data: Any = None,
-    ) -> selectors.SelectorKey:
-        """Watch a file object for other events.
-
-        Raises:
-            KeyError: It is not watched.
-        """
-        key = self._keys[_fd(fileobj)]
-        if events != key.events:
-            self._epoll.modify(key.fd, _epoll_events(events))
-            if not events & selectors.EVENT_READ:
-                self._remove_direct(key.fd)
-            elif key.fd in self._readers:
-                self._data.modify(key.fd, _epoll_events(events))
-        key = self._keys[key.fd] = selectors.SelectorKey(fileobj, key.fd, events, data)
+    def modify(self, fileobj: FileDescriptorLike, events: int, data: Any = None) -> selectors.SelectorKey:
+        """Watch a file object for other events; as in ``selectors``."""
+        key = super().modify(fileobj, events, data)
+        if not events & selectors.EVENT_READ:
+            self._remove_direct(key.fd)
+        elif key.fd in self._readers:
+            self._data.modify(key.fd, _epoll_events(events))
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -380,16 +311,16 @@ class DirectSelector(selectors.BaseSelector):
         elif timeout <= 0:
             wait = 0.0
         else:
-            # Rounded up, as asyncio's own selector does: else the loop would wake too early for a timer, and spin.
+            # Rounded up, as in the base class: else the loop would wake too early for a timer, and spin.
             wait = math.ceil(timeout / _EPOLL_RESOLUTION) * _EPOLL_RESOLUTION
         try:
-            happened = self._epoll.poll(wait, max(len(self._keys), 1))
+            happened = self._selector.poll(wait, max(len(self._fd_to_key), 1))
         except InterruptedError:
             return []
         self.previous_poll_at, self.polled_at = self.polled_at, time.monotonic()
         ready = []
         for fd, event in self._call(happened):
-            key = self._keys.get(fd)
+            key = self._fd_to_key.get(fd)
             if key is not None:
                 events = (selectors.EVENT_WRITE if event & _NOT_READABLE else 0) | (
                     selectors.EVENT_READ if event & _NOT_WRITABLE else 0
@@ -422,23 +353,10 @@ class DirectSelector(selectors.BaseSelector):
             with contextlib.suppress(OSError):  # the descriptor is closed already
                 self._data.unregister(fd)
 
-    def get_map(self) -> Mapping[FileDescriptorLike, selectors.SelectorKey]:
-        """The keys of all watched file objects, by file descriptor."""
-        return cast("Mapping[FileDescriptorLike, selectors.SelectorKey]", self._keys)
-
-    def get_key(self, fileobj: FileDescriptorLike) -> selectors.SelectorKey:
-        """The key of a file object.
-
-        Raises:
-            KeyError: It is not watched.
-        """
-        return self._keys[_fd(fileobj)]
-
     def close(self) -> None:
         """Stop watching everything."""
-        self._epoll.close()
+        super().close()
         self._data.close()
-        self._keys.clear()
         self._readers.clear()
         self._writers.clear()
 
@@ -449,9 +367,10 @@ class AgentLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
-        self._poll_data = self._direct_selector.poll_data
+        self.yield_to_data = self._direct_selector.poll_data
+        """Handles the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``."""
         # asyncio takes each ready callback from this queue, and only from it.
-        self._ready: deque[asyncio.Handle] = _ReadyQueue(self._poll_data)
+        self._ready: deque[asyncio.Handle] = _ReadyQueue(self.yield_to_data)
 
     @property
     def previous_poll_at(self) -> float:
@@ -460,10 +379,6 @@ class AgentLoop(asyncio.SelectorEventLoop):
         The data of the present events arrived after that time, so it has waited in this process no longer.
         """
         return self._direct_selector.previous_poll_at
-
-    def yield_to_data(self) -> None:
-        """Handle the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``."""
-        self._poll_data()
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, but called by the selector itself; ``remove_reader`` ends it.
@@ -537,10 +452,7 @@ class _ReadyQueue(deque[asyncio.Handle]):
 
 
 def _fd(fileobj: FileDescriptorLike) -> int:
-    fd: int = fileobj if isinstance(fileobj, int) else int(fileobj.fileno())
-    if fd < 0:
-        raise ValueError(f"{fileobj!r} is closed")
-    return fd
+    return fileobj if isinstance(fileobj, int) else fileobj.fileno()
 
 
 def _epoll_events(events: int) -> int:

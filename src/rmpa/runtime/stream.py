@@ -24,7 +24,7 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.runtime import limits
 from rmpa.runtime import tls as corking
-from rmpa.runtime.tls import Buffer, RecordIncomplete, SecureSocket, unsent
+from rmpa.runtime.tls import INCOMPLETE, Buffer, SecureSocket, unsent
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,8 @@ class Stream:
         self._sock: socket.socket | SecureSocket = sock if secure is None else secure
         self._on_bytes = on_bytes
         self._on_close = on_close
-        self._outbox = outbox
+        self.outbox = outbox
+        """The queue of the waiting bytes, with the counts of dropped entries."""
         self._frame = frame
         self._keep = keep
         self._buffer = bytearray(_FIRST_BUFFER)
@@ -90,7 +91,8 @@ class Stream:
         self._kept_bytes = 0
         self._collection: object = None
         """The read for which messages are kept."""
-        self._closed = False
+        self.closed = False
+        """Whether the socket is gone."""
         self._reading_held = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
@@ -112,30 +114,20 @@ class Stream:
             self._loop.call_soon(self._read_held)
 
     @property
-    def closed(self) -> bool:
-        """Whether the socket is gone."""
-        return self._closed
-
-    @property
     def pending_bytes(self) -> int:
         """Bytes in the outbox, which the socket has not taken yet."""
-        return self._outbox.pending_bytes
+        return self.outbox.pending_bytes
 
     @property
     def unacknowledged(self) -> int:
         """Bytes in the kernel's send queue: not sent yet, or not acknowledged by the remote side."""
-        if self._closed:
+        if self.closed:
             return 0
         return int.from_bytes(fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
 
-    @property
-    def outbox(self) -> Outbox:
-        """The queue of the waiting bytes, with the counts of dropped entries."""
-        return self._outbox
-
     def feed(self, data: Buffer) -> None:
         """Take bytes that were read from the socket before the stream existed."""
-        if self._closed:
+        if self.closed:
             return
         self._reserve(self._filled + len(data))
         self._view[self._filled : self._filled + len(data)] = data
@@ -155,7 +147,7 @@ class Stream:
         Returns:
             How many older messages, of any key, were dropped to make room.
         """
-        if self._closed or self._finishing:
+        if self.closed or self._finishing:
             return 0
         if self._writing:
             return self._queue(b"".join(parts), key)
@@ -166,64 +158,51 @@ class Stream:
 
     def send_mark(self, data: bytes, key: int) -> None:
         """Send a mark after all present messages of a key; unlike a message, a mark is never dropped."""
-        if self._closed or self._finishing:
+        if self.closed or self._finishing:
             return
         if self._kept:
             self._uncork()
         if self._writing:
-            self._outbox.push(data, key, self._loop.time(), pinned=True)
+            self.outbox.push(data, key, self._loop.time(), pinned=True)
         else:
             self._send_now((data,), key)
 
     def adopt(self, outbox: Outbox, frame: Framer | None) -> None:
         """Send from another outbox from now on, its present entries first; it is kept when the socket is gone."""
         self._uncork()
-        rest = b"".join(self._outbox.head(1 << 20))
-        self._outbox.clear()
+        rest = b"".join(self.outbox.head(1 << 20))
+        self.outbox.clear()
         outbox.prepend(rest)
-        self._outbox = outbox
+        self.outbox = outbox
         self._frame = frame
         self._keep = True
         self.pump()
 
     def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:
-        try:
-            sent = self._sock.sendmsg(parts)
-        except (BlockingIOError, InterruptedError):
-            sent = 0
-        except OSError as error:
-            self._lost(error)
-            return 0
-        self.bytes_out += sent
         size = 0
         for buffer in parts:
             size += len(buffer)
-        if sent == size:
+        sent = self._transmit(parts, size)
+        if sent == size or self.closed:
             if self._secure is not None:
                 self._flush_later()
             return 0
-        if sent:
-            sent = self._send_rest(parts, sent, size)
-            if sent == size or self._closed:
-                self._flush_later()
-                return 0
         self._wait_for_room()
         if not sent and not part:
             return self._queue(b"".join(parts), key)
-        self._outbox.push_rest(b"".join(unsent(parts, sent)), key)
+        self.outbox.push_rest(b"".join(unsent(parts, sent)), key)
         return 0
 
-    def _send_rest(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
-        """Try once more to send a message that the socket took in part, because queueing its rest means copying it.
+    def _transmit(self, parts: Sequence[Buffer], size: int) -> int:
+        """Send what the socket takes now of ``size`` bytes; return how many it took.
 
-        The socket often has room again at once.
-
-        Returns:
-            How many bytes of the message were sent in total.
+        A message that it took in part is tried once more, because queueing its rest means copying it: the socket
+        often has room again at once.
         """
+        sent = 0
         while sent < size:
             try:
-                more = self._sock.sendmsg(unsent(parts, sent))
+                more = self._sock.sendmsg(unsent(parts, sent) if sent else parts)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError as error:
@@ -235,7 +214,7 @@ class Stream:
 
     def _flush_later(self) -> None:
         """Wait for room if the socket has not taken all ciphertext of messages that count as sent."""
-        if self._secure is not None and self._secure.pending and not self._closed:
+        if self._secure is not None and self._secure.pending and not self.closed:
             self._wait_for_room()
 
     def _wait_for_room(self) -> None:
@@ -256,7 +235,7 @@ class Stream:
         Returns:
             How many older messages, of any key, were dropped to make room.
         """
-        if self._closed or self._finishing or parcel.dropped:
+        if self.closed or self._finishing or parcel.dropped:
             return 0
         view, dropped = memoryview(data), 0
         while len(view) > _PART:
@@ -266,12 +245,12 @@ class Stream:
 
     def _extend(self, parcel: QueuedMessage, view: memoryview) -> int:
         if self._writing:
-            return self._outbox.extend(parcel, bytes(view))
-        if self._outbox.waiting(parcel.key):
+            return self.outbox.extend(parcel, bytes(view))
+        if self.outbox.waiting(parcel.key):
             # The first bytes had to wait, so the outbox keeps this message's counts.
             if self._kept:
                 self._uncork()
-            dropped = self._outbox.extend(parcel, bytes(view))
+            dropped = self.outbox.extend(parcel, bytes(view))
             self._wait_for_room()
             self._writable()
             return dropped
@@ -289,16 +268,16 @@ class Stream:
             Whether the remote side has an incomplete message that cannot be aborted, so that the connection must be
             closed.
         """
-        if self._closed or parcel.sent == parcel.size:
+        if self.closed or parcel.sent == parcel.size:
             return False
         if self._kept:
             self._uncork()
-        waits = self._writing or self._outbox.waiting(parcel.key)
+        waits = self._writing or self.outbox.waiting(parcel.key)
         if not waits and parcel.sent and not parcel.dropped and self._frame is not None:
             parcel.dropped = True
             self._send_now([self._frame(parcel, 0, LAST | ABORT)], parcel.key)
             return False
-        torn = self._outbox.abandon(parcel)
+        torn = self.outbox.abandon(parcel)
         self.pump()
         return torn
 
@@ -306,7 +285,7 @@ class Stream:
         """Send the entries that other code has put into the outbox."""
         if self._kept:
             self._uncork()
-        if self._outbox and not self._writing and not self._closed:
+        if self.outbox and not self._writing and not self.closed:
             self._wait_for_room()
 
     def _framed(self, parcel: QueuedMessage, view: memoryview) -> list[Buffer]:
@@ -340,25 +319,16 @@ class Stream:
         kept, self._kept = self._kept, []
         size, self._kept_bytes = self._kept_bytes, 0
         self._collection = None
-        if self._closed or not kept:
+        if self.closed or not kept:
             return
-        if self._writing or self._outbox:
+        if self._writing or self.outbox:
             self._keep_rest(kept, 0)  # after the entries that the outbox is sending
             return
         if len(kept) == 1:
             self._send_now(*kept[0])
             return
-        try:
-            sent = self._sock.sendmsg([buffer for parts, _, _ in kept for buffer in parts])
-        except (BlockingIOError, InterruptedError):
-            sent = 0
-        except OSError as error:
-            self._lost(error)
-            return
-        self.bytes_out += sent
-        if 0 < sent < size:
-            sent = self._send_rest([buffer for parts, _, _ in kept for buffer in parts], sent, size)
-        if sent < size and not self._closed:
+        sent = self._transmit([buffer for parts, _, _ in kept for buffer in parts], size)
+        if sent < size and not self.closed:
             self._keep_rest(kept, sent)
         else:
             self._flush_later()
@@ -376,10 +346,10 @@ class Stream:
             if sent >= length:
                 sent -= length
             elif sent > 0:
-                self._outbox.push_rest(b"".join(unsent(parts, sent)), key)
+                self.outbox.push_rest(b"".join(unsent(parts, sent)), key)
                 sent = 0
             elif index <= last_part:
-                self._outbox.commit(b"".join(parts))
+                self.outbox.commit(b"".join(parts))
             else:
                 self._queue(b"".join(parts), key)
 
@@ -404,7 +374,7 @@ class Stream:
 
     async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
         """Return when the outbox is empty, the stream is closed, or ``within`` seconds have passed."""
-        if self._closed or not self._writing:
+        if self.closed or not self._writing:
             return
         if self._drained is None or self._drained.done():
             self._drained = self._loop.create_future()
@@ -412,28 +382,28 @@ class Stream:
 
     def _queue(self, message: bytes, key: int) -> int:
         if key == URGENT:
-            self._outbox.push_urgent(message)
+            self.outbox.push_urgent(message)
             return 0
-        return self._outbox.push(message, key, self._loop.time())
+        return self.outbox.push(message, key, self._loop.time())
 
     def _shut(self) -> None:
-        if self._closed:
+        if self.closed:
             return
-        self._closed = True
+        self.closed = True
         self._loop.remove_reader(self._fd)
         if self._writing:
             self._loop.remove_writer(self._fd)
         self._sock.close()
         # No callback is called from now on; dropping them breaks the reference cycle of the stream and its owner.
-        self._on_bytes, self._on_close = _no_bytes, _no_close
+        del self._on_bytes, self._on_close
         self._view = memoryview(b"")
         self._buffer = bytearray()
         if not self._keep:
-            self._outbox.clear()
+            self.outbox.clear()
         self._done_draining()
 
     def _shut_write(self) -> None:
-        if not self._closed:
+        if not self.closed:
             with contextlib.suppress(OSError):  # the remote side may be gone; the reader will notice
                 self._sock.shutdown(socket.SHUT_WR)
 
@@ -442,7 +412,7 @@ class Stream:
             self._drained.set_result(None)
 
     def _lost(self, error: Exception | None) -> None:
-        if not self._closed:
+        if not self.closed:
             on_close = self._on_close
             self._shut()
             # Later, not from here: this may be a ``send`` within the owner's loop over its streams.
@@ -464,9 +434,6 @@ class Stream:
             return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
-        except RecordIncomplete:
-            self._heard()  # a large record on a slow network is no silence
-            return
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -476,6 +443,8 @@ class Stream:
             self._lost(None)
             return
         self._heard()
+        if count == INCOMPLETE:  # a large record on a slow network is no silence
+            return
         self.bytes_in += count
         self._filled += count
         if self._filled == _FIRST_BUFFER == len(self._buffer):
@@ -495,7 +464,7 @@ class Stream:
             self._reading_held = False
 
     def _is_holding(self) -> bool:
-        return self._secure is not None and self._secure.readable and not self._closed
+        return self._secure is not None and self._secure.readable and not self.closed
 
     def _heard(self) -> None:
         """Note that bytes came now."""
@@ -519,7 +488,7 @@ class Stream:
                 _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
             self._lost(error)
             return
-        if self._closed:
+        if self.closed:
             return
         rest = self._filled - consumed
         if consumed and rest:
@@ -540,7 +509,7 @@ class Stream:
         """Send queued entries until the socket takes no more, or ``_WRITES`` system calls were made."""
         for _ in range(_WRITES):
             # Without parts: all entries were too old, and were dropped.
-            parts = self._outbox.head(_IOV, self._loop.time())
+            parts = self.outbox.head(_IOV, self._loop.time())
             try:
                 sent = self._sock.sendmsg(parts) if parts or self._secure is not None else 0
             except (BlockingIOError, InterruptedError):
@@ -549,8 +518,8 @@ class Stream:
                 self._lost(error)
                 return
             self.bytes_out += sent
-            self._outbox.consumed(sent)
-            if not self._outbox:
+            self.outbox.consumed(sent)
+            if not self.outbox:
                 if self._secure is None or not self._secure.pending:
                     self._all_sent()
                 return
@@ -563,12 +532,3 @@ class Stream:
         if self._finishing:
             self._shut_write()
         self._done_draining()
-
-
-def _no_bytes(view: memoryview) -> tuple[int, int]:
-    """``on_bytes`` of a closed stream."""
-    return len(view), 0
-
-
-def _no_close(_error: Exception | None) -> None:
-    """``on_close`` of a closed stream."""

@@ -1,20 +1,17 @@
-"""TLS for a stream: a socket with records, corking, and what a partial write leaves.
-
-What a partial write leaves of its buffers.
-"""
+"""TLS for a stream: a socket with records, corking, and what a partial write leaves of its buffers."""
 
 from __future__ import annotations
 
 import contextlib
 import ssl
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.core.limits import KIB
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    import socket
+    from collections.abc import Callable, Sequence
 
 Buffer = bytes | bytearray | memoryview
 
@@ -37,9 +34,7 @@ def unsent(parts: Sequence[Buffer], sent: int) -> list[Buffer]:
 # One loop and one thread handle reads, one after the other; a read may be handled within another one.
 
 
-_Ends: TypeAlias = list[Callable[[], None]]
-
-collected: _Ends | None = None
+collected: list[Callable[[], None]] | None = None
 """Called in order at the end of the read that is handled now; ``None``: nothing is collected."""
 
 
@@ -87,6 +82,8 @@ def after_read(call: Callable[[], None]) -> None:
 # while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
 
 
+INCOMPLETE: Final = -1
+"""What ``SecureSocket.recv_into`` returns for a part of a record: the other side is alive."""
 _RECORD: Final = 16 * KIB
 """Plain bytes of the largest record (RFC 8446, section 5.1)."""
 _WRITE_MAX: Final = 128 * KIB
@@ -96,30 +93,6 @@ _READ: Final = 128 * KIB
 """Bytes that are read from the socket at once."""
 _scratch: Final = memoryview(bytearray(_READ))
 """Where every connection reads ciphertext: one loop, one thread, and nothing stays in it."""
-
-
-class DataSocket(Protocol):
-    """A connected, non-blocking socket."""
-
-    def sendmsg(self, buffers: Sequence[Buffer], /) -> int:
-        """Send as much as the socket takes now."""
-        ...
-
-    def recv_into(self, buffer: memoryview, /) -> int:
-        """Read into a buffer; 0 at the end of the stream."""
-        ...
-
-    def shutdown(self, how: int, /) -> None:
-        """Close one direction."""
-        ...
-
-    def close(self) -> None:
-        """Close the socket."""
-        ...
-
-
-class RecordIncomplete(BlockingIOError):  # noqa: N818 - the name says what happened, as in core.errors
-    """Bytes came, but no whole record yet: nothing can be read, and the other side is alive."""
 
 
 class TlsHandshake:
@@ -132,14 +105,10 @@ class TlsHandshake:
 
     def __init__(self, context: ssl.SSLContext, *, server_side: bool) -> None:
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=server_side)
+        self.tls = context.wrap_bio(self._incoming, self._outgoing, server_side=server_side)
+        """The connection's state, for the certificate and the protocol that was chosen."""
         self.done = False
         """Whether this side has finished; a server may still refuse the client's certificate afterwards."""
-
-    @property
-    def tls(self) -> ssl.SSLObject:
-        """The connection's state, for the certificate and the protocol that was chosen."""
-        return self._tls
 
     def receive(self, data: Buffer) -> None:
         """Take bytes of the other side; at first none, so that a client begins.
@@ -152,7 +121,7 @@ class TlsHandshake:
         if self.done:
             return
         try:
-            self._tls.do_handshake()
+            self.tls.do_handshake()
         except ssl.SSLWantReadError:
             return
         self.done = True
@@ -161,7 +130,7 @@ class TlsHandshake:
         """The bytes to send now."""
         return self._outgoing.read()
 
-    def secure(self, sock: DataSocket) -> SecureSocket:
+    def secure(self, sock: socket.socket) -> SecureSocket:
         """The socket to be used from now on; bytes that came behind the handshake are read first.
 
         Raises:
@@ -169,7 +138,7 @@ class TlsHandshake:
         """
         if not self.done:
             raise LocalProtocolError("the TLS handshake is not done")
-        return SecureSocket(sock, self._tls, self._incoming, self._outgoing)
+        return SecureSocket(sock, self.tls, self._incoming, self._outgoing)
 
 
 class SecureSocket:
@@ -183,10 +152,10 @@ class SecureSocket:
     """
 
     def __init__(
-        self, sock: DataSocket, tls: ssl.SSLObject, incoming: ssl.MemoryBIO, outgoing: ssl.MemoryBIO
+        self, sock: socket.socket, tls: ssl.SSLObject, incoming: ssl.MemoryBIO, outgoing: ssl.MemoryBIO
     ) -> None:
         self._sock = sock
-        self._transmit = _sender(sock)
+        self._transmit = sock.send  # 0.3 µs faster than ``sendmsg``
         self._receive = sock.recv_into
         self._tls = tls
         self._write = tls.write
@@ -268,8 +237,10 @@ class SecureSocket:
     def recv_into(self, buffer: memoryview) -> int:
         """Read and decrypt; 0 at the end of the stream, with or without TLS's own end.
 
+        Returns:
+            How many bytes; ``INCOMPLETE`` if some came, but no whole record yet: nothing can be read.
+
         Raises:
-            RecordIncomplete: Bytes came, but nothing can be read yet.
             BlockingIOError: Nothing came.
             OSError: The connection is gone, or (``ssl.SSLError``) its bytes are not TLS, or an alert came.
         """
@@ -283,7 +254,7 @@ class SecureSocket:
         try:
             count = self._read(len(buffer), buffer)
         except ssl.SSLWantReadError:
-            raise RecordIncomplete from None
+            return INCOMPLETE
         except ssl.SSLZeroReturnError:
             return 0
         # A buffer with room left has the whole record; OpenSSL reads no further than the end of a record.
@@ -341,9 +312,3 @@ class SecureSocket:
             sent = 0
         if sent < len(ciphertext):
             self._unsent = memoryview(ciphertext)[sent:]
-
-
-def _sender(sock: DataSocket) -> Callable[[Buffer], int]:
-    """What sends the bytes of one buffer by a socket; ``send`` is 0.3 µs faster than ``sendmsg``."""
-    send: Callable[[Buffer], int] | None = getattr(sock, "send", None)
-    return send if send is not None else lambda data: sock.sendmsg((data,))
