@@ -30,6 +30,7 @@ ABORT: Final = 4
 """Flag of a fragment: the rest of its message will never come."""
 
 
+@dataclass(slots=True, eq=False)
 class QueuedMessage:
     """One waiting message; an opened message may not have all its bytes yet.
 
@@ -39,36 +40,25 @@ class QueuedMessage:
         sequence: Its sequence number, for the framer.
         stamp_ns: Its time stamp in nanoseconds, for the framer.
         born: When it was pushed, monotonic seconds.
+        framed: Whether it is sent in fragments with headers.
+        pinned: Whether it is a mark, which is never dropped.
+        chunks: Its waiting bytes.
+        held: The number of bytes in ``chunks``.
+        sent: Bytes that the socket took or that are committed. A message with any such byte is never dropped.
+        dropped: Whether the rest of it will not be sent.
     """
 
-    __slots__ = (
-        "born",
-        "chunks",
-        "dropped",
-        "framed",
-        "held",
-        "key",
-        "pinned",
-        "sent",
-        "sequence",
-        "size",
-        "stamp_ns",
-    )
-
-    def __init__(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0, born: float = 0.0) -> None:
-        self.key = key
-        self.size = size
-        self.sequence = sequence
-        self.stamp_ns = stamp_ns
-        self.born = born
-        self.framed = True
-        self.pinned = False
-        self.chunks: deque[memoryview] = deque()
-        self.held = 0
-        """The number of bytes in ``chunks``."""
-        self.sent = 0
-        """Bytes that the socket took or that are committed. A message with any such byte is never dropped."""
-        self.dropped = False
+    key: int
+    size: int
+    sequence: int = 0
+    stamp_ns: int = 0
+    born: float = 0.0
+    framed: bool = True
+    pinned: bool = False
+    chunks: deque[memoryview] = field(default_factory=deque)
+    held: int = 0
+    sent: int = 0
+    dropped: bool = False
 
 
 Framer = Callable[[QueuedMessage, int, int], bytes]
@@ -128,7 +118,8 @@ class Outbox:
         self._round_robin: deque[int] = deque()
         self._committed: deque[memoryview] = deque()
         self._committed_bytes = 0
-        self._urgent_bytes = 0
+        self.urgent_bytes = 0
+        """Bytes of the uncommitted urgent entries. The outbox does not bound them; its owner must."""
         self._data_bytes = 0
         self._begun_bytes = 0
         self.dropped: Counter[int] = Counter()
@@ -163,19 +154,9 @@ class Outbox:
             self._queues[key].bounds = bounds
 
     @property
-    def urgent_bytes(self) -> int:
-        """Bytes of the uncommitted urgent entries. The outbox does not bound them; its owner must."""
-        return self._urgent_bytes
-
-    @property
     def pending_bytes(self) -> int:
         """All waiting bytes, including urgent entries and the rest of entries that were sent in part."""
-        return self._committed_bytes + self._urgent_bytes + self._data_bytes + self._begun_bytes
-
-    @property
-    def pending_entries(self) -> int:
-        """The number of waiting entries, including urgent entries and committed parts."""
-        return len(self._committed) + len(self._urgent) + sum(len(f.messages) for f in self._queues.values())
+        return self._committed_bytes + self.urgent_bytes + self._data_bytes + self._begun_bytes
 
     @property
     def waiting_entries(self) -> int:
@@ -193,7 +174,7 @@ class Outbox:
         """Queue control bytes: before all data, but after the bytes that are already committed."""
         if data:
             self._urgent.append(data)
-            self._urgent_bytes += len(data)
+            self.urgent_bytes += len(data)
 
     def push_rest(self, data: bytes, key: int) -> None:  # noqa: ARG002 - the entry's key, for the caller's reader
         """Queue the rest of an entry whose first bytes the driver has sent; it goes first and is never dropped.
@@ -203,8 +184,7 @@ class Outbox:
         """
         if self:
             raise LocalProtocolError("a message was begun while others wait")
-        if data:
-            self._commit_bytes(memoryview(data))
+        self.commit(data)
 
     def commit(self, data: bytes) -> None:
         """Commit a part of a message whose earlier parts are sent or committed; it is never dropped."""
@@ -225,10 +205,7 @@ class Outbox:
         """
         if not data:
             return 0
-        message = QueuedMessage(key, len(data), born=now)
-        message.framed = False
-        message.pinned = pinned
-        return self._enqueue(message, memoryview(data))
+        return self._enqueue(QueuedMessage(key, len(data), 0, 0, now, False, pinned), memoryview(data))
 
     def extend(self, message: QueuedMessage, data: bytes) -> int:
         """Queue the first or further bytes of an opened message; return the number of dropped entries, as ``push``.
@@ -246,15 +223,7 @@ class Outbox:
         # The bytes of a message all arrive before its key's next message begins: a waiting message is the last one.
         if queue is None or not queue.messages or queue.messages[-1] is not message:
             return self._enqueue(message, memoryview(data))
-        message.chunks.append(memoryview(data))
-        message.held += len(data)
-        if message.sent:
-            self._begun_bytes += len(data)
-        else:
-            queue.size += len(data)
-            self._data_bytes += len(data)
-        self._schedule(queue, message.key)
-        return self._enforce_max_bytes(message)
+        return self._hold(queue, message, memoryview(data))
 
     def abandon(self, message: QueuedMessage) -> bool:
         """Drop an opened message whose rest will never come.
@@ -266,19 +235,13 @@ class Outbox:
         """
         if message.dropped:
             return False
-        message.dropped = True
         queue = self._queues.get(message.key)
         if queue is not None and message in queue.messages:
             queue.messages.remove(message)
             self._release(queue, message)
             if not queue.messages:
                 self._remove_queue(message.key, queue)
-        if not message.sent:
-            return False
-        if self._frame is None:
-            return True
-        self._commit_bytes(memoryview(self._frame(message, 0, LAST | ABORT)))
-        return False
+        return self._abort(message)
 
     def discard(self, key: int) -> int:
         """Drop all entries of one key, and its own bounds; return the number of entries.
@@ -289,17 +252,12 @@ class Outbox:
         self._own_bounds.pop(key, None)
         if queue is None:
             return 0
-        count = 0
-        for message in tuple(queue.messages):
+        for message in queue.messages:
             self._release(queue, message)
-            if message.sent and self._frame is not None and not message.dropped:
-                self._commit_bytes(memoryview(self._frame(message, 0, LAST | ABORT)))
-            message.dropped = True
-            count += 1
-        queue.messages.clear()
+            self._abort(message)
         if queue.scheduled:
             self._round_robin.remove(key)
-        return count
+        return len(queue.messages)
 
     def reset(self) -> int:
         """Prepare for the next connection, because the present one is gone.
@@ -313,7 +271,7 @@ class Outbox:
         torn = 0
         self._committed.clear()
         self._urgent.clear()
-        self._committed_bytes = self._urgent_bytes = 0
+        self._committed_bytes = self.urgent_bytes = 0
         for key, queue in list(self._queues.items()):
             message = queue.messages[0] if queue.messages else None
             if message is not None and message.sent:
@@ -336,7 +294,7 @@ class Outbox:
         self._queues.clear()
         self._round_robin.clear()
         self._committed.clear()
-        self._committed_bytes = self._urgent_bytes = self._data_bytes = self._begun_bytes = 0
+        self._committed_bytes = self.urgent_bytes = self._data_bytes = self._begun_bytes = 0
 
     # --- output ---------------------------------------------------------------------------------------------
 
@@ -385,7 +343,7 @@ class Outbox:
         """Commit the next entry or fragment in turn; return ``False`` if there is none."""
         if self._urgent:
             data = self._urgent.popleft()
-            self._urgent_bytes -= len(data)
+            self.urgent_bytes -= len(data)
             self._commit_bytes(memoryview(data))
             return True
         while self._round_robin:
@@ -449,30 +407,35 @@ class Outbox:
         else:
             while len(queue.messages) - queue.marks >= queue.bounds.entries and self._drop_oldest(queue, message):
                 dropped += 1
-        message.chunks.append(data)
-        message.held = len(data)
         queue.messages.append(message)
-        if message.sent or message.pinned:
+        return dropped + self._hold(queue, message, data)
+
+    def _hold(self, queue: _KeyQueue, message: QueuedMessage, data: memoryview) -> int:
+        """Keep bytes of a message, which is in its queue; return how many entries were dropped."""
+        message.chunks.append(data)
+        message.held += len(data)
+        if message.sent or message.pinned:  # these count against no bound
             self._begun_bytes += len(data)
         else:
             queue.size += len(data)
             self._data_bytes += len(data)
         self._schedule(queue, message.key)
-        return dropped + self._enforce_max_bytes(message)
+        dropped = 0
+        while self._data_bytes > self._max_bytes and (count := self._drop_largest(message)):
+            dropped += count
+        return dropped
+
+    def _abort(self, message: QueuedMessage) -> bool:
+        """Drop a message, and say so if a part of it was sent; return whether that cannot be said."""
+        message.dropped = True
+        if message.sent and self._frame is not None:
+            self._commit_bytes(memoryview(self._frame(message, 0, LAST | ABORT)))
+        return message.sent > 0 and self._frame is None
 
     def _schedule(self, queue: _KeyQueue, key: int) -> None:
         if not queue.scheduled and queue.messages and queue.messages[0].chunks:
             queue.scheduled = True
             self._round_robin.append(key)
-
-    def _enforce_max_bytes(self, newest: QueuedMessage) -> int:
-        dropped = 0
-        while self._data_bytes > self._max_bytes:
-            count = self._drop_largest(newest)
-            if not count:
-                break
-            dropped += count
-        return dropped
 
     def _release(self, queue: _KeyQueue, message: QueuedMessage) -> None:
         """Drop a message's waiting bytes, and subtract them from the sums."""

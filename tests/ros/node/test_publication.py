@@ -579,7 +579,7 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
         owner.publication.publish_framed(frame_message(bytes(200_000)))
     links = [link for link in owner.publication._connections if isinstance(link, AcceptedConnection)]
     assert len(links) == 2
-    assert all(link.dropped > 50 and link.outbox.pending_entries <= 4 for link in links)
+    assert all(link.dropped > 50 and link.outbox.waiting_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
     early.close()
