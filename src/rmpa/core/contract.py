@@ -15,9 +15,8 @@ from rmpa.core import limits
 from rmpa.core.identity import matches
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
-_Word = TypeVar("_Word", bound=StrEnum)
 _Number = TypeVar("_Number", int, float)
 Depth = Annotated[int, Meta(ge=1, le=limits.CONTRACT_DEPTH_MAX)]
 """These types have the bounds that hold in settings and in the messages of peers."""
@@ -124,10 +123,15 @@ KEYS: Final = tuple(item.name for item in fields(Contract))
 _DEFAULT: Final = Contract()
 _AGENTS_WORDS: Final = ("reliability", "durability", "history", "depth")
 """Fields that only agents can keep where they differ from the default; the others are ``needs_agents``' own."""
-_URGENCY: Final = {Priority.NORMAL: 0, Priority.LOW: 1, Priority.HIGH: 2}
-"""Normal is weaker than either other word."""
-_TRANSPORTS: Final = (Transport.RELAY, Transport.DIRECT, Transport.AUTO)
-"""The strongest first: one end's ``relay`` keeps the messages with the agents; ``direct`` wants its warning."""
+_RANKS: Final = {
+    "reliability": tuple(Reliability).index,
+    "durability": tuple(Durability).index,
+    "history": tuple(History).index,
+    "priority": (Priority.NORMAL, Priority.LOW, Priority.HIGH).index,
+    "transport": (Transport.AUTO, Transport.DIRECT, Transport.RELAY).index,
+}
+"""Which word of a field is the stronger one. Of the transports ``relay`` is the strongest, because it keeps the
+messages with the agents; ``direct`` wants its warning."""
 
 
 def combine(offered: Contract, requested: Contract) -> Contract:
@@ -139,25 +143,18 @@ def combine(offered: Contract, requested: Contract) -> Contract:
             it is the receiver that waits.
     """
     watched = requested if requested.liveliness_lease is not None else offered
-    return Contract(
-        reliability=_either(offered.reliability, requested.reliability, Reliability.RELIABLE),
-        durability=_either(offered.durability, requested.durability, Durability.TRANSIENT_LOCAL),
-        history=_either(offered.history, requested.history, History.KEEP_ALL),
-        depth=_larger(offered.depth, requested.depth, limits.ROUTE_QUEUE_MESSAGES),
+    stronger = {key: max(getattr(offered, key), getattr(requested, key), key=rank) for key, rank in _RANKS.items()}
+    return replace(
+        _DEFAULT,
+        **stronger,
+        depth=_larger(offered.depth, requested.depth, _DEFAULT.depth),
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
         lifespan=_smaller(offered.lifespan, requested.lifespan),
         liveliness=watched.liveliness,
         liveliness_lease=watched.liveliness_lease,
-        priority=max(offered.priority, requested.priority, key=_URGENCY.__getitem__),
         max_rate=_smaller(offered.max_rate, requested.max_rate),
-        outage=_larger(offered.outage, requested.outage, limits.RESUME_WINDOW),
-        transport=combine_transport(offered.transport, requested.transport),
+        outage=_larger(offered.outage, requested.outage, _DEFAULT.outage),
     )
-
-
-def combine_transport(offered: Transport, requested: Transport) -> Transport:
-    """The stronger of both ends' words: ``relay`` before ``direct`` before ``auto``."""
-    return min(offered, requested, key=_TRANSPORTS.index)
 
 
 def needs_agents(contract: Contract) -> str:
@@ -188,10 +185,6 @@ def _larger(one: _Number, other: _Number, default: _Number) -> _Number:
     return max((value for value in (one, other) if value != default), default=default)
 
 
-def _either(one: _Word, other: _Word, stronger: _Word) -> _Word:
-    return stronger if stronger in (one, other) else one
-
-
 def _smaller(one: float | None, other: float | None) -> float | None:
     given = [value for value in (one, other) if value is not None]
     return min(given) if given else None
@@ -216,15 +209,11 @@ class ContractRule:
         shown = []
         for key, globs, name in (("topics", self.topics, topic), ("types", self.types, type_name)):
             if globs:
-                glob = _first(globs, name)
+                glob = next((glob for glob in globs if matches(glob, name)), None)
                 if glob is None:
                     return None
                 shown.append(f"{key} {glob}")
         return ", ".join(shown) or "every topic"
-
-
-def _first(globs: Iterable[str], name: str) -> str | None:
-    return next((glob for glob in globs if matches(glob, name)), None)
 
 
 class Contracts:
