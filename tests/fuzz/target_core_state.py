@@ -8,17 +8,14 @@ import msgspec
 
 from rmpa.ros.core.state import parse, serialize
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.wire.xmlrpc import response_pieces
 
 _NODE = {
     "api": "http://h:1/",
-    "publishers": {"/t": "a/B"},
-    "subscribers": {"/u": "*"},
-    "services": {"/s": "rosrpc://h:2"},
+    "entries": [["publisher", "/t", "a/B"], ["subscriber", "/u", "*"], ["service", "/s", "rosrpc://h:2"]],
 }
 SEEDS: list[bytes] = [
-    msgspec.msgpack.encode({"format": "rmpa core 1", **parts})
+    msgspec.msgpack.encode({"format": "rmpa core 2", **parts})
     for parts in (
         {"boot": "4f0c", "nodes": {"/talker": _NODE}},
         {"params": {"a": {"b": [1, "x", 2.5], "c": {}}, "e": {"k": b"\0"}}},
@@ -41,8 +38,8 @@ def _use(data: bytes) -> None:
     master = MasterApi("http://h:1/", 1, lambda _: None)
     master.parameters.set("/", state.params)
     for name, node in state.nodes.items():
-        for topic, kind in node.publishers.items():
-            master.registrations.register(RegistrationKind.PUBLISHER, topic, name, node.api, kind)
+        for kind, key, detail in node.entries:
+            master.registrations.register(kind, key, name, node.api, detail)
     for method, *arguments in (("getSystemState",), ("getParam", "/"), ("getTopicTypes",)):
         for _ in response_pieces(list(master.call(method, ["/x", *arguments]))):
             pass

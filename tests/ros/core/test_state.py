@@ -24,6 +24,7 @@ from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.state import StoredState, parse, serialize
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, legal_text, response_pieces
 
@@ -503,7 +504,7 @@ async def test_a_core_whose_port_is_taken_leaves_the_file_alone(path: Path) -> N
 
 
 def state_of(**parts: Any) -> bytes:
-    return msgspec.msgpack.encode({"format": "rmpa core 1", **parts})
+    return msgspec.msgpack.encode({"format": "rmpa core 2", **parts})
 
 
 def lists(depth: int) -> list[Any]:
@@ -524,11 +525,12 @@ def nested(depth: int) -> dict[str, Any]:
         b"SQLite format 3\0" * 100,
         b"",
         state_of(params={"a": "b" * 20_000})[:-1],
-        state_of(format="rmpa core 2"),
+        state_of(format="rmpa core 1"),
         msgspec.msgpack.encode({"nodes": {}}),
         state_of(nodes={"/talker": {"api": "rosrpc://h:1"}}),
         state_of(nodes={"talker": {"api": "http://h:1"}}),
-        state_of(nodes={"/t": {"api": "http://h:1", "publishers": {"/t": "a\0b"}}}),
+        state_of(nodes={"/t": {"api": "http://h:1", "entries": [["publisher", "t", "*"]]}}),
+        state_of(nodes={"/t": {"api": "http://h:1", "entries": [["publisher", "/t", "a\0b"]]}}),
         state_of(params={"a": 1 << 40}),
         state_of(params={"a": None}),
         state_of(params={"a": "\x1b"}),
@@ -590,10 +592,15 @@ values = st.recursive(
 
 @given(st.dictionaries(texts, values, max_size=5))
 def test_each_value_of_ros_comes_back_as_it_was(tree: dict[str, Any]) -> None:
-    node = NodeRecord("http://h:1/", {"/t": STRING}, {"/u": "*"}, {"/s": "rosrpc://h:2"}, ["/p/"])
-    stored = StoredState("rmpa core 1", "boot", {"/talker": node}, tree)
+    entries = [
+        (RegistrationKind.PUBLISHER, "/t", STRING),
+        (RegistrationKind.SERVICE, "/s", "rosrpc://h:2"),
+        (RegistrationKind.PARAM, "/p/", ""),
+    ]
+    node = NodeRecord("http://h:1/", entries)
+    stored = StoredState("rmpa core 2", "boot", {"/talker": node}, tree)
     assert parse(serialize(stored)) == stored
-    assert math.isnan(parse(serialize(StoredState("rmpa core 1", params={"a": math.nan}))).params["a"])
+    assert math.isnan(parse(serialize(StoredState("rmpa core 2", params={"a": math.nan}))).params["a"])
 
 
 def test_where_a_core_keeps(tmp_path: Path) -> None:

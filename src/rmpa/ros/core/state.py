@@ -58,7 +58,7 @@ class StoredState(msgspec.Struct):
         params: The parameter tree.
     """
 
-    format: Literal["rmpa core 1"]
+    format: Literal["rmpa core 2"]
     boot: str = ""
     nodes: dict[Name, NodeRecord] = {}
     params: dict[str, Any] = {}
@@ -246,16 +246,10 @@ class CoreState:
             if table.node_api(name) not in {None, node.api}:
                 continue  # a new node has its name
             self._up += 1
-            topics |= node.subscribers.keys()
-            for topic, kind in node.publishers.items():
-                table.register(RegistrationKind.PUBLISHER, topic, name, node.api, kind)
-            for topic, kind in node.subscribers.items():
-                table.register(RegistrationKind.SUBSCRIBER, topic, name, node.api, kind)
-            for service, uri in node.services.items():
-                if table.service_uri(service) is None:
-                    table.register(RegistrationKind.SERVICE, service, name, node.api, uri)
-            for key in node.params:
-                table.register(RegistrationKind.PARAM, key, name, node.api)
+            topics |= _keys(node, RegistrationKind.SUBSCRIBER)
+            for kind, key, detail in node.entries:
+                if kind is not RegistrationKind.SERVICE or table.service_uri(key) is None:
+                    table.register(kind, key, name, node.api, detail)
         for topic in topics:
             table.notify_subscribers(topic)
 
@@ -352,7 +346,7 @@ class CoreState:
         }
         try:
             # Trees and records are never changed in place, so that a thread may read them.
-            await in_thread(lambda: self._put(StoredState("rmpa core 1", boot, nodes, tree)), "core state")
+            await in_thread(lambda: self._put(StoredState("rmpa core 2", boot, nodes, tree)), "core state")
         except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
             if not self._problem:
                 _log.warning("! nothing of the core is kept over a restart: %s", self._reason(error))
@@ -415,25 +409,35 @@ async def _is_there(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
     A rospy node gives its name in ``getName``, a roscpp node in the header of a topic that it publishes; one that
     publishes nothing is known by its own lists of topics. The records take up what these lists have.
     """
-    topics = [topic for node in nodes.values() for topic in node.publishers if topic != "/rosout"]
+    topics = [topic for node in nodes.values() for topic in _keys(node, RegistrationKind.PUBLISHER) - {"/rosout"}]
     try:
         name = await name_at(api, topics)
         if name is not None and name not in nodes:
             return False
-        published, subscribed = await _listed(api, "getPublications"), await _listed(api, "getSubscriptions")
+        lists = {
+            RegistrationKind.PUBLISHER: await _listed(api, "getPublications"),
+            RegistrationKind.SUBSCRIBER: await _listed(api, "getSubscriptions"),
+        }
     except UnreachableError as error:
         return False if isinstance(error.__cause__, ConnectionRefusedError) else None
     except RmpaError:  # such as no file descriptor left
         return None
-    had = [(node.publishers, published) for node in nodes.values() if node.publishers]
-    had += [(node.subscribers, subscribed) for node in nodes.values() if node.subscribers]
-    if name is None and not (had and all(now is not None and then.keys() <= now.keys() for then, now in had)):
-        return None if topics else False  # a publisher tells its name, unless it is too busy at present
+    if name is None:
+        had = [(_keys(node, kind), now) for node in nodes.values() for kind, now in lists.items()]
+        known = [keys <= now.keys() if now is not None else False for keys, now in had if keys]
+        if not known or not all(known):
+            return None if topics else False  # a publisher tells its name, unless it is too busy at present
     if len(nodes) == 1:  # the lists of nodelets do not say which node an entry belongs to
         [node] = nodes.values()
-        node.publishers = node.publishers if published is None else published
-        node.subscribers = node.subscribers if subscribed is None else subscribed
+        for kind, now in lists.items():
+            if now is not None:
+                others = [entry for entry in node.entries if entry[0] is not kind]
+                node.entries = [*others, *((kind, topic, topic_type) for topic, topic_type in now.items())]
     return True
+
+
+def _keys(node: NodeRecord, kind: RegistrationKind) -> set[str]:
+    return {key for its, key, _ in node.entries if its is kind}
 
 
 async def _listed(api: str, method: str) -> dict[str, str] | None:

@@ -18,22 +18,16 @@ Name = Annotated[str, msgspec.Meta(pattern="^/", max_length=limits.CORE_STATE_NA
 """A name in a core's state file."""
 
 
-class NodeRecord(msgspec.Struct, omit_defaults=True):
+class NodeRecord(msgspec.Struct):
     """Everything that one node registered, as a core's state file has it.
 
     Attributes:
         api: The URI of its slave API.
-        publishers: Topics that it publishes, with their types.
-        subscribers: Topics that it subscribes to, with their types.
-        services: Services that it provides, with their ``rosrpc://`` URIs.
-        params: Parameters that it subscribed to; each ends in ``/``.
+        entries: For each registration the kind, the key and the detail, as for ``Registrations.register``.
     """
 
     api: Annotated[str, msgspec.Meta(pattern="^http://")]
-    publishers: dict[Name, str] = {}
-    subscribers: dict[Name, str] = {}
-    services: dict[Name, str] = {}
-    params: list[Name] = []
+    entries: list[tuple[RegistrationKind, Name, str]] = []
 
 
 class Registrations:
@@ -104,15 +98,12 @@ class Registrations:
             return None
         record = NodeRecord(self._apis[node])
         for kind, key in self._entries[node]:
-            match kind:
-                case RegistrationKind.PUBLISHER:
-                    record.publishers[key] = self._types.get(key, ANY_TYPE)
-                case RegistrationKind.SUBSCRIBER:
-                    record.subscribers[key] = self._types.get(key, ANY_TYPE)
-                case RegistrationKind.SERVICE if node in self._services.get(key, _NONE):
-                    record.services[key] = self._services[key][node]
-                case RegistrationKind.PARAM:
-                    record.params.append(key)
+            if kind is RegistrationKind.SERVICE:
+                detail = self._services.get(key, _NONE).get(node)
+            else:
+                detail = "" if kind is RegistrationKind.PARAM else self._types.get(key, ANY_TYPE)
+            if detail is not None:
+                record.entries.append((kind, key, detail))
         return record
 
     def state(self) -> GraphState:
