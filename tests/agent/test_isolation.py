@@ -28,7 +28,6 @@ import pytest
 from rmpa.agent.agent import Agent
 from rmpa.config import limits as config_limits
 from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
-from rmpa.core.errors import UnreachableError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
@@ -401,7 +400,7 @@ async def an_external_graph_is_followed(world: World) -> None:
 async def its_master_is_started_anew(world: World) -> None:
     assert isinstance(world.near.core, ExternalCore)
     for _ in range(4):
-        world.near.core._drop_writes(UnreachableError("master", "there"))
+        world.near.core._drop_writes()
         world.near.core._poll_soon()
         looks = world.near.core.counters.as_dict()["master.looks"]
         await world.until(lambda looks=looks: world.near.core.counters.as_dict()["master.looks"] > looks)  # type: ignore[misc]

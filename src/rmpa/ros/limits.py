@@ -15,8 +15,7 @@ TCPROS_HEADER_MAX: Final = 4 * MIB
 TCPROS_MESSAGE_MAX: Final = MESSAGE_MAX - 4
 """One message without its 4-byte length."""
 TCPROS_LENGTH_MAX: Final = 1_000_000_000
-"""A length above this means that the stream is out of step: the connection is closed. roscpp has the same bound. A
-message between the two limits is read and dropped."""
+"""Above it, as in roscpp, the stream is out of step and closed; a message between both limits is read and dropped."""
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
 """Time within which the other side's header must arrive; rospy and roscpp wait without a limit."""
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
@@ -32,8 +31,7 @@ TCPROS_RETRY_FIRST: Final = 0.1
 TCPROS_RETRY_MAX: Final = 2.0
 """The longest pause between attempts, while the graph lists the publisher."""
 SHARED_BACKLOG: Final = 4096
-"""Length of the listen queue of the one socket of all proxies: all subscribers of a restarted agent connect at once.
-The kernel lowers it to ``net.core.somaxconn``."""
+"""Listen queue of all proxies' one socket: all subscribers of a restarted agent connect at once."""
 SHARED_PROBE_TIMEOUT: Final = 1.0
 """Time-out of the test whether addresses of 127/8 other than 127.0.0.1 work here; if so, it takes a millisecond."""
 LOOPBACK_REST: Final = 60.0
@@ -51,8 +49,7 @@ SERVICE_MESSAGE_MAX: Final = 64 * MIB
 SERVICE_OPEN_TIMEOUT: Final = 5.0
 """Time-out of the connection to a service's server and the exchange of headers together."""
 SERVICE_STALL: Final = 30.0
-"""Time within which the next bytes of a service request must arrive; for a client that is not persistent, also the
-first ones."""
+"""Time within which the next bytes of a service request (of a single call also the first) must arrive."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages queued for one slow local subscriber; above it the oldest is dropped."""
 LATCHED_MAX: Final = 100
@@ -80,8 +77,7 @@ PACKAGE_FILE_MAX: Final = 256 * KIB
 TYPES_FOUND_MAX: Final = 256
 """Types found on this machine in the cache of a process; the least recently used is dropped."""
 TYPE_MISSING: Final = 10.0
-"""Time before an unknown type of a publisher's header is searched for again: each message asks for it, and a search
-goes through the whole workspace, which takes some 50 ms."""
+"""Time before an unknown type is searched for again: each message asks for it, and a search takes some 50 ms."""
 TYPES_MISSING_MAX: Final = 64
 """Unknown types in the cache of a process; the oldest is dropped."""
 SEARCHED_SHOWN: Final = 4
@@ -105,20 +101,17 @@ RECEIVED_QUEUE: Final = 1000
 
 # --- XML-RPC over HTTP --------------------------------------------------------------------------------------------
 HTTP_BODY_MAX: Final = 64 * MIB
-"""One XML-RPC call or response: URDFs and maps reach some 10 MB, and roslaunch sets all parameters of a launch file
-in one call."""
+"""One XML-RPC call or response: maps reach 10 MB; roslaunch sets all parameters of a file in one call."""
 HTTP_BODIES_MAX: Final = 256 * MIB
 """All large calls of one server together: four of the largest."""
 HTTP_DISCARDED_MAX: Final = 1024 * MIB
-"""A call that is too large is read to its end, because its client reads no answer before it has sent all; a call
-above this limit is cut off."""
+"""A call that is too large is read to its end, for its client sends all before it reads; above this it is cut."""
 HTTP_PACE_MIN: Final = 64 * KIB
 """Bytes a second: the connection of a slower call is closed where room is short; loopback carries 1 GB/s."""
 HTTP_SLOW_AFTER: Final = 1.0
 """Time before the pace of a call is judged."""
 HTTP_BODY_INLINE: Final = 64 * KIB
-"""Longer bodies are read and written over several turns of the event loop: 8 MiB of numbers would hold up keepalives
-for seconds. Shorter ones take some 5 ms, during which only pending data is served."""
+"""Longer bodies are read and written over several turns of the event loop: 8 MiB of numbers take seconds."""
 XMLRPC_SLICE: Final = 2 * KIB
 """Bytes of XML parsed at once, some 100 microseconds; then pending data is served."""
 HTTP_ACCEPTS: Final = 4
@@ -126,11 +119,9 @@ HTTP_ACCEPTS: Final = 4
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """All headers of one request."""
 HTTP_BACKLOG: Final = 1024
-"""Length of the listen queue: all nodes of a robot register at once. A SYN that finds it full is sent again after
-1 s."""
+"""Length of the listen queue: all nodes of a robot register at once, and a refused SYN is repeated after 1 s."""
 HTTP_CONNECTIONS_MAX: Final = 512
-"""Open connections to one XML-RPC server: rospy keeps one per thread alive. Beyond it ``ros.http.server`` chooses
-the one to close for a new one."""
+"""Open connections to one XML-RPC server; beyond it ``ros.http.server`` chooses one to close for a new one."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
 """Time after which a kept-alive connection without a call is closed; rospy and roscpp reconnect by themselves."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
@@ -148,20 +139,17 @@ SLAVE_CALL_TIMEOUT: Final = 3.0
 MASTER_OTHER_AGENT: Final = 10.0
 """Time for which another agent at the same roscore is told after its last registration was seen."""
 MASTER_LOOK_FIRST: Final = 0.1
-"""Time between two polls of a roscore whose graph has just changed: nodes register one thing after the other. A poll
-of a graph of 50 nodes costs the roscore some milliseconds."""
+"""Time between two polls of a roscore whose graph has just changed; a poll of 50 nodes costs it some milliseconds."""
 MASTER_LOOK_IDLE: Final = 0.5
 """Time between two polls while nothing changes."""
 MASTER_LOOK_MAX: Final = 0.8
 """The longest pause between two polls, so that a change is seen within a second."""
 MASTER_LOOK_SHARE: Final = 20
-"""The pause is at least this many times the duration of the poll, so that polls take at most a twentieth of the
-master's time."""
+"""The pause is at least this many times the duration of the poll: polls take at most a twentieth of its time."""
 MASTER_LOOK_SOON: Final = 0.02
 """Delay of a poll out of turn, after a node is suspected to be dead or moved: one change is seldom alone."""
 MASTER_RETRY: Final = 0.5
-"""Time between two polls of a roscore that does not answer, so that a restarted one has the agent's registrations
-within a second."""
+"""Time between two polls of a roscore that does not answer: a restarted one has our registrations within a second."""
 MASTER_TIMEOUT: Final = 3.0
 """Time-out of one poll of or write to a roscore; one on a busy board answered in 0.3 s."""
 MASTER_ASK_TIMEOUT: Final = 10.0
@@ -169,8 +157,7 @@ MASTER_ASK_TIMEOUT: Final = 10.0
 MASTER_WRITES_AT_ONCE: Final = 64
 """Registrations in one call to a roscore, some 10 ms of its work."""
 MASTER_WRITES_MAX: Final = 20_000
-"""Registrations queued for a roscore, more than a peer may advertise. Above it the queue is dropped, and the next
-poll finds what is missing."""
+"""Registrations queued for a roscore; above it the queue is dropped, and the next poll finds what is missing."""
 MASTER_FAREWELL: Final = 2.0
 """Time in which an ending agent unregisters at a roscore."""
 
@@ -180,15 +167,13 @@ NODE_CHECK_INTERVAL: Final = 5.0
 NODE_RECHECK_DELAY: Final = 0.2
 """Time between the two refused connects that prove a node dead: it may be restarting its server."""
 NODE_UNREACHABLE_AFTER: Final = 15.0
-"""Seconds for which connections to a registered node fail until peers are no longer offered it: a cable that is
-pulled and put back, or a change of the access point, takes less."""
+"""Seconds for which connects to a node fail until peers are no longer offered it: a cable is put back sooner."""
 NODE_UNREACHABLE_CHECKS: Final = 4
 """Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds."""
 NOTIFY_QUEUE_MAX: Final = 4096
 """Updates of topics and parameters queued for one slow node; for each topic only the latest is queued."""
 NOTIFY_COALESCE: Final = 64
-"""With this many updates queued for a node, only the latest update of each parameter is queued; with fewer, the node
-gets each update, as from rosmaster."""
+"""With this many updates queued for a node, only the latest of each parameter is kept; with fewer all of them."""
 NOTIFY_RETRY_FIRST: Final = 0.2
 """Pause before an update is sent again to a node that did not answer."""
 NOTIFY_RETRY_MAX: Final = 3.0
@@ -211,14 +196,11 @@ CORE_STATE_BYTES: Final = 64 * MIB
 CORE_STATE_NAME_MAX: Final = 4096
 """Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200."""
 CORE_STATE_DEPTH_MAX: Final = PARAM_DEPTH_MAX + XMLRPC_DEPTH_MAX // 3
-"""Namespaces, structs and arrays within each other in a state file: as many as ``setParam`` can make, whose name and
-value have their bounds; each is three XML elements."""
+"""Namespaces, structs and arrays within each other in a state file: as many as ``setParam`` can make."""
 CORE_STATE_GATHER: Final = 0.3
-"""Changes of the graph are gathered this long before they are written; with the write, a kill -9 loses up to 0.5 s. A
-starting node registers a dozen things."""
+"""Changes are gathered this long before they are written: a starting node registers a dozen things."""
 CORE_STATE_SHARE: Final = 20
-"""After a write, a pause of this many times the processor time that its state took: a large one is written less
-often."""
+"""After a write, a pause of this many times its processor time: a large state is written less often."""
 CORE_STATE_REST: Final = 10.0
 """The longest such pause."""
 CORE_STATE_RETRY: Final = 5.0

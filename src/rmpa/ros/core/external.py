@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import logging
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.counters import Counters, logged_failure
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, UnreachableError
@@ -125,7 +125,7 @@ class Core(Protocol):
                 with logged_failure(_log, "a listener failed at %s", change):
                     callback(change)
 
-    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:
+    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - for the embedded core
         """Let ``callback`` answer ``lookupService`` for each caller.
 
         Args:
@@ -136,6 +136,7 @@ class Core(Protocol):
         Returns:
             Whether this core can do so: a real roscore cannot.
         """
+        return False
 
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes to which connecting fails, by name; the caller must not change the mapping."""
@@ -150,12 +151,11 @@ class Core(Protocol):
 
     def restored(self) -> str:
         """Where the core stores its state and what it restored, for people; empty for nothing."""
+        return ""
 
 
 _PARAM_WRITES: Final = frozenset({"setParam", "deleteParam"})
 _MULTICALL: Final = "system.multicall"
-_Write: TypeAlias = "tuple[Call, asyncio.Future[RosReply] | None]"
-"""A call in the queue to the master, and the future of its answer, if a caller waits for it."""
 
 
 class ExternalCore(Core):
@@ -185,7 +185,7 @@ class ExternalCore(Core):
         self.liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
         self.registrations = self._mirror.registrations
         self.listeners = []
-        self._writes: deque[_Write] = deque()
+        self._writes: deque[Call] = deque()
         self._written = asyncio.Event()
         self._written.set()
         self._wake = asyncio.Event()
@@ -232,7 +232,8 @@ class ExternalCore(Core):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await self.liveness.close()
-        self._drop_writes(UnreachableError("ROS master", self.uri, "the agent has ended"))
+        self._problem = "the agent has ended"
+        self._drop_writes()
 
     def notes(self) -> tuple[str, ...]:
         """Whether the master does not answer, or another agent is at it too."""
@@ -258,33 +259,24 @@ class ExternalCore(Core):
         else:
             reply = RosReply(1, "will be written", 0)
         if reply.code == 1:
-            self._write(((method, params), None))
+            self._write((method, params))
         return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        if method in REGISTRATIONS:
+        registers = method in REGISTRATIONS
+        if registers:
             reply = self._apply(method, params)
             if reply.code != 1:
                 return reply
-        elif method not in _PARAM_WRITES:
-            await self._written.wait()
-            return await call_api(self.uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
-        if self._problem:
+        await self._written.wait()
+        if self._problem and (registers or method in _PARAM_WRITES):
             raise UnreachableError("ROS master", self.uri, self._problem)
-        done: asyncio.Future[RosReply] = asyncio.get_running_loop().create_future()
-        self._write(((method, params), done))
-        return await done
+        return await call_api(self.uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
 
     def _apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
         reply = self._mirror.apply(method, params)
         self._report_changes()
         return reply
-
-    def on_lookup(self, callback: Callable[[str, str, str, str], str]) -> bool:  # noqa: ARG002 - a roscore has no such hook
-        return False
-
-    def restored(self) -> str:
-        return ""
 
     def suspect(self, node: str) -> None:
         if node not in self._mirror.ours():
@@ -321,28 +313,24 @@ class ExternalCore(Core):
             self._pace = limits.MASTER_LOOK_FIRST
             self._wake.set()
 
-    def _write(self, write: _Write) -> None:
+    def _write(self, write: Call) -> None:
         """Queue a call; drop it while the master does not answer.
 
         The first poll afterwards finds the registrations that the master lacks.
         """
         if self._problem:
             return
-        self._queue(write)
-        if len(self._writes) > limits.MASTER_WRITES_MAX:
-            # Dropping all is cheaper than choosing: the next poll finds what is missing.
-            _log.warning("! the roscore at %s is slow: %d changes are told anew", self.uri, len(self._writes))
-            self._drop_writes(UnreachableError("ROS master", self.uri, "it is too slow"))
-            self._poll_soon()
-
-    def _queue(self, write: _Write) -> None:
         self._writes.append(write)
         self._written.clear()
         self._wake.set()
+        if len(self._writes) > limits.MASTER_WRITES_MAX:
+            # Dropping all is cheaper than choosing: the next poll finds what is missing.
+            _log.warning("! the roscore at %s is slow: %d changes are told anew", self.uri, len(self._writes))
+            self._drop_writes()
+            self._poll_soon()
 
-    def _drop_writes(self, error: Exception) -> None:
+    def _drop_writes(self) -> None:
         self._seen = b""
-        _fail(self._writes, error)
         self._writes.clear()
         self._written.set()
 
@@ -354,41 +342,36 @@ class ExternalCore(Core):
                 await self._send(batch)
             except UnreachableError as error:
                 self._lost(error)
-                _fail(batch, error)
-            finally:
-                _fail(batch, UnreachableError("ROS master", self.uri, "the call was given up"))
         self._written.set()
 
-    async def _send(self, batch: list[_Write]) -> None:
+    async def _send(self, batch: list[Call]) -> None:
         """Send calls as one ``system.multicall``; if that fails as a whole, one by one."""
         try:
             # A master needs long to read parameters of megabytes.
-            large = any(method in _PARAM_WRITES for (method, _), _ in batch)
+            large = any(method in _PARAM_WRITES for method, _ in batch)
             timeout = limits.MASTER_ASK_TIMEOUT if large else limits.MASTER_TIMEOUT
-            answers = await self._many([one_call(*asked) for asked, _ in batch], timeout)
+            answers = await self._many([one_call(*write) for write in batch], timeout)
         except (LocalProtocolError, RemoteProtocolError, RosFault) as error:
-            if len(batch) > 1:
-                for write in batch:
-                    await self._send([write])
+            if len(batch) == 1:
+                self._refused(batch[0], error)
                 return
-            self._refused(batch[0], error)
+            for write in batch:
+                await self._send([write])
             return
         for write, answer in zip(yielding_to_data(batch), answers, strict=False):
             match answer:
-                case [[int(code), str(status), value]]:
-                    if write[1] is not None and not write[1].done():
-                        write[1].set_result(RosReply(code, status, value))
-                    if code != 1:
-                        self._refused(write, RosFault(code, status))
+                case [[1, _, _]]:
+                    pass
+                case [[int(code), str(status), _]]:
+                    self._refused(write, RosFault(code, status))
                 case _:
                     self._refused(write, RosFault(1, brief(answer)))
 
-    def _refused(self, write: _Write, error: Exception) -> None:
-        _fail([write], error)
+    def _refused(self, write: Call, error: Exception) -> None:
         self.counters.add("master.refused")
-        method, params = write[0]
+        method, params = write
         _log.error("! the roscore at %s does not take %s%s: %s", self.uri, method, brief(params), error)
-        self._mirror.forget(write[0])
+        self._mirror.forget(write)
         self._report_changes()
 
     # --- polling ----------------------------------------------------------------------------------------------
@@ -453,8 +436,9 @@ class ExternalCore(Core):
         self._report_changes()
         if again and self._loop.time() >= self._other_until:
             _log.info("= %d registrations are made, or ended, anew at %s", len(again), self.uri)
-        for missing in again:
-            self._queue((missing, None))
+        if again:  # of any number: the bound would only drop them until the next poll
+            self._writes += again
+            self._written.clear()
 
     async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
         answers = await call(self.uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
@@ -478,7 +462,7 @@ class ExternalCore(Core):
         if not self._problem or self._task is None:
             _log.warning("! the roscore at %s: %s; it is waited for, and what flows goes on", self.uri, problem)
         self._problem = problem
-        self._drop_writes(error)
+        self._drop_writes()
 
     def _dead(self, node: str, api: str) -> None:
         self.counters.add("node.dead")
@@ -496,10 +480,3 @@ class ExternalCore(Core):
                 _log.info("= node %s at %s lives after all", node, api)
                 del self._mirror.dead[node]
                 self._seen = b""
-
-
-def _fail(writes: Iterable[_Write], error: Exception) -> None:
-    """Answer the calls with an error, as far as a caller waits for an answer."""
-    for _, done in writes:
-        if done is not None and not done.done():
-            done.set_exception(error)

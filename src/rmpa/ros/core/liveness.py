@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 import os
 import random
 from collections import OrderedDict
@@ -130,19 +129,11 @@ class Liveness:
     Args:
         nodes: All nodes with their slave APIs.
         on_dead: ``(node, api)`` of a node that refused two connects.
-        interval: Seconds in which every node is checked once; ``limits.NODE_CHECK_INTERVAL`` by default.
     """
 
-    def __init__(
-        self,
-        *,
-        nodes: Callable[[], dict[str, str]],
-        on_dead: Callable[[str, str], None],
-        interval: float | None = None,
-    ) -> None:
+    def __init__(self, *, nodes: Callable[[], dict[str, str]], on_dead: Callable[[str, str], None]) -> None:
         self._nodes = nodes
         self._on_dead = on_dead
-        self._interval = limits.NODE_CHECK_INTERVAL if interval is None else interval
         self._task: asyncio.Task[None] | None = None
         self._checks: dict[str, asyncio.Task[None]] = {}
         self._ports: asyncio.Future[set[int] | None] | None = None
@@ -186,13 +177,11 @@ class Liveness:
             self._ports = asyncio.get_running_loop().run_in_executor(None, ask_listening_ports)
             silent = self._not_listening(await asyncio.shield(self._ports))
             # Connects are spread over the interval, in as few wake-ups as their number allows.
-            portion = max(1, math.ceil(len(silent) / _PORTIONS))
-            for first in range(0, max(1, len(silent)), portion):
-                for node in silent[first : first + portion]:
+            portions = [silent[first::_PORTIONS] for first in range(min(_PORTIONS, max(1, len(silent))))]
+            for portion in portions:
+                for node in portion:
                     self.suspect(node)
-                if first + portion < len(silent):
-                    await sleep_to_tick(self._interval / _PORTIONS)
-            await sleep_to_tick(self._interval)
+                await sleep_to_tick(limits.NODE_CHECK_INTERVAL / len(portions))
 
     def _not_listening(self, ports: set[int] | None) -> list[str]:
         """The nodes that the kernel's table does not prove to live; the others are noted as reached."""
@@ -210,10 +199,7 @@ class Liveness:
 
     async def _check(self, node: str, api: str) -> None:
         try:
-            if node in self.unreachable:
-                async with self._slow:
-                    problem = await try_connect(api)
-            else:
+            async with self._slow if node in self.unreachable else contextlib.nullcontext():
                 problem = await try_connect(api)
         except ConnectionRefusedError:
             await asyncio.sleep(limits.NODE_RECHECK_DELAY)
@@ -413,11 +399,6 @@ class Notifier:
         self._closed = False
         self._serial = 0
 
-    @property
-    def waiting(self) -> int:
-        """Notifications in the queues."""
-        return sum(map(len, self._queues.values()))
-
     def add(self, slave_call: SlaveCall) -> None:
         """Queue a call; a task makes it, never this call."""
         if self._closed:
@@ -474,22 +455,16 @@ class Notifier:
             else:
                 _log.debug("> %s %s %s", api, method, name)
                 await call(api, method, MASTER_ID, name, value, use=Use.CORE)
-        except OutOfDescriptors as error:
-            # The shortage is this process's, and is reported elsewhere: the node may be well.
+        except (UnreachableError, RosFault, RemoteProtocolError, LocalProtocolError) as error:
             self._counters.add("notify.failed")
-            _log.debug("! %s", error)
-            return False
-        except UnreachableError as error:
-            self._counters.add("notify.failed")
-            _log.info("! %s", error)
-            self._on_unreachable(api)
-            return False
-        except (RosFault, RemoteProtocolError, LocalProtocolError) as error:
-            # The node got it, or never will: sending again would not help.
-            self._counters.add("notify.failed")
-            _log.info("! %s: %s", api, error)
-        else:
-            self._counters.add("notify.sent")
+            # A shortage is this process's, and is reported elsewhere: the node may be well.
+            short = isinstance(error, OutOfDescriptors)
+            _log.log(logging.DEBUG if short else logging.INFO, "! %s: %s", api, error)
+            if isinstance(error, UnreachableError) and not short:
+                self._on_unreachable(api)
+            # Else the node got it, or never will: sending again would not help.
+            return not isinstance(error, UnreachableError)
+        self._counters.add("notify.sent")
         return True
 
     async def _shut_down(self, api: str, node: str, topics: XmlRpcValue) -> None:

@@ -362,13 +362,11 @@ class Mirror:
         for entry, (api, detail) in self._yielder(list(self._own.items())):
             kind, key, node = entry
             if kind is RegistrationKind.PARAM:
-                lacks = restarted
-            elif self._is_newer(entry, seen):
-                lacks = False
+                there = not restarted
             else:
-                lacks = node not in survey.holders[kind].get(key, ()) or survey.uris.get(node) != api
-                lacks = lacks or (kind is RegistrationKind.SERVICE and survey.services.get(key) != detail)
-            if lacks:
+                there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == api
+                there = there and (kind is not RegistrationKind.SERVICE or survey.services.get(key) == detail)
+            if not there and not self._is_newer(entry, seen):
                 yield _register(entry, api, detail)
 
     def _surplus(self, survey: Survey, seen: int) -> Iterable[Call]:

@@ -10,6 +10,7 @@ only these are generated here. This module is imported when the first message is
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from rosbags.interfaces import Msgdef, Nodetype
@@ -19,8 +20,6 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rosbags.interfaces.typing import FieldDesc
 
 _BYTE: Final = (Nodetype.BASE, ("byte", 0))
@@ -58,26 +57,18 @@ class Ros1Store(Typestore):
                 for name, kind in self.fielddefs[typename][1]
             ]
             getsize, size = generate_getsize_ros1(fields, self)
-            no: Callable[..., Any] = _no_cdr
-            found = self.cache[typename] = Msgdef(
-                name=typename,
-                fields=fields,
-                cls=self.types[typename],
-                size_cdr=0,
-                getsize_cdr=no,
-                serialize_cdr_le=no,
-                serialize_cdr_be=no,
-                deserialize_cdr_le=no,
-                deserialize_cdr_be=no,
-                size_ros1=size,
-                getsize_ros1=getsize,
-                serialize_ros1=generate_serialize_ros1(fields, self),
-                deserialize_ros1=generate_deserialize_ros1(fields, self),
-                getsize_ros1_to_cdr=no,
-                ros1_to_cdr=no,
-                getsize_cdr_to_ros1=no,
-                cdr_to_ros1=no,
-            )
+            cdr: dict[str, Any] = {each.name: _no_cdr for each in dataclasses.fields(Msgdef)}
+            ros1: dict[str, Any] = {
+                "name": typename,
+                "fields": fields,
+                "cls": self.types[typename],
+                "size_cdr": 0,
+                "size_ros1": size,
+                "getsize_ros1": getsize,
+                "serialize_ros1": generate_serialize_ros1(fields, self),
+                "deserialize_ros1": generate_deserialize_ros1(fields, self),
+            }
+            found = self.cache[typename] = Msgdef(**cdr | ros1)
         return found
 
 
