@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
@@ -312,6 +313,9 @@ class ReliableRouteSender(RouteSender):
 
 class ExportFlow:
     """From one local publisher to the peers that want it, each by a route sender of its own."""
+
+    connection: TopicConnection
+    """To the publisher."""
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}

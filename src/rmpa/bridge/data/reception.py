@@ -110,8 +110,10 @@ class ImportFlow(DataHandler):
         """The bytes so far of the message that comes in parts, if it must be delivered whole."""
         self._held: tuple[asyncio.TimerHandle, int, bytes] | None = None
         """The end of the wait, the stamp and the bytes of a stale message that waits for a newer one."""
+        self.told: tuple[str, ...] = ()
+        """The local subscribers of which the publisher's agent was told on this route; see ``RemoteSubscribers``."""
         self._link: PeerLink
-        self._route = self._epoch = 0
+        self.route = self._epoch = 0
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = QosWatch(contract, self._loop.time(), past)
@@ -146,7 +148,8 @@ class ImportFlow(DataHandler):
         Returns:
             Whether the numbering of the earlier link goes on.
         """
-        position, self._link, self._route, self._epoch = self.position, link, route, epoch
+        position, self._link, self.route, self._epoch = self.position, link, route, epoch
+        self.told = ()
         self.torn()
         self._stop_ack_timer()
         self._numbering.begin(epoch, first)
@@ -351,7 +354,7 @@ class ImportFlow(DataHandler):
     def _acknowledge(self, now: float) -> None:
         self._stop_ack_timer()
         if (sequence := self._numbering.due_ack(now)) is not None:
-            self._link.mark(FrameKind.ACK, self._route, sequence)
+            self._link.mark(FrameKind.ACK, self.route, sequence)
 
     # --- messages in parts -----------------------------------------------------------------------------------------
 

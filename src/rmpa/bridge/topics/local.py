@@ -32,9 +32,11 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.core.external import Core
-    from rmpa.ros.core.liveness import Unreachable
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.subscription import TopicConnection
+
+
+_log = logging.getLogger(__name__)
 
 
 class LocalSources:
@@ -68,41 +70,28 @@ class LocalSources:
     def of(self, topic: str) -> dict[str, LocalSource]:
         """This module's own publishers of a topic, by node, without those that cannot be reached."""
         unreachable = self._core.unreachable()
-        nodes = {
-            node: uri
+        return {
+            node: LocalSource(self._type(topic, node), uri)
             for node, uri in self._core.publishers(topic).items()
-            if not is_own(node) and not (node in unreachable and self._withdrawn(unreachable[node], topic, node))
+            if not is_own(node)
+            and (node not in unreachable or not unreachable[node].withdrawn or self._flows(Source(topic, node)))
         }
-        said = self._core.type_of(topic) if nodes else ""
-        return {node: LocalSource(self._type(topic, node, said), uri) for node, uri in nodes.items()}
 
     def relayed(self, topic: str) -> dict[str, LocalSource]:
         """The proxies of a topic that this agent relays, by node, with their origin; empty if it is no relay."""
-        if not self._relay.enabled:
-            return {}
-        said = self._core.type_of(topic)
-        publishers: Mapping[str, str] = self._core.publishers(topic)
+        publishers: Mapping[str, str] = self._core.publishers(topic) if self._relay.enabled else {}
         return {
-            node: LocalSource(self._type(topic, node, said), uri, origin)
+            node: LocalSource(self._type(topic, node), uri, origin)
             for node, uri in publishers.items()
             if (origin := self._relay.origin((topic, node))) is not None
         }
 
-    def _withdrawn(self, found: Unreachable, topic: str, node: str) -> bool:
-        return found.withdrawn and not self._flows(Source(topic, node))
-
-    def _type(self, topic: str, node: str, otherwise: str) -> str:
-        return self._types.get(Source(topic, node)) or otherwise
-
-
-# Carries out the export plan: one subscription to each local publisher that a peer wants.
-
-
-_log = logging.getLogger(__name__)
+    def _type(self, topic: str, node: str) -> str:
+        return self._types.get(Source(topic, node)) or self._core.type_of(topic)
 
 
 class LocalSubscriptions:
-    """Subscriptions to local publishers, as the agent's own node.
+    """Subscriptions to local publishers that a peer wants, as the agent's own node, and the routes to the peers.
 
     Args:
         shared: The local core and the agent's node; its subscriptions are registered, so that ROS tools show them.
@@ -125,9 +114,8 @@ class LocalSubscriptions:
         self._node = shared.node
         self._exports, self._losses, self._out = exports, losses, out
         self._find = find
-        self._connections: dict[Source, TopicConnection] = {}
         self.flows: dict[Source, ExportFlow] = {}
-        """The flow of each connected source, for snapshots."""
+        """The flow of each source that the agent is connected to, for snapshots."""
         self._senders: dict[tuple[int, int], RouteSender] = {}
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
         # Kept messages are dropped when their outage is over.
@@ -136,46 +124,45 @@ class LocalSubscriptions:
     @property
     def connections(self) -> Iterable[TopicConnection]:
         """The connections to local publishers."""
-        return self._connections.values()
+        return [flow.connection for flow in self.flows.values()]
 
     def connect(self, source: Source, uri: str) -> None:
         """Subscribe to a publisher at its slave API; the exports are told its header later, or that it is lost."""
-        flow = self.flows[source] = ExportFlow()
-        if sum(s.topic == source.topic for s in self.flows) == 1:
-            self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
-        _log.debug("> subscribe to %s at %s", source, uri)
-        connection = self._connections[source] = self._connection(source, uri, flow)
-        connection.start()
-
-    def _connection(self, source: Source, uri: str, flow: ExportFlow) -> TopicConnection:
-        """A connection to a publisher, without a socket if it is a proxy of this process."""
 
         def find() -> Callable[[InProcessConnection], None] | None:
             publication = self._find(source.node, uri, source.topic)
             return publication.attach if publication is not None else None
 
+        if not any(one.topic == source.topic for one in self.flows):
+            self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
+        _log.debug("> subscribe to %s at %s", source, uri)
+        flow = self.flows[source] = ExportFlow()
         kind = PublisherConnection if find() is None else InProcessConnection
-        connection: TopicConnection = kind(
+        flow.connection = kind(
             source.topic,
             uri,
             OWN_NODE,
             on_message=flow.message,
             on_parts=flow,
             on_header=lambda fields: self._header(source, fields),
-            on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
-            on_lost=lambda reason: self._gone(source, connection, reason),
+            on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
+            on_lost=lambda reason: self._gone(source, flow, reason),
             on_oversized=lambda size: self._left_out(source, flow, size),
             number=self._node.next_number(),
             find=find,
         )
-        return connection
+        flow.connection.start()
 
     def disconnect(self, source: Source) -> None:
         """Disconnect one publisher, and drop its routes."""
-        connection = self._connections.pop(source, None)
-        if connection is not None:
-            connection.close()
-        self._drop(source)
+        if (flow := self.flows.get(source)) is not None:
+            flow.connection.close()
+            for peer in list(flow.by_peer):
+                self.remove_route(source, peer)
+            flow.close()
+            del self.flows[source]
+            if not any(one.topic == source.topic for one in self.flows):
+                self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
 
     def add_route(self, source: Source, peer: int, route: ExportRoute, link: PeerLink) -> None:
         """Send a source to one more peer, or resume its suspended route.
@@ -185,9 +172,9 @@ class LocalSubscriptions:
         """
         flow = self.flows[source]
         sender = flow.by_peer.get(peer)
-        self._claim(peer, source)
-        resumes = isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch
-        if isinstance(sender, ReliableRouteSender) and resumes and route.after is not None:
+        if route.after is not None and isinstance(sender, ReliableRouteSender) and sender.sender.epoch == route.epoch:
+            self._parked.claim((peer, source))
+            self._timer.arm()
             try:
                 sender.resume(link, route.number, route.after)
             except RemoteProtocolError:
@@ -196,28 +183,21 @@ class LocalSubscriptions:
             if missed := sender.missed():
                 self._losses.missed(source, peer, missed)
         else:
-            self._end(source, peer)
+            self.remove_route(source, peer)
             sender = flow.add(peer, link, route.number, route.contract, route.epoch)
         self._senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
         """Keep a reliable source's messages for an absent peer, for a time in seconds; best effort keeps none."""
-        flow = self.flows.get(source)
-        if flow is not None:
-            route_sender = flow.by_peer.get(peer)
-            self._forget(route_sender, peer)
-            if isinstance(route_sender, ReliableRouteSender):
-                key = (peer, source)
-                route_sender.suspend(self._keeper(key))
-                until = asyncio.get_running_loop().time() + outage
-                if full := self._parked.park(key, route_sender.sender, until):
-                    # Later: the exports are at work on these routes now.
-                    asyncio.get_running_loop().call_soon(self._give_up, full)
-                self._timer.arm()
-
-    def _keeper(self, key: tuple[int, Source]) -> Callable[[bytes, int], object]:
-        """Returns the function that keeps a source's messages for an absent peer."""
-        return lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp))
+        sender = self._sender_of(source, peer)
+        self._forget(peer, sender)
+        if isinstance(sender, ReliableRouteSender):
+            key = (peer, source)
+            sender.suspend(lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp)))
+            loop = asyncio.get_running_loop()
+            if full := self._parked.park(key, sender.sender, loop.time() + outage):
+                loop.call_soon(self._give_up, full)  # later: the exports are at work on these routes now
+            self._timer.arm()
 
     def back(self, peer: int) -> None:
         """Give a peer that has a link again ``mesh.limits.RESUME_CLAIM`` to open its suspended routes."""
@@ -231,36 +211,30 @@ class LocalSubscriptions:
         self._give_up([key for key in keys if self._parked.claim(key) is not None])
 
     def remove_route(self, source: Source, peer: int) -> None:
-        """End a source's route to a peer."""
-        self._claim(peer, source)
-        self._end(source, peer)
+        """End a source's route to a peer, if there is one, suspended or not."""
+        self._parked.claim((peer, source))
+        self._timer.arm()
+        if (sender := self._sender_of(source, peer)) is not None:
+            self._forget(peer, sender)
+            self.flows[source].remove(peer)
 
     def numbering(self, source: Source, peer: int) -> ReliableSender | None:
         """The sender of a source's reliable route to a peer, suspended or not; ``None`` if there is none."""
-        flow = self.flows.get(source)
-        route_sender = flow.by_peer.get(peer) if flow is not None else None
-        return route_sender.sender if isinstance(route_sender, ReliableRouteSender) else None
+        sender = self._sender_of(source, peer)
+        return sender.sender if isinstance(sender, ReliableRouteSender) else None
 
-    def _end(self, source: Source, peer: int) -> None:
-        """Removes a source's sender to a peer, if there is one."""
+    def _sender_of(self, source: Source, peer: int) -> RouteSender | None:
         flow = self.flows.get(source)
-        route_sender = flow.by_peer.get(peer) if flow is not None else None
-        if flow is not None and route_sender is not None:
-            self._forget(route_sender, peer)
-            flow.remove(peer)
-
-    def _claim(self, peer: int, source: Source) -> None:
-        self._parked.claim((peer, source))
-        self._timer.arm()
+        return flow.by_peer.get(peer) if flow is not None else None
 
     def _give_up(self, keys: list[tuple[int, Source]]) -> None:
         """Reports routes whose messages are not kept any more for absent peers."""
         for peer in dict.fromkeys(peer for peer, _ in keys):
             counts = {}
             for source in (source for one, source in keys if one == peer):
-                route_sender = flow.by_peer.get(peer) if (flow := self.flows.get(source)) is not None else None
-                if isinstance(route_sender, ReliableRouteSender):
-                    counts[source] = route_sender.missed() + route_sender.sender.pending
+                sender = self._sender_of(source, peer)
+                if isinstance(sender, ReliableRouteSender):
+                    counts[source] = sender.missed() + sender.sender.pending
             self._losses.given_up(peer, counts)
             for source in counts:
                 self._exports.given_up(source, peer)
@@ -275,13 +249,14 @@ class LocalSubscriptions:
             if owner == peer:
                 route_sender.lane_lost()
 
-    def _forget(self, route_sender: RouteSender | None, peer: int) -> None:
-        if route_sender is not None and self._senders.get((peer, route_sender.route)) is route_sender:
-            del self._senders[peer, route_sender.route]
+    def _forget(self, peer: int, sender: RouteSender | None) -> None:
+        """Takes no marks of a route any more; of a suspended one another route may have the id since."""
+        if sender is not None and self._senders.get((peer, sender.route)) is sender:
+            del self._senders[peer, sender.route]
 
     def close(self) -> None:
         """Disconnect all publishers."""
-        for source in list(self._connections):
+        for source in list(self.flows):
             self.disconnect(source)
         self._timer.close()
 
@@ -290,7 +265,7 @@ class LocalSubscriptions:
         text = about.definition.encode(errors="surrogateescape").decode("latin-1")
         description = Description(about.type, about.md5sum, text, about.latching)
         if description.problem:
-            self._gone(source, self._connections[source], description.problem)
+            self._gone(source, self.flows[source], description.problem)
             return
         if description.latching:
             self.flows[source].latch()
@@ -300,27 +275,15 @@ class LocalSubscriptions:
         flow.left_out(size)
         self._losses.oversized(source, flow)
 
-    def _gone(self, source: Source, connection: TopicConnection, reason: str) -> None:
-        if self._connections.get(source) is not connection:
+    def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
+        if self.flows.get(source) is not flow:
             return
-        self._connections.pop(source).close()
         short = DESCRIPTORS.problem  # reported once for the process; the node itself may be well
         _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
-        if connection.malformed:
+        if flow.connection.malformed:
             self._out.warn("publisher.malformed", str(source), f"{source}: {reason}")
-        numberings = {peer: self.numbering(source, peer) for peer in self.flows[source].by_peer}
-        self._drop(source)  # first: what follows may connect the source anew
-        lasts = {peer: numbering.last for peer, numbering in numberings.items() if numbering is not None}
+        lasts = {peer: one.last for peer in flow.by_peer if (one := self.numbering(source, peer)) is not None}
+        self.disconnect(source)  # first: what follows may connect the source anew
         self._exports.lost(source, reason[: limits.CONTROL_TEXT_MAX], lasts)
         if not short:
             self._core.suspect(source.node)
-
-    def _drop(self, source: Source) -> None:
-        flow = self.flows.pop(source, None)
-        if flow is not None:
-            for peer in list(flow.by_peer):
-                self._claim(peer, source)
-                self._forget(flow.by_peer[peer], peer)
-            flow.close()
-        if flow is not None and not any(s.topic == source.topic for s in self.flows):
-            self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

@@ -22,7 +22,7 @@ from rmpa.bridge.topics.exports import ExportEffects, Exports
 from rmpa.bridge.topics.imports import ImportEffects, Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
-from rmpa.bridge.topics.subscribers import MismatchReports, RemoteSubscribers
+from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
@@ -71,7 +71,7 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
         """Reports messages that do not reach their listeners."""
         self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
         """The subscriptions to local publishers, and the routes to the peers."""
-        self._mismatches = MismatchReports(self, self.exports, self.imports)
+        self._mismatches = Mismatches(self, self.exports, self.imports)
         self._subscribers = RemoteSubscribers(shared, self, self.exports, self.imports, self.peers)
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports, self.peers)

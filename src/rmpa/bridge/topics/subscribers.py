@@ -16,21 +16,24 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
+from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.messages import Audience, Mismatch, encode, is_crossing_name
-from rmpa.bridge.topics.imports import Imports, RouteState
 from rmpa.config.peer_rules import Access
 from rmpa.core.identity import OWN_NODE, proxied_node, proxy_name
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import Effects
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.imports import Imports
     from rmpa.bridge.topics.peer_topics import PeerTopics
+
+_log = logging.getLogger(__name__)
 
 _GOAL: Final = "ActionGoal"
 _CANCEL: Final = "actionlib_msgs/GoalID"
@@ -61,53 +64,10 @@ def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(names)[: limits.AUDIENCE_MAX])
 
 
-# Subscribers whose type or definition does not fit a source, for ``rmpa topic info`` and the diagnostics.
-
-
 class Mismatches:
-    """Texts by source and subscriber.
+    """Subscribers whose type or definition does not fit a source: local ones of peers' sources, and peers' of ours.
 
     A subscriber is given by its name: ``/viewer`` here, ``base/viewer`` at the peer ``base``.
-    """
-
-    def __init__(self) -> None:
-        self._texts: dict[Source, dict[str, str]] = {}
-
-    def __bool__(self) -> bool:
-        """Whether there are any."""
-        return bool(self._texts)
-
-    def texts(self, source: Source) -> tuple[str, ...]:
-        """The texts about one source."""
-        return tuple(self._texts.get(source, {}).values())
-
-    def add(self, source: Source, subscriber: str, text: str) -> None:
-        """Remember a mismatch, or replace its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
-        known = self._texts.setdefault(source, {})
-        if subscriber in known or len(known) < limits.MISMATCHES_MAX:
-            known[subscriber] = text
-
-    def mended(self, source: Source, subscriber: str) -> bool:
-        """Forget a subscriber that fits now or has gone; return whether it was remembered."""
-        return self._texts.get(source, {}).pop(subscriber, None) is not None
-
-    def peer_gone(self, name: str) -> None:
-        """Forget all subscribers at a peer that is gone."""
-        for known in self._texts.values():
-            for subscriber in [one for one in known if one == name or one.startswith(name + "/")]:
-                del known[subscriber]
-
-    def keep(self, wanted: Callable[[Source], bool]) -> None:
-        """Forget the sources for which ``wanted`` is false."""
-        for source in [source for source in self._texts if not wanted(source)]:
-            del self._texts[source]
-
-
-# Reports subscribers whose type or definition does not fit a source, here and to the agent at the other end.
-
-
-class MismatchReports:
-    """The mismatches of local subscribers with peers' sources, and of peers' subscribers with local sources.
 
     Args:
         out: Sends messages and warns.
@@ -117,15 +77,21 @@ class MismatchReports:
 
     def __init__(self, out: Effects, exports: Exports, imports: Imports) -> None:
         self._out, self._exports, self._imports = out, exports, imports
-        self._mismatches = Mismatches()
+        self._texts: dict[Source, dict[str, str]] = {}
 
     def texts(self, source: Source) -> tuple[str, ...]:
-        """Texts about subscribers, here or at peers, whose definition does not fit a source's."""
-        return self._mismatches.texts(source)
+        """The texts about one source, for ``rmpa topic info`` and the diagnostics."""
+        return tuple(self._texts.get(source, {}).values())
+
+    def _add(self, source: Source, subscriber: str, text: str) -> None:
+        """Remembers a mismatch, or replaces its text; dropped beyond ``limits.MISMATCHES_MAX`` for one source."""
+        known = self._texts.setdefault(source, {})
+        if subscriber in known or len(known) < limits.MISMATCHES_MAX:
+            known[subscriber] = text
 
     def refused(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         """A local subscriber does not fit a peer's source: remember it, and tell the peer."""
-        self._mismatches.add(source, subscriber, text)
+        self._add(source, subscriber, text)
         self._out.warn("mismatch.md5", str(source), text)
         self._out.send(peer, Mismatch(source.topic, source.node, subscriber, text))
 
@@ -136,53 +102,29 @@ class MismatchReports:
             return  # it went meanwhile
         subscriber = f"{name}{message.subscriber}"
         if not message.text:
-            self._mismatches.mended(source, subscriber)
+            self._texts.get(source, {}).pop(subscriber, None)
             return
-        self._mismatches.add(source, subscriber, message.text)
+        self._add(source, subscriber, message.text)
         where = f"{name}: {source}"
         self._out.warn("mismatch.remote", where, f"{where}: {message.text}")
 
     def registration_changed(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone or has registered again: forget its mismatch, here and at the peers."""
-        if not self._mismatches:
-            return
-        for peer, source in list(self._imports.at(topic)):
-            if self._mismatches.mended(source, subscriber):
+        for peer, source in list(self._imports.at(topic)) if self._texts else ():
+            if self._texts.get(source, {}).pop(subscriber, None) is not None:
                 self._out.send(peer, Mismatch(source.topic, source.node, subscriber, ""))
 
     def peer_gone(self, name: str) -> None:
         """Forget all subscribers at a peer that is gone."""
-        self._mismatches.peer_gone(name)
+        for known in self._texts.values():
+            for subscriber in [one for one in known if one.startswith(f"{name}/")]:
+                del known[subscriber]
 
     def forget_gone(self) -> None:
         """Forget the mismatches of sources that are gone."""
-        if self._mismatches:
-            self._mismatches.keep(lambda source: source in self._exports.offered or self._imports.knows(source))
-
-
-# Names local subscribers to the publishing peer, and connects to local publishers for a peer's subscribers.
-#
-# See ``bridge.topics.subscribers`` for the topics that need it.
-
-
-_log = logging.getLogger(__name__)
-
-
-def _ignore(_: memoryview) -> None:
-    """Drops a message: the bridge gets it by its own connection."""
-
-
-class _IgnoreParts:
-    """Drops messages that come in parts."""
-
-    def begin(self, size: int) -> None:
-        """A message of ``size`` bytes begins."""
-
-    def part(self, part: memoryview) -> None:
-        """A part of it."""
-
-    def abort(self) -> None:
-        """The rest does not come."""
+        for source in list(self._texts):
+            if source not in self._exports.offered and not self._imports.knows(source):
+                del self._texts[source]
 
 
 class RemoteSubscribers:
@@ -201,8 +143,6 @@ class RemoteSubscribers:
     ) -> None:
         self._shared, self._out = shared, out
         self._exports, self._imports, self._peers = exports, imports, peers
-        self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
-        """Route id and listeners as they were last sent to each peer, by source."""
         self._changed: dict[tuple[int, Source], None] = {}
         self._soon: asyncio.Handle | None = None
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
@@ -228,16 +168,13 @@ class RemoteSubscribers:
         self._soon = None
         changed, self._changed = self._changed, {}
         for peer, source in changed:
-            session, entry = self._shared.sessions.get(peer), self._imports.get(peer, source)
-            if session is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
-                self._told.pop((peer, source), None)
+            topic = topics.topics.get(source) if (topics := self._peers.get(peer)) is not None else None
+            if topics is None or topic is None or (flow := topic.flow) is None:
                 continue
-            publication = self._peers[peer].publication(source)
-            names = audience(publication.listeners) if publication is not None else ()
-            before, known = self._told.get((peer, source), (0, ()))
-            if names != (known if before == entry.route else ()):
-                self._told[peer, source] = (entry.route, names)
-                session.link.send_control(encode(Audience(entry.route, names)))
+            names = audience(topic.publication.listeners)
+            if names != flow.told and topics.flows.get(flow.route) is flow:
+                flow.told = names
+                topics.session.link.send_control(encode(Audience(flow.route, names)))
 
     # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
 
@@ -246,21 +183,23 @@ class RemoteSubscribers:
         if not isinstance(message, Audience):
             return False
         source = self._exports.source(session.peer, message.route)
-        local = self._exports.offered.get(source) if source is not None else None
-        if source is None or local is None or not is_watched(local.type):
+        if source is None or (local := self._exports.offered.get(source)) is None or not is_watched(local.type):
             return True
         if self._exports.description(source) is None:
             return True  # its publisher is not connected
         names = {name for node in message.nodes if (name := self._name(session, node, source.topic))}
-        shown = self._shown.setdefault((session.peer, source), {})
+        shown, most = self._shown.setdefault((session.peer, source), {}), limits.AUDIENCES_MAX
         for name in shown.keys() - names:
             shown.pop(name).close()
         for name in sorted(names - shown.keys()):
-            if self._count(session.peer) >= limits.AUDIENCES_MAX:
-                text = f"{session.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
+            if sum(len(names) for (peer, _), names in self._shown.items() if peer == session.peer) >= most:
+                text = f"{session.link.name}: more than {most} of its nodes listen to actions here"
                 self._out.warn("audience.too_many", session.link.name, text)
                 break
-            shown[name] = self._connect(source, local.uri, name)
+            _log.debug("> %s: %s listens", source, name)
+            sink = ExportFlow()  # to no peer: the bridge gets the messages by its own connection
+            shown[name] = PublisherConnection(source.topic, local.uri, name, on_message=sink.message, on_parts=sink)
+            shown[name].start()
         if not shown:
             del self._shown[session.peer, source]
         return True
@@ -275,15 +214,6 @@ class RemoteSubscribers:
             return ""
         return node if self._shared.context.gate.admits(Access.SUBSCRIBE, whose[0], topic, relay=relay) else ""
 
-    def _count(self, peer: int) -> int:
-        return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)
-
-    def _connect(self, source: Source, uri: str, name: str) -> PublisherConnection:
-        _log.debug("> %s: %s listens", source, name)
-        connection = PublisherConnection(source.topic, uri, name, on_message=_ignore, on_parts=_IgnoreParts())
-        connection.start()
-        return connection
-
     def route_over(self, peer: int, source: Source) -> None:
         """Close the connections for a source's listeners at a peer, since its route has ended."""
         for connection in self._shown.pop((peer, source), {}).values():
@@ -293,8 +223,6 @@ class RemoteSubscribers:
         """Close the connections for all listeners of a peer whose link is gone."""
         for owner, source in [key for key in self._shown if key[0] == peer]:
             self.route_over(owner, source)
-        for key in [key for key in self._told if key[0] == peer]:
-            del self._told[key]
 
     def close(self) -> None:
         """Close all connections."""

@@ -26,6 +26,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import subscribers as module
 from rmpa.bridge.topics.exports import LocalSource
+from rmpa.bridge.topics.imports import RouteState
 from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import PolicySettings, TrustSettings
@@ -83,7 +84,9 @@ class World:
         link = SimpleNamespace(name="base", send_control=lambda payload: self.sent.append(decode(payload)))
         proxies = SimpleNamespace(prefix="/rmpa/base")
         self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, proxies=proxies))
-        peers: Any = {1: SimpleNamespace(publication=self._publication)}
+        self.flows: dict[int, SimpleNamespace] = {}
+        topics = SimpleNamespace(get=self._topic)
+        peers: Any = {1: SimpleNamespace(session=self.peer, flows=self.flows, topics=topics)}
         out: Any = SimpleNamespace(warn=lambda kind, _who, _text: self.warned.append(kind))
         exports, imports = cast("Any", self.exports), cast("Any", self.imports)
         shared = SimpleNamespace(sessions={1: self.peer}, context=SimpleNamespace(gate=gate))
@@ -91,8 +94,14 @@ class World:
         self.exports.link_up(1, "base" if gate.on else "")
         self.imports.link_up(1)
 
-    def _publication(self, source: Source) -> object:
-        return SimpleNamespace(listeners=self.listeners[source]) if source in self.listeners else None
+    def _topic(self, source: Source) -> object:
+        """The source at its proxy, with a flow of its own for each route."""
+        entry = self.imports.get(1, source)
+        open_states = {RouteState.OPEN, RouteState.LINGERING}
+        if source not in self.listeners or entry is None or entry.state not in open_states:
+            return None
+        flow = self.flows.setdefault(entry.route, SimpleNamespace(route=entry.route, told=()))
+        return SimpleNamespace(publication=SimpleNamespace(listeners=self.listeners[source]), flow=flow)
 
     async def changed(self, source: Source, *listeners: str) -> list[object]:
         """These listen to a source of the peer now; return what it was told."""
