@@ -327,14 +327,22 @@ class SubscriberModule:
         """A source appears in the graph here, or leaves it."""
         if shown and source not in self.shown:
             latched = SimpleNamespace(latching=self.there.talkers[source].latched)
-            self.shown[source] = SimpleNamespace(
-                topic=source.topic, type=TYPE, shown=True, origin=None, description=latched, direct=False
+            entry = self.shown[source] = SimpleNamespace(
+                peer=self.here,
+                wire=source,
+                name=source.topic,
+                node=source.node,
+                type=TYPE,
+                shown=True,
+                origin=None,
+                description=latched,
+                direct=False,
             )
-            self.importer.shown(self.here, source)
+            self.importer.shown(cast("Any", entry))
             for name in list(self.listeners):
                 self.ask(source, name, anew=True)
         elif not shown and source in self.shown:
-            self.importer.hidden(self.here, source)
+            self.importer.hidden(self.shown[source])
             self.leave(source)
 
     def leave(self, source: Source) -> None:

@@ -53,7 +53,7 @@ class GraphPart(Part, Effects):
     """What peers offer."""
     direct_exports: Grants
     """Direct connections of peers' nodes to local ones."""
-    direct_imports: Paths
+    direct_imports: Paths[Any]
     """Direct connections of local nodes to peers' ones."""
     verb: ClassVar[str]
     """What a peer does with its entries, for the log."""

@@ -167,7 +167,7 @@ class ServicesSection:
             lookups = direct.lookups[remote.name]
             return {"wanted": wanted, "transport": "direct", "address": address, "lookups": lookups}
         found = {"wanted": wanted, "transport": "relay"}
-        unmet = direct.unmet(peer, remote.name)
+        unmet = direct.unmet(remote)
         return found if unmet is None else found | {"condition": unmet.condition.value, "relayed_because": unmet.text}
 
 

@@ -158,7 +158,7 @@ def _condition(subscribers: tuple[SubscriberTransport, ...]) -> tuple[str, str]:
     return (relayed[0].condition, relayed[0].text) if relayed else ("", "")
 
 
-def _subscriber(path: Path, now: float) -> SubscriberTransport:
+def _subscriber(path: Path[RemoteTopic], now: float) -> SubscriberTransport:
     endpoint = path.endpoint
     unmet = path.unmet
     return SubscriberTransport(

@@ -13,12 +13,13 @@ import logging
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic
 
 import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, DirectAsk, Grant, Unmet, Want, read_ask, read_reply
+from rmpa.bridge.offers import EntryT
 from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
@@ -41,7 +42,7 @@ LOST: Final = ("", -1)
 
 
 @dataclass(slots=True, eq=False)
-class Path:
+class Path(Generic[EntryT]):
     """How one local subscriber of a peer's topic, or all local callers of its service, reach the peer's node.
 
     More than twelve fields: the facts, the decision, and where the subscriber is, which follows it later.
@@ -49,6 +50,7 @@ class Path:
     Args:
         session: The peer.
         want: What is reached.
+        entry: The source or service, as the peer offers it.
         contract: That of the topic here; of a service the transport alone.
         here: The condition that does not hold by the rules and the graph of this module, if any.
         breaks: When its direct connections ended by themselves, monotonic seconds.
@@ -66,6 +68,7 @@ class Path:
 
     session: PeerSession
     want: Want
+    entry: EntryT
     contract: Contract
     here: Unmet | None = None
     breaks: deque[float] = field(default_factory=lambda: deque(maxlen=limits.DIRECT_BREAKS))
@@ -103,7 +106,7 @@ class Path:
         return "direct" if isinstance(self.found, Grant) else "relayed"
 
 
-class Paths:
+class Paths(Generic[EntryT]):
     """The decisions of this module. Subclasses probe nodes, and carry the decisions out.
 
     Args:
@@ -117,22 +120,22 @@ class Paths:
     def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None]) -> None:
         self._shared = shared
         self._on_warning = on_warning
-        self._paths: dict[tuple[int, str, str], dict[str, Path]] = {}
+        self._paths: dict[tuple[int, str, str], dict[str, Path[EntryT]]] = {}
         """By peer, name and node; then by user."""
         self._probes: dict[tuple[int, int, str], asyncio.Task[str]] = {}
         self._asks: dict[int, asyncio.Semaphore] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closed = False
 
-    def __iter__(self) -> Iterator[Path]:
+    def __iter__(self) -> Iterator[Path[EntryT]]:
         """Every path; changes during the iteration are allowed."""
         return iter([path for users in self._paths.values() for path in users.values()])
 
-    def of(self, peer: int, name: str, node: str) -> list[Path]:
+    def of(self, peer: int, name: str, node: str) -> list[Path[EntryT]]:
         """The paths to one node's topic or service, by the names of their users."""
         return [path for _, path in sorted(self._paths.get((peer, name, node), {}).items())]
 
-    def get(self, peer: int, want: Want) -> Path | None:
+    def get(self, peer: int, want: Want) -> Path[EntryT] | None:
         """One path; ``None`` if it is not known."""
         return self._paths.get((peer, *want[:2]), {}).get(want.user)
 
@@ -142,32 +145,35 @@ class Paths:
 
     # --- what subclasses do -----------------------------------------------------------------------------------------
 
-    async def _probe(self, path: Path, grant: Grant) -> str:
+    async def _probe(self, path: Path[EntryT], grant: Grant) -> str:
         """Why a node cannot be reached from here; empty: it can."""
         raise NotImplementedError
 
-    def _decided(self, path: Path) -> None:
+    def _decided(self, path: Path[EntryT]) -> None:
         """Carry out a decision."""
         raise NotImplementedError
 
-    def _subject(self, path: Path) -> str:
+    def _subject(self, path: Path[EntryT]) -> str:
         """A path in a warning."""
         raise NotImplementedError
 
     # --- facts ------------------------------------------------------------------------------------------------------
 
-    def judge(self, session: PeerSession, want: Want, contract: Contract, unmet: Unmet | None) -> Path:
+    def judge(
+        self, session: PeerSession, want: Want, entry: EntryT, contract: Contract, unmet: Unmet | None
+    ) -> Path[EntryT]:
         """Judge a path that is new, or for which something may have changed here.
 
         Args:
             session: The peer.
             want: What is reached.
+            entry: The source or service, as the peer offers it.
             contract: That of the topic here; of a service the transport alone.
             unmet: The condition that does not hold here, if any.
         """
         path = self.get(session.peer, want)
         if path is None:
-            path = Path(session, want, contract, unmet)
+            path = Path(session, want, entry, contract, unmet)
             self._paths.setdefault((session.peer, *want[:2]), {})[want.user] = path
         elif (path.contract, path.here) == (contract, unmet):
             return path
@@ -175,7 +181,7 @@ class Paths:
         self.update(path)
         return path
 
-    def forget(self, path: Path) -> None:
+    def forget(self, path: Path[EntryT]) -> None:
         """Forget a path that is not used any more; its connections stay as they are."""
         place = (path.session.peer, *path.want[:2])
         users = self._paths.get(place, {})
@@ -204,10 +210,10 @@ class Paths:
         for path in self._of_peer(session):
             self.forget(path)
 
-    def _of_peer(self, session: PeerSession) -> list[Path]:
+    def _of_peer(self, session: PeerSession) -> list[Path[EntryT]]:
         return [path for path in self if path.session is session]
 
-    def broke(self, path: Path) -> None:
+    def broke(self, path: Path[EntryT]) -> None:
         """Ask again for what was direct until its connection ended by itself, unless that happens all the time."""
         path.breaks.append(self._now())
         self.update(path)
@@ -217,7 +223,7 @@ class Paths:
         if path is not None and path.found is not _UNSTABLE:
             self.update(path, pause=path.asked_at + limits.DIRECT_RETRY_PAUSE - self._now())
 
-    def _retry(self, path: Path) -> None:
+    def _retry(self, path: Path[EntryT]) -> None:
         path.breaks.clear()
         self.update(path)
 
@@ -233,7 +239,7 @@ class Paths:
 
     # --- the decision -----------------------------------------------------------------------------------------------
 
-    def _unmet(self, path: Path) -> Unmet | None:
+    def _unmet(self, path: Path[EntryT]) -> Unmet | None:
         """The condition that does not hold by what is known here; ``None``: the peer decides."""
         if path.here is not None:
             return path.here
@@ -243,7 +249,7 @@ class Paths:
         often = len(breaks) == limits.DIRECT_BREAKS and breaks[-1] - breaks[0] < limits.DIRECT_BREAKS_SPAN
         return _UNSTABLE if often else None
 
-    def update(self, path: Path, *, pause: float = 0.0) -> None:
+    def update(self, path: Path[EntryT], *, pause: float = 0.0) -> None:
         """Decide again: a fact has changed.
 
         Args:
@@ -258,7 +264,7 @@ class Paths:
         else:
             path.task = self._spawn(self._find(path, pause), f"direct {path.want.name}")
 
-    async def decision(self, path: Path) -> None:
+    async def decision(self, path: Path[EntryT]) -> None:
         """Wait for the decision, at most ``limits.DIRECT_HOLD``."""
         try:
             async with asyncio.timeout(limits.DIRECT_HOLD):
@@ -267,7 +273,7 @@ class Paths:
         except TimeoutError:
             self._shared.counters.add("direct.undecided")
 
-    def _stop(self, path: Path) -> None:
+    def _stop(self, path: Path[EntryT]) -> None:
         for work in (path.task, path.retry):
             if work is not None:
                 work.cancel()
@@ -285,7 +291,7 @@ class Paths:
             self._shared.counters.add("direct.failed")
             _log.error("! %s failed", task.get_name(), exc_info=error)
 
-    async def _find(self, path: Path, pause: float) -> None:
+    async def _find(self, path: Path[EntryT], pause: float) -> None:
         found: Grant | Unmet = Unmet(Condition.AGENT, "this agent failed")
         try:
             await asyncio.sleep(pause)
@@ -297,7 +303,7 @@ class Paths:
                 path.task = None
                 self._decide(path, self._unmet(path) or found)
 
-    def _decide(self, path: Path, found: Grant | Unmet) -> None:
+    def _decide(self, path: Path[EntryT], found: Grant | Unmet) -> None:
         path.found, path.since = found, self._now()
         if isinstance(found, Unmet):
             self._release(path)
@@ -310,7 +316,7 @@ class Paths:
                 self._on_warning("direct.relayed", f"{path.session.peer} {subject} {found.condition}", text)
         self._decided(path)
 
-    async def _ask(self, path: Path) -> Grant | Unmet:
+    async def _ask(self, path: Path[EntryT]) -> Grant | Unmet:
         session, want = path.session, path.want
         async with self._asks.setdefault(session.peer, asyncio.Semaphore(limits.DIRECT_ASKS)):
             broken = bool(path.breaks) and path.breaks[-1] > path.asked_at
@@ -331,7 +337,7 @@ class Paths:
                 found = Unmet(Condition.AGENT, str(error))
             return found
 
-    async def _reached(self, path: Path, grant: Grant) -> Unmet | None:
+    async def _reached(self, path: Path[EntryT], grant: Grant) -> Unmet | None:
         """Probe a node, once for all that ask for it at a time."""
         key = (id(path.session.link), grant.port, "" if path.want.user else path.want.name)
         task = self._probes.get(key)
@@ -341,7 +347,7 @@ class Paths:
         problem = await asyncio.shield(task)
         return Unmet(Condition.REACHABLE, problem) if problem else None
 
-    def _release(self, path: Path) -> None:
+    def _release(self, path: Path[EntryT]) -> None:
         """Give back a grant that the peer may hold."""
         if path.held and path.session.linked:
             path.held = False

@@ -23,40 +23,36 @@ from rmpa.runtime.kernel_tcp import connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.services.imports import RemoteService, ServiceImports
+    from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
+
+    ServicePath = Path[RemoteService]
 
 _log = logging.getLogger(__name__)
 _OWN_TOOLS: Final = "/rmpa_service"
 """The names of the nodes of ``rmpa service`` begin so: their calls are relayed, so that the agents measure them."""
 
 
-class ServicePaths(Paths):
+class ServicePaths(Paths["RemoteService"]):
     """Direct calls of local nodes to services of peers.
 
     Args:
         shared: As of ``Paths``.
         on_warning: As of ``Paths``.
-        imports: The peers' services.
         proxy_uri: ``(peer, service)``: the proxy's address for a service; empty if there is none.
     """
 
     kind = "service"
 
     def __init__(
-        self,
-        shared: Shared,
-        on_warning: Callable[[str, str, str], None],
-        imports: ServiceImports,
-        proxy_uri: Callable[[int, str], str],
+        self, shared: Shared, on_warning: Callable[[str, str, str], None], proxy_uri: Callable[[int, str], str]
     ) -> None:
         super().__init__(shared, on_warning)
         own = Needs((), "the peer's own services that are called directly")
         shared.rpc.on_notification("direct.service_again", self._asked_again, own)
-        self._imports = imports
         self._proxy_uri = proxy_uri
-        self.answers: dict[str, Path] = {}
+        self.answers: dict[str, ServicePath] = {}
         """The services whose lookups are answered with the server's address, by their names here."""
         self.lookups: Counter[str] = Counter()
         """How many lookups of each were answered so."""
@@ -124,61 +120,54 @@ class ServicePaths(Paths):
         if looked:
             self._look_later()
 
-    def unmet(self, peer: int, service: str) -> Unmet | None:
+    def unmet(self, remote: RemoteService) -> Unmet | None:
         """Why the calls of a shown service are relayed; ``None``: they are direct, or it is not decided yet."""
-        remote = self._imports.get(peer, service)
-        if remote is None:
-            return None
-        path = self.get(peer, Want(service, remote.node))
+        path = self.get(remote.peer, Want(remote.name, remote.node))
         if path is not None:
             return path.unmet
-        contract = Contract(transport=self._shared.context.services.transport(service))
+        contract = Contract(transport=self._shared.context.services.transport(remote.name))
         return unmet_by_contract(contract, "this module")  # nothing is kept of what is relayed by rule
 
     # --- the local graph -----------------------------------------------------------------------------------------
 
-    def shown(self, peer: int, service: str) -> None:
+    def shown(self, remote: RemoteService) -> None:
         """Judge a service that is in the local graph, or to which other rules apply."""
-        remote, session = self._imports.get(peer, service), self._shared.sessions.get(peer)
-        if remote is None or not remote.shown or session is None:
-            return
-        want, wanted = Want(service, remote.node), self._shared.context.services.transport(service)
-        if wanted is not Transport.RELAY:
-            self.judge(session, want, Contract(transport=wanted), self._unmet_here(session, remote))
-        elif (path := self.get(peer, want)) is not None:
+        session, want = self._shared.sessions.get(remote.peer), Want(remote.name, remote.node)
+        contract = Contract(transport=self._shared.context.services.transport(remote.name))
+        if contract.transport is not Transport.RELAY and session is not None:
+            self.judge(session, want, remote, contract, self._unmet_here(session, remote, contract))
+        elif (path := self.get(remote.peer, want)) is not None:
             self.forget(path)  # nothing is kept of services that are relayed by rule
 
-    def hidden(self, peer: int, service: str, node: str, *, end: bool = False) -> None:
+    def hidden(self, remote: RemoteService, *, end: bool = False) -> None:
         """Forget a service that leaves the local graph; clients keep the connections that they have.
 
         Args:
-            peer: The peer.
-            service: The service.
-            node: The node that provides it.
+            remote: The service.
             end: End these connections, too: the peer may not serve it here any more.
         """
-        path = self.get(peer, Want(service, node))
+        path = self.get(remote.peer, Want(remote.name, remote.node))
         if path is not None:
             endpoint = path.endpoint
             self.forget(path)
             if end and endpoint is not None:
                 self._end(path.session, (endpoint,))
 
-    def forget(self, path: Path) -> None:
+    def forget(self, path: ServicePath) -> None:
         """As of ``Paths``; lookups are answered with the proxy's address again."""
         super().forget(path)
         path.found = None
         self._decided(path)
 
-    def renewed(self, peer: int, service: str, node: str) -> None:
+    def renewed(self, remote: RemoteService) -> None:
         """Ask again for a service that was offered again: its server may be another one."""
-        path = self.get(peer, Want(service, node))
+        path = self.get(remote.peer, Want(remote.name, remote.node))
         if path is not None and path.here is None:
             self.update(path)
 
-    def _unmet_here(self, session: PeerSession, remote: RemoteService) -> Unmet | None:
+    def _unmet_here(self, session: PeerSession, remote: RemoteService, contract: Contract) -> Unmet | None:
         rules, service, owner = self._shared.context.services, remote.name, "the server's module"
-        contract, other = Contract(transport=rules.transport(service)), remote.wire if remote.wire != service else ""
+        other = remote.wire if remote.wire != service else ""
         unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, remote.origin)
         if unmet is not None:
             return unmet
@@ -216,7 +205,7 @@ class ServicePaths(Paths):
 
     # --- carrying out --------------------------------------------------------------------------------------------
 
-    async def _probe(self, path: Path, grant: Grant) -> str:
+    async def _probe(self, path: ServicePath, grant: Grant) -> str:
         address = f"rosrpc://{path.session.address}:{grant.port}"
         try:
             connection = await ServiceConnection.open(
@@ -229,10 +218,10 @@ class ServicePaths(Paths):
             return f"{printable(connection.caller_id) or 'another program'} listens at {address}"
         return ""
 
-    def _subject(self, path: Path) -> str:
+    def _subject(self, path: ServicePath) -> str:
         return f"{path.want.name} of {path.session.link.name}"
 
-    def _decided(self, path: Path) -> None:
+    def _decided(self, path: ServicePath) -> None:
         service, peer = path.want.name, path.session.link.name
         answered, before, path.place = self.answers.get(service), path.place, path.target
         if path.place is None:

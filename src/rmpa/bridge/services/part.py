@@ -108,7 +108,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         self.serving = Serving(shared, self.exports, self._budgets)
         """The servers of this module that peers call."""
         self.direct_exports = ServiceGrants(shared, self.exports, self.warn)
-        self.direct_imports = ServicePaths(shared, self.warn, self.imports, self._proxy_uri)
+        self.direct_imports = ServicePaths(shared, self.warn, self._proxy_uri)
         shared.rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))
 
     def __iter__(self) -> Iterator[ShownService]:
@@ -124,7 +124,8 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         super().reload()
         self.direct_exports.judge_again()
         for shown in yielding_to_data(list(self._shown.values()), every=16):
-            self.direct_imports.shown(shown.peer, shown.service)
+            if (remote := self.imports.get(shown.peer, shown.service)) is not None:
+                self.direct_imports.shown(remote)
             timeout, endpoint = self.context.services.timeout(shown.service), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
@@ -285,7 +286,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
         shown = self._shown[peer, service] = ShownService(peer, service, node, self.imports.peer_name(peer))
         session.proxies.hold(node, f"service {service}", lambda proxy: self._expose(shown, proxy))
-        self.direct_imports.shown(peer, service)
+        self.direct_imports.shown(remote)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
         """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""
@@ -326,7 +327,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         shown = self._shown.pop((remote.peer, remote.name), None)
         if shown is None:
             return
-        self.direct_imports.hidden(remote.peer, remote.name, remote.node, end=remote.cause == DENIED)
+        self.direct_imports.hidden(remote, end=remote.cause == DENIED)
         text = f"{shown.text}: {reason}"
         self._fail_waiting(shown, text)
         if (proxy := shown.proxy) is not None:
@@ -342,7 +343,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         if shown is not None:
             if shown.endpoint is not None:
                 shown.endpoint.description = None
-            self.direct_imports.renewed(remote.peer, remote.name, shown.node)
+            self.direct_imports.renewed(remote)
 
     def _call(self, shown: ShownService, call: ServiceCall) -> None:
         """Make a client's call, or have it wait until the service is open; the hot path."""

@@ -23,7 +23,6 @@ from rmpa.bridge.direct.conditions import (
 )
 from rmpa.bridge.direct.nodes import bus_links, end_links, forgotten, kernel_tells, publisher_update, standing
 from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
-from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.core.contract import Contract, Transport
@@ -39,11 +38,14 @@ from rmpa.ros.wire.xmlrpc import RosReply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
+    from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.imports import Imports, RemoteTopic
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.ros.node.publication import Publication
+
+    TopicPath = Path[RemoteTopic]
 
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
@@ -52,7 +54,7 @@ _TWICE: Final = Unmet(
 )
 
 
-class TopicPaths(Paths):
+class TopicPaths(Paths["RemoteTopic"]):
     """Direct connections of local subscribers to nodes of peers.
 
     Args:
@@ -89,49 +91,50 @@ class TopicPaths(Paths):
 
     def reload(self) -> None:
         """Judge every subscriber by the new contracts."""
-        for peer, source, _ in list(self._imports):
-            self.shown(peer, source)
+        for _, _, entry in list(self._imports):
+            self.shown(entry)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Judge a local subscriber that came, or forget one that went."""
         if change.kind is not RegistrationKind.SUBSCRIBER or is_own(change.node):
             return
         for peer, source in list(self._imports.at(change.name)):
-            if change.added:
-                self._consider(peer, source, change.node, change.api)
-            elif (path := self.get(peer, Want(source.topic, source.node, change.node))) is not None:
+            entry = self._imports.get(peer, source)
+            if change.added and entry is not None:
+                self._consider(entry, change.node, change.api)
+            path = self.get(peer, Want(source.topic, source.node, change.node))
+            if not change.added and path is not None:
                 self.forget(path)  # it ends its connections itself
 
-    def shown(self, peer: int, source: Source) -> None:
+    def shown(self, entry: RemoteTopic) -> None:
         """Judge the subscribers of a source that appears in the local graph, or to which other rules apply."""
-        entry = self._imports.get(peer, source)
-        if entry is not None:
-            for node, uri in self._shared.core.subscribers(entry.topic).items():
-                self._consider(peer, source, node, uri)
+        for node, uri in self._shared.core.subscribers(entry.name).items():
+            self._consider(entry, node, uri)
 
-    def hidden(self, peer: int, source: Source) -> None:
+    def hidden(self, entry: RemoteTopic) -> None:
         """Forget the subscribers of a source that leaves the local graph, and end their direct connections."""
-        for path in self.of(peer, source.topic, source.node):
+        for path in self.of(entry.peer, entry.wire.topic, entry.node):
             self.forget(path)
             self._hang_up(path)
 
-    def _consider(self, peer: int, source: Source, node: str, uri: str) -> None:
-        session, entry = self._shared.sessions.get(peer), self._imports.get(peer, source)
-        if session is None or entry is None or not entry.shown or is_own(node):
+    def _consider(self, entry: RemoteTopic, node: str, uri: str) -> None:
+        session = self._shared.sessions.get(entry.peer)
+        if session is None or not entry.shown or is_own(node):
             return
-        want = Want(source.topic, source.node, node)
-        contract = self._shared.context.contracts.of(entry.topic, entry.type)
-        is_known = self.get(peer, want) is not None
+        want = Want(entry.wire.topic, entry.node, node)
+        contract = self._shared.context.contracts.of(entry.name, entry.type)
+        is_known = self.get(entry.peer, want) is not None
         if contract.transport is Transport.RELAY and not is_known:
             return  # nothing is kept of topics that are relayed by rule
-        path = self.judge(session, want, contract, self._unmet_here(session, want, entry, contract, uri))
+        unmet = self._unmet_here(session, want, entry, contract, uri)
+        path = self.judge(session, want, entry, contract, unmet)
         if not is_known and self._is_relayed(path):
             path.place = AGENTS  # until now it was relayed by rule
 
     def _unmet_here(
         self, session: PeerSession, want: Want, entry: RemoteTopic, contract: Contract, uri: str
     ) -> Unmet | None:
-        node, owner, other = want.user, "the publisher's module", want.name if want.name != entry.topic else ""
+        node, owner, other = want.user, "the publisher's module", want.name if want.name != entry.name else ""
         unmet = unmet_by_rules(contract, self._shared, session, "this module", owner, other, entry.origin)
         if unmet is not None:
             return unmet
@@ -149,23 +152,23 @@ class TopicPaths(Paths):
             return Unmet(Condition.SUBSCRIBER, text)
         return None
 
-    def _unmet(self, path: Path) -> Unmet | None:
+    def _unmet(self, path: TopicPath) -> Unmet | None:
         """As of ``Paths``. A latched source that is relayed to a subscriber stays so until it subscribes again."""
         unmet = super()._unmet(path)
         if unmet is not None or not self._is_relayed(path):
             return unmet
-        entry = self._imports.get(path.session.peer, _source(path))
-        return _TWICE if entry is not None and entry.description and entry.description.latching else None
+        description = path.entry.description
+        return _TWICE if description is not None and description.latching else None
 
-    def _is_relayed(self, path: Path) -> bool:
+    def _is_relayed(self, path: TopicPath) -> bool:
         publication = self._publication(path)
         return publication is not None and path.want.user in publication.callers
 
-    def _publication(self, path: Path) -> Publication | None:
+    def _publication(self, path: TopicPath) -> Publication | None:
         topics = self._topics.get(path.session.peer)
-        return topics.publication(_source(path)) if topics is not None else None
+        return topics.publication(path.entry.wire) if topics is not None else None
 
-    def _uri(self, path: Path) -> str:
+    def _uri(self, path: TopicPath) -> str:
         """The slave API of a path's subscriber; empty if it is not registered."""
         return self._shared.core.subscribers(path.want.name).get(path.want.user, "")
 
@@ -176,11 +179,12 @@ class TopicPaths(Paths):
         want = Want(source.topic, source.node, subscriber)
         path, session = self.get(peer, want), self._shared.sessions.get(peer)
         recent = self._now() < self._started + limits.DIRECT_ADOPT
-        if path is None and session is not None and (recent or session.link.name in self._left):
-            path = Path(session, want, Contract())
+        entry = self._imports.get(peer, source)
+        if path is None and session is not None and entry and (recent or session.link.name in self._left):
+            path = Path(session, want, entry, Contract())
         return self._answer(path) if path is not None else None
 
-    async def _answer(self, path: Path) -> RosReply | None:
+    async def _answer(self, path: TopicPath) -> RosReply | None:
         await self.decision(path)
         direct = path.target if path.task is None else None
         stays = await self._end_direct(path, keep=direct)
@@ -192,7 +196,7 @@ class TopicPaths(Paths):
         self._put(path, direct or AGENTS)
         return RosReply(1, f"ready on {direct[0]}:{direct[1]}", [TCPROS, *direct]) if direct is not None else None
 
-    def _put(self, path: Path, place: tuple[str, int], at: float | None = None) -> None:
+    def _put(self, path: TopicPath, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
         path.place, path.placed_at = place, self._now() if at is None else at
         if place in {LOST, AGENTS, path.target}:
@@ -201,7 +205,7 @@ class TopicPaths(Paths):
         self._place(path)
         self._watch()
 
-    def _interrupted(self, path: Path, *, lasts: bool) -> None:
+    def _interrupted(self, path: TopicPath, *, lasts: bool) -> None:
         interrupted(self.interruptions, path.session.link.name, path.want, self._now(), lasts=lasts)
 
     def listeners_changed(self, peer: int, source: Source) -> None:
@@ -219,21 +223,17 @@ class TopicPaths(Paths):
 
     def link_up(self, session: PeerSession) -> None:
         """As of ``Paths``."""
-        for peer, _, entry in self._imports:
-            if peer == session.peer:
-                entry.direct = False
+        for path in self._of_peer(session):
+            path.entry.direct = False
         super().link_up(session)
 
     def link_down(self, session: PeerSession) -> None:
         """As of ``Paths``; sources with direct subscribers stay in the graph if only the peer's agent has died."""
         for path in self._of_peer(session):
-            entry = self._imports.get(session.peer, _source(path))
-            if path.endpoint is None:
-                continue
-            if not session.link.crashed:
+            if path.endpoint is not None and session.link.crashed:
+                path.entry.direct = True
+            elif path.endpoint is not None:
                 self._interrupted(path, lasts=True)
-            elif entry is not None:
-                entry.direct = True
         super().link_down(session)
 
     def gone(self, session: PeerSession) -> None:
@@ -245,13 +245,13 @@ class TopicPaths(Paths):
         for path in direct if not session.link.crashed else ():
             self._hang_up(path)
 
-    def _hang_up(self, path: Path) -> None:
+    def _hang_up(self, path: TopicPath) -> None:
         """Make a subscriber leave its direct connection; it is not called back."""
         if path.endpoint is not None and not self._closed:
             self._shared.counters.add("direct.hung_up")
             self._spawn(self._leave(path), f"hang up {path.want.user}")
 
-    async def _leave(self, path: Path) -> tuple[str, int] | None:
+    async def _leave(self, path: TopicPath) -> tuple[str, int] | None:
         """Make a subscriber leave all of its connections to a node; return a direct one that stays."""
         proxy, publication = path.session.proxies.get(path.want.node), self._publication(path)
         await self._list(path, without=proxy.uri if proxy is not None else "")
@@ -261,15 +261,15 @@ class TopicPaths(Paths):
 
     # --- carrying out -----------------------------------------------------------------------------------------------
 
-    async def _probe(self, path: Path, grant: Grant) -> str:
+    async def _probe(self, path: TopicPath, grant: Grant) -> str:
         address, timeout = path.session.address, limits.DIRECT_PROBE_TIMEOUT
         problem = await probe(address, grant.port, grant.probe, node=grant.node, timeout=timeout)
         return f"no connection to {address}:{grant.port}: {problem}" if problem else ""
 
-    def _subject(self, path: Path) -> str:
-        return f"{_source(path)} to {path.want.user}"
+    def _subject(self, path: TopicPath) -> str:
+        return f"{path.entry.wire} to {path.want.user}"
 
-    def _decided(self, path: Path) -> None:
+    def _decided(self, path: TopicPath) -> None:
         if path.endpoint == path.target:
             path.stuck = ""
             if path.endpoint is not None:
@@ -277,7 +277,7 @@ class TopicPaths(Paths):
         self._place(path)
         self._watch()
 
-    def _is_misplaced(self, path: Path) -> bool:
+    def _is_misplaced(self, path: TopicPath) -> bool:
         """Whether a subscriber has another connection than was decided, or waits for being called back."""
         if path.task is not None or path.place is None or self.get(path.session.peer, path.want) is not path:
             return False
@@ -285,11 +285,11 @@ class TopicPaths(Paths):
             return self._now() - path.placed_at > limits.DIRECT_SETTLE
         return path.endpoint != path.target
 
-    def _place(self, path: Path) -> None:
+    def _place(self, path: TopicPath) -> None:
         if path.mover is None and not self._closed and self._is_misplaced(path):
             path.mover = self._spawn(self._move(path), f"move {path.want.user}")
 
-    async def _move(self, path: Path) -> None:
+    async def _move(self, path: TopicPath) -> None:
         """Make a subscriber leave its connection, and call it back to get the answer that was decided."""
         try:
             while self._is_misplaced(path) and await self._renew(path):
@@ -297,7 +297,7 @@ class TopicPaths(Paths):
         finally:
             path.mover = None
 
-    async def _renew(self, path: Path) -> bool:
+    async def _renew(self, path: TopicPath) -> bool:
         """List without the proxy, end the connection, list with it; return whether that was done."""
         uri, proxy = self._uri(path), path.session.proxies.get(path.want.node)
         if not uri or proxy is None or self._publication(path) is None:
@@ -311,7 +311,7 @@ class TopicPaths(Paths):
         asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
         return True
 
-    async def _end_direct(self, path: Path, *, keep: tuple[str, int] | None = None) -> tuple[str, int] | None:
+    async def _end_direct(self, path: TopicPath, *, keep: tuple[str, int] | None = None) -> tuple[str, int] | None:
         """End connections of a subscriber to a peer's nodes: of an earlier answer, or an earlier run of an agent.
 
         A second connection would double messages.
@@ -346,7 +346,7 @@ class TopicPaths(Paths):
                 return end
         return None
 
-    async def _list(self, path: Path, *, without: str = "") -> None:
+    async def _list(self, path: TopicPath, *, without: str = "") -> None:
         """Tell a subscriber the publishers of its topic, as its master does."""
         uri, topic = self._uri(path), path.want.name
         if uri:
@@ -354,13 +354,13 @@ class TopicPaths(Paths):
                 uri, topic, [one for one in self._shared.core.publishers(topic).values() if one != without]
             )
 
-    def _list_again(self, path: Path) -> None:
+    def _list_again(self, path: TopicPath) -> None:
         """Repeat the list of publishers: a roscore's graph is known here with a delay, and calls may be lost."""
         if not self._closed and path.mover is None:
             self._spawn(self._list(path), f"call back {path.want.user}")
 
-    def _warn_stuck(self, path: Path, endpoint: tuple[str, int], problem: str) -> None:
-        source, user = _source(path), path.want.user
+    def _warn_stuck(self, path: TopicPath, endpoint: tuple[str, int], problem: str) -> None:
+        source, user = path.entry.wire, path.want.user
         path.stuck = problem
         text = (
             f"{source}: {user} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves only when "
@@ -379,7 +379,7 @@ class TopicPaths(Paths):
         """Compare the direct connections with the kernel's table; ask the nodes only where some are missing."""
         self._checking = None
         self._watch()
-        settled: list[tuple[Path, tuple[str, int]]] = []
+        settled: list[tuple[TopicPath, tuple[str, int]]] = []
         for path in self:
             if not path.stuck:
                 self._place(path)
@@ -392,7 +392,7 @@ class TopicPaths(Paths):
             if len(there[endpoint[0]].get(endpoint[1], ())) < wanted[endpoint]:
                 self._spawn(self._check_one(path, endpoint), f"check {path.want.user}")
 
-    async def _check_one(self, path: Path, endpoint: tuple[str, int]) -> None:
+    async def _check_one(self, path: TopicPath, endpoint: tuple[str, int]) -> None:
         uri = self._uri(path)
         links = await bus_links(uri, path.want.name) if uri else None
         stands = any(one.connected and one.remote == endpoint for one in links or ())
@@ -409,7 +409,3 @@ class TopicPaths(Paths):
         if self._checking is not None:
             self._checking.cancel()
         await super().close()
-
-
-def _source(path: Path) -> Source:
-    return Source(path.want.name, path.want.node)

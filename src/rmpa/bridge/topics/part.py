@@ -307,13 +307,13 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
             place = (entry.name, name)
             self._shared.relay.pass_on(session.peer, session.link.identity, source, place, entry.origin)
             topics.publish(entry)
-            self.direct_imports.shown(entry.peer, source)
+            self.direct_imports.shown(entry)
 
     def retract(self, entry: RemoteTopic) -> None:
         """As of ``ImportEffects``."""
         if (topics := self.peers.get(entry.peer)) is not None:
             self._shared.relay.gone(entry.peer, entry.wire)
-            self.direct_imports.hidden(entry.peer, entry.wire)
+            self.direct_imports.hidden(entry)
             topics.retract(entry.wire)
 
     def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:

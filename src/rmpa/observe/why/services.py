@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.imports import RemoteTopic
@@ -495,7 +496,7 @@ class ServiceEvidence:
             node=remote.node,
             hidden=hidden,
             registered=bool(uri),
-            transport=self._transport(session.peer, service),
+            transport=self._transport(remote),
             answer=answer,
             refusal=refusal,
             calls=shown.stats.calls,
@@ -504,13 +505,9 @@ class ServiceEvidence:
             mismatch=shown.mismatch,
         )
 
-    def _transport(self, peer: int, service: str) -> ServiceTransport:
-        direct = self._services.direct_imports
-        wanted, address, unmet = (
-            self._bridge.context.services.transport(service),
-            direct.address(peer, service),
-            direct.unmet(peer, service),
-        )
+    def _transport(self, remote: RemoteService) -> ServiceTransport:
+        direct, wanted = self._services.direct_imports, self._bridge.context.services.transport(remote.name)
+        address, unmet = direct.address(remote.peer, remote.name), direct.unmet(remote)
         if address:
             return ServiceTransport(wanted, address)
         if unmet is None:

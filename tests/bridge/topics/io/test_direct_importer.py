@@ -109,14 +109,22 @@ class Module:
         )
         monkeypatch.setattr(self.sut, "_renew", self._renew)
 
-    async def _renew(self, path: Path) -> bool:
+    async def _renew(self, path: Path[Any]) -> bool:
         self.moved.append(path.want.user)
         return False
 
     @staticmethod
     def _entry() -> Any:
         return SimpleNamespace(
-            topic="/chatter", type="std_msgs/String", shown=True, origin=None, description=None, direct=False
+            peer=1,
+            wire=SOURCE,
+            name="/chatter",
+            node="/talker",
+            type="std_msgs/String",
+            shown=True,
+            origin=None,
+            description=None,
+            direct=False,
         )
 
     async def _request(self, *_: object) -> object:
@@ -150,7 +158,7 @@ class Module:
         return await answer if answer is not None else None
 
     @property
-    def path(self) -> Path:
+    def path(self) -> Path[Any]:
         found = self.sut.get(1, WANT)
         assert found is not None
         return found
@@ -169,7 +177,7 @@ async def module(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Module]:
 
 async def test_a_subscriber_waits_for_the_decision_and_is_sent_to_the_links_own_address(module: Module) -> None:
     module.gate.clear()
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     asking = asyncio.create_task(module.ask())
     await until(lambda: module.asking)
     module.gate.set()
@@ -183,7 +191,7 @@ async def test_one_that_has_waited_for_too_long_is_relayed_and_moved_later(
 ) -> None:
     monkeypatch.setattr(limits, "DIRECT_HOLD", 0.01)
     module.gate.clear()
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() is None
     assert module.state == ("asking", None)
     module.gate.set()
@@ -191,7 +199,7 @@ async def test_one_that_has_waited_for_too_long_is_relayed_and_moved_later(
 
 
 async def test_a_withdrawal_while_the_answer_is_made_is_not_overlooked(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     await until(lambda: module.state[0] == "direct")
     module.connected = [LINK]
     asking = asyncio.create_task(module.ask())
@@ -206,7 +214,7 @@ async def test_a_withdrawal_while_the_answer_is_made_is_not_overlooked(module: M
 
 
 async def test_one_that_is_connected_already_gets_no_second_connection(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     await until(lambda: module.state[0] == "direct")
     module.connected = [LINK]
     reply = await module.ask()
@@ -218,7 +226,7 @@ async def test_one_that_is_connected_already_gets_no_second_connection(module: M
 async def test_only_so_many_requests_wait_for_a_peer(module: Module) -> None:
     module.gate.clear()
     module.subscribers["/chatter"] |= {f"/n{number}": "http://10.0.0.2:1/" for number in range(200)}
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     await until(lambda: module.asking == limits.DIRECT_ASKS)
     module.gate.set()
     await until(lambda: all(path.state == "direct" for path in module.sut))
@@ -240,7 +248,7 @@ async def test_why_a_peer_grants_nothing_decides_whether_it_is_asked_again(
     module: Module, value: object, condition: Condition
 ) -> None:
     module.value = value
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() is None
     unmet = module.path.unmet
     assert unmet is not None
@@ -249,7 +257,7 @@ async def test_why_a_peer_grants_nothing_decides_whether_it_is_asked_again(
 
 
 async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
     module.sut.link_down(module.session)
     assert module.entry.direct
@@ -263,15 +271,15 @@ async def test_a_source_is_kept_only_while_its_own_agent_is_dead(module: Module)
 
 
 async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
     assert module.sut.interruptions.get(("a", WANT)) is None
     module.session.link.crashed = False
     module.sut.link_down(module.session)
-    module.sut.hidden(1, SOURCE)
+    module.sut.hidden(module.entry)
     count, _, ended = module.sut.interruptions["a", WANT]
     assert (count, ended) == (1, None)
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     module.sut.link_up(module.session)
     assert await module.ask() == DIRECT
     assert module.sut.interruptions["a", WANT][2] is not None
@@ -279,7 +287,7 @@ async def test_an_interruption_by_a_lost_link_is_told_after_it(module: Module) -
 
 async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(module: Module) -> None:
     module.reachable.clear()
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     await until(lambda: module.probed)
     early = module.reachable
     module.reachable = asyncio.Event()
@@ -295,21 +303,21 @@ async def test_a_probe_over_an_earlier_link_does_not_count_for_the_next_one(modu
 
 
 async def test_a_subscriber_that_ends_frees_its_grant(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
-    module.sut.hidden(1, SOURCE)
+    module.sut.hidden(module.entry)
     assert "direct.topic_release" in module.told
     assert list(module.sut) == []
 
 
 async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_connection_before(module: Module) -> None:
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
     module.connected = [LINK]
     module.sut.link_down(module.session)
     module.sut.gone(module.session)
     module.value = {"why": "listening", "text": "loopback"}
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() is None
     assert module.connected == []
 
@@ -324,9 +332,9 @@ async def test_a_connection_to_an_earlier_address_of_the_peer_ends(
     monkeypatch.setattr(
         direct_importer, "standing", lambda address, _=None: {45225: {40_000}} if address == END[0] else {}
     )
-    module.sut.shown(1, SOURCE)
+    module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
     module.connected = [LINK]
     module.session.address = "10.1.0.1"  # its next link came by another network
-    module.sut.hidden(1, SOURCE)
+    module.sut.hidden(module.entry)
     await until(lambda: module.connected == [])
