@@ -27,7 +27,7 @@ class MeasuredMesh:
     def __init__(self) -> None:
         self._key = ec.generate_private_key(CURVE)
         self._ca = make_ca(self._key, "lab", _serial(), time.time())
-        self._keys = sign(KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))]), self._key)
+        self._keys = sign(KeyList(1, (GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES)),)), self._key)
 
     def admit(self, home: Path, host: str, name: str) -> TrustStore:
         """Write the files of a module, where an agent on this host of a bed looks for them."""

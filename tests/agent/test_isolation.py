@@ -234,7 +234,7 @@ async def parameters_are_large(world: World) -> None:
 
 async def somebody_looks_at_everything(world: World) -> None:
     def work() -> None:
-        path = next(world.near._control.path.parent.glob("near.sock"))
+        path = next(world.near.control.path.parent.glob("near.sock"))
         with ControlClient(path, timeout=DEADLINE) as client:
             for _ in range(6):
                 assert len(client.snapshot().topics) > TOPICS
@@ -247,7 +247,7 @@ async def somebody_asks_why(world: World) -> None:
     topic = next(iter(world.near.bridge.topics.imports.offered_by(next(world.near.bridge.sessions.linked()).peer)))
 
     def work() -> None:
-        path = next(world.near._control.path.parent.glob("near.sock"))
+        path = next(world.near.control.path.parent.glob("near.sock"))
         with ControlClient(path, timeout=DEADLINE) as client:
             for name, peer in ((topic, "far"), (topic, None), (topic + "x", "far"), (topic + "x", None)) * 2:
                 (found,) = client.call("why", tuple[Diagnosis, ...], name=name, peer=peer)
@@ -268,11 +268,11 @@ async def plans_are_reconciled(world: World) -> None:
 async def other_rules_hold(world: World) -> None:
     """Every topic gets another name here, and is kept home over there; and back."""
     for rules in ((PeerRule("far", "/moved"),), ()) * 3:
-        world.near.apply_settings(replace(world.near._settings, peers=rules))
+        world.near.apply_settings(replace(world.near.settings, peers=rules))
         await world.until(lambda rules=rules: world.shown() == (0 if rules else TOPICS))  # type: ignore[misc]
         await world.until(lambda rules=rules: world.shown("/moved/fleet/") == (TOPICS if rules else 0))  # type: ignore[misc]
     for policy in (PolicySettings(deny=("/fleet/**",)), PolicySettings()) * 3:
-        world.far.apply_settings(replace(world.far._settings, policy=policy))
+        world.far.apply_settings(replace(world.far.settings, policy=policy))
         await world.until(lambda policy=policy: world.shown() == (0 if policy.deny else TOPICS))  # type: ignore[misc]
 
 
@@ -320,7 +320,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
                 time.sleep(0.02)
         for out in senders:
             out.close()
-        path = next(world.near._control.path.parent.glob("near.sock"))
+        path = next(world.near.control.path.parent.glob("near.sock"))
         with ControlClient(path, timeout=DEADLINE) as client:
             for _ in range(4):
                 client.snapshot()

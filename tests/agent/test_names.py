@@ -115,7 +115,7 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         far_rule = PeerRule("pc", "", (), (("/named", "/other"),))
         agent.apply_settings(
             replace(
-                agent._settings,
+                agent.settings,
                 policy=PolicySettings(deny=(f"{prefix}denied",)),
                 peers=(far_rule if far else near_rule,),
                 contracts=(ContractRule((f"{prefix}tuned",), (), {"depth": 3}),),

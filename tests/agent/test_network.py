@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from ipaddress import IPv4Address
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
@@ -57,9 +58,9 @@ class Endpoint:
 
     failing = 0
 
-    def __init__(self, *_: object, port: int, on_displaced: Callable[[], None], **__: object) -> None:
+    def __init__(self, network: Network, port: int) -> None:
         self.port = port
-        self.displaced = on_displaced
+        self.displaced = network.move
         self.started = self.closed = False
         made.append(self)
 
@@ -83,7 +84,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Network]:
     made.clear()
     monkeypatch.setattr(network, "NetworkEndpoint", Endpoint)
     monkeypatch.setattr(Endpoint, "failing", 0)
-    return lambda: Network(Settings(), cast("Any", None), trust=cast("Any", object()))
+    return lambda: Network(Settings(), cast("Any", None), trust=cast("Any", SimpleNamespace()))
 
 
 def test_a_move_goes_on_until_the_agent_is_in_the_network_again(joined: Callable[[], Network]) -> None:

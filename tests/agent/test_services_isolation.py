@@ -67,10 +67,10 @@ async def somebody_looks_at_everything(world: World) -> None:
 
 async def other_rules_hold(world: World) -> None:
     for rules in ((PeerRule("far", "/moved"),), ()) * 2:
-        world.near.apply_settings(replace(world.near._settings, peers=rules))
+        world.near.apply_settings(replace(world.near.settings, peers=rules))
         await world.until(lambda rules=rules: shown(world) == (0 if rules else SERVICES))  # type: ignore[misc]
     for services in (ServiceSettings(deny=("/fleet/**",)), ServiceSettings()) * 2:
-        world.far.apply_settings(replace(world.far._settings, services=services))
+        world.far.apply_settings(replace(world.far.settings, services=services))
         await world.until(lambda services=services: shown(world) == (0 if services.deny else SERVICES))  # type: ignore[misc]
 
 

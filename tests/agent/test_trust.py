@@ -15,16 +15,15 @@ import pytest
 pytest.importorskip("cryptography")
 
 from rmpa.agent.agent import Agent
-from rmpa.agent.trust import RENEW, trust_store
+from rmpa.agent.trust import RENEW, AgentTrust, trust_store
 from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
 from rmpa.trust.authority import found_mesh
-from rmpa.trust.certificates import DocumentKind
 from rmpa.trust.joining import join_mesh
-from rmpa.trust.permissions import Notice, page_hosts
+from rmpa.trust.permissions import HAVE, page_hosts
 from rmpa.trust.tokens import Token
 
 if TYPE_CHECKING:
@@ -152,10 +151,10 @@ async def test_a_revoked_module_is_gone_everywhere_within_a_second(tmp_path: Pat
         assert time.monotonic() - began < 1.0
         await fleet.linked("base", "arm", "stick")  # … and nothing else has fallen
         members = [agent.trust.membership for agent in honest if agent.trust is not None]
-        await until(lambda: all(member.numbers[DocumentKind.KEYS] == 2 for member in members))
+        await until(lambda: all(member.keys.number == 2 for member in members))
         robbed = fleet.agents["thief"].trust
         assert robbed is not None
-        assert robbed.membership.numbers[DocumentKind.KEYS] == 1  # it did not get the new key
+        assert robbed.membership.keys.number == 1  # it did not get the new key
         again = Agent(fleet.settings("thief"))
         await fleet.stop("thief")
         await again.start()
@@ -245,7 +244,7 @@ async def test_a_member_that_says_it_is_the_authority_is_not_believed(tmp_path: 
         await fleet.stop("base")
         await fleet.linked("arm", "thief")
         [session] = [each for each in thief.bridge.sessions.linked() if each.link.name == "arm"]
-        thief.bridge.rpc.notify(session, Notice.HAVE, {"deny": 0, "keys": 1, "authority": True})
+        thief.bridge.rpc.notify(session, HAVE, {"deny": 0, "keys": 1, "authority": True})
         with pytest.raises(RmpaError, match="not the authority"):  # behind this answer the lie was heard
             await thief.bridge.rpc.request(session, RENEW, {"request": ""}, DEADLINE)
         assert trust.authority_name() == ""
@@ -373,11 +372,11 @@ async def test_the_certificate_is_for_the_hosts_of_the_page_and_for_no_other_mod
     addresses = {"base": "10.1.1.1", "arm": "10.1.1.2"}
     web = WebSettings(hosts=("Panel.local", "www.example.com", "base"))
 
-    def hosts(agent: Agent) -> tuple[str, ...]:
-        settings = agent._settings
+    def hosts(trust: AgentTrust) -> tuple[str, ...]:
+        settings = trust._settings
         return page_hosts((addresses[settings.name], "10.9.9.9", *settings.web.hosts))
 
-    monkeypatch.setattr(Agent, "_page_hosts", hosts)
+    monkeypatch.setattr(AgentTrust, "page_hosts", hosts)
     async with a_fleet(tmp_path) as fleet:
         await until(lambda: _hosts(fleet.agents["base"]) >= {"10.1.1.1", "10.9.9.9"})
         arm = await fleet.add("arm", web=web)
@@ -408,8 +407,8 @@ async def test_a_member_does_not_fill_the_log_by_documents_and_claims(
         leg = fleet.agents["leg"]
         [session] = [each for each in arm.bridge.sessions.linked() if each.link.name == "leg"]
         for _ in range(50):
-            arm.bridge.rpc.notify(session, Notice.DENY, {"document": "{}"})
-            arm.bridge.rpc.notify(session, Notice.HAVE, {"deny": 0, "keys": 1, "authority": True})
+            arm.bridge.rpc.notify(session, "trust.deny", {"document": "{}"})
+            arm.bridge.rpc.notify(session, HAVE, {"deny": 0, "keys": 1, "authority": True})
         await until(lambda: leg.bridge.counters["trust.no_authority"] == 50)
         assert leg.bridge.counters["trust.document_refused"] == 50
         lines = [text for text in caplog.messages if "does not hold" in text or "it is not" in text]

@@ -12,8 +12,7 @@ try:
         KeyList,
         ca_public_key,
         make_request,
-        read_deny_list,
-        read_key_list,
+        read_document,
         read_request,
         sign,
         verify,
@@ -33,12 +32,12 @@ else:
     _LAB = Authority()
     _ARM = _LAB.module("arm")
     _DENY = sign(DenyList().with_name("arm", WALL), _LAB.key)
-    _KEYS = sign(KeyList.of(1, [GroupKey(1, bytes(32))]), _LAB.key)
+    _KEYS = sign(KeyList(1, (GroupKey(1, bytes(32)),)), _LAB.key)
     _KEY = ca_public_key(_LAB.certificate)
     _SIGNED = (
         verify(_ARM, _LAB.certificate, WALL),
-        read_deny_list(_DENY, _KEY),
-        read_key_list(_KEYS, _KEY),
+        read_document(_DENY, _KEY, DenyList),
+        read_document(_KEYS, _KEY, KeyList),
     )
     SEEDS = [b"", make_request(new_key(), "arm"), _ARM, _LAB.certificate, _DENY, _KEYS]
 
@@ -46,8 +45,8 @@ else:
         """Whatever comes in: a documented error, or what the authority has signed."""
         readers: list[Callable[[], object]] = [
             lambda: verify(data, _LAB.certificate, WALL),
-            lambda: read_deny_list(data, _KEY),
-            lambda: read_key_list(data, _KEY),
+            lambda: read_document(data, _KEY, DenyList),
+            lambda: read_document(data, _KEY, KeyList),
         ]
         for reader in readers:
             try:

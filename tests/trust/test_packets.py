@@ -18,10 +18,8 @@ from rmpa.trust import limits
 from rmpa.trust.packets import (
     TRAILER_BYTES,
     GroupKey,
-    KeyPurpose,
     KeyRing,
-    PacketSigner,
-    PacketVerifier,
+    PacketTrust,
     Verdict,
     Verification,
 )
@@ -39,37 +37,34 @@ GOLDEN_TAG = "f640dd86c92a0b701f540511ba2915e6"
 HEAD = "01 01 0003 0000000000000001 6ab13b80"  # format, clock set, key 3, number 1, 1790000000
 
 
-def _signer(*keys: GroupKey) -> PacketSigner:
-    return PacketSigner(KeyRing(keys or (KEY,), 0.0))
+def _trust(*keys: GroupKey, wall: float | None = WALL) -> PacketTrust:
+    return PacketTrust(KeyRing(keys or (KEY,), 0.0), lambda: wall)
 
 
-def _verifier(*keys: GroupKey) -> PacketVerifier:
-    return PacketVerifier(KeyRing(keys or (KEY,), 0.0))
-
-
-def _verify(verifier: PacketVerifier, data: bytes, wall: float | None = WALL, now: float = NOW) -> Verification:
-    return verifier.verify(data, KeyPurpose.BEACON, RUN, now, wall)
+def _verify(verifier: PacketTrust, data: bytes, wall: float | None = WALL, now: float = NOW) -> Verification:
+    verifier.wall = lambda: wall
+    return verifier.verify(data, RUN, now)
 
 
 def test_golden_bytes_both_ways() -> None:
     body = BEACON + bytes.fromhex(HEAD)
     key = hmac.new(bytes(range(32)), b"rmpa beacon 1", hashlib.sha256).digest()
     tag = hmac.new(key, body, hashlib.sha256).digest()[:16]
-    signed = _signer().sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    signed = _trust().sign(BEACON, NOW)
     assert signed == body + tag
     assert len(signed) == len(BEACON) + TRAILER_BYTES
-    assert _verify(_verifier(), signed) == Verification(Verdict.ACCEPTED, len(BEACON), 0)
+    assert _verify(_trust(), signed) == Verification(Verdict.ACCEPTED, len(BEACON), 0)
 
 
 def test_the_tag_itself_is_golden() -> None:
-    assert _signer().sign(bytes(32), KeyPurpose.BEACON, NOW, None)[-32:].hex() == (
+    assert _trust(wall=None).sign(bytes(32), NOW)[-32:].hex() == (
         "010000030000000000000001" + "00000000" + GOLDEN_TAG
     )
 
 
 def test_a_reader_without_trust_ignores_the_trailer() -> None:
     # The count of observed addresses in front of it is written even where it is 0: docs/design/trust.md.
-    signed = _signer().sign(BEACON + b"\x00", KeyPurpose.BEACON, NOW, WALL)
+    signed = _trust().sign(BEACON + b"\x00", NOW)
     assert Beacon.parse(signed, 5).serialize() == BEACON
 
 
@@ -83,33 +78,33 @@ def test_the_largest_beacon_fits_with_its_trailer() -> None:
 
 
 def test_every_changed_byte_is_noticed() -> None:
-    signed = _signer().sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    signed = _trust().sign(BEACON, NOW)
     for offset in range(len(signed)):
         changed = signed[:offset] + bytes([signed[offset] ^ 1]) + signed[offset + 1 :]
-        verdict = _verify(_verifier(), changed).verdict
+        verdict = _verify(_trust(), changed).verdict
         assert verdict in {Verdict.FORGED, Verdict.UNTAGGED, Verdict.UNKNOWN_KEY}, offset
 
 
 def test_every_shorter_packet_is_refused() -> None:
-    signed = _signer().sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    signed = _trust().sign(BEACON, NOW)
     for length in range(len(signed)):
-        assert _verify(_verifier(), signed[:length]).verdict is not Verdict.ACCEPTED
+        assert _verify(_trust(), signed[:length]).verdict is not Verdict.ACCEPTED
 
 
 def test_a_plain_packet_is_untagged_or_forged() -> None:
-    assert _verify(_verifier(), BEACON).verdict is Verdict.UNTAGGED
-    assert _verify(_verifier(), BEACON + bytes(TRAILER_BYTES)).verdict is Verdict.UNTAGGED
+    assert _verify(_trust(), BEACON).verdict is Verdict.UNTAGGED
+    assert _verify(_trust(), BEACON + bytes(TRAILER_BYTES)).verdict is Verdict.UNTAGGED
 
 
 def test_the_key_of_another_mesh_is_refused() -> None:
-    signed = _signer().sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
-    assert _verify(_verifier(GroupKey(3, bytes(32))), signed).verdict is Verdict.FORGED
-    assert _verify(_verifier(GroupKey(4, KEY.secret)), signed).verdict is Verdict.UNKNOWN_KEY
+    signed = _trust().sign(BEACON, NOW)
+    assert _verify(_trust(GroupKey(3, bytes(32))), signed).verdict is Verdict.FORGED
+    assert _verify(_trust(GroupKey(4, KEY.secret)), signed).verdict is Verdict.UNKNOWN_KEY
 
 
 def test_a_packet_is_accepted_once() -> None:
-    signer, verifier = _signer(), _verifier()
-    packets = [signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL) for _ in range(100)]
+    signer, verifier = _trust(), _trust()
+    packets = [signer.sign(BEACON, NOW) for _ in range(100)]
     assert _verify(verifier, packets[99]).verdict is Verdict.ACCEPTED
     assert _verify(verifier, packets[99]).verdict is Verdict.REPEATED
     assert _verify(verifier, packets[90]).verdict is Verdict.ACCEPTED
@@ -129,14 +124,14 @@ def test_a_packet_is_accepted_once() -> None:
     ],
 )
 def test_clocks_that_are_set_must_agree(sent: float | None, heard: float | None, verdict: Verdict, skew: int) -> None:
-    signed = _signer().sign(BEACON, KeyPurpose.BEACON, NOW, sent)
-    found = _verify(_verifier(), signed, heard)
+    signed = _trust(wall=sent).sign(BEACON, NOW)
+    found = _verify(_trust(), signed, heard)
     assert (found.verdict, found.skew) == (verdict, skew)
 
 
 def test_what_is_refused_leaves_nothing_behind() -> None:
-    signer, verifier = _signer(), _verifier()
-    first = signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    signer, verifier = _trust(), _trust()
+    first = signer.sign(BEACON, NOW)
     forged = first[:-1] + bytes([first[-1] ^ 1])
     for _ in range(3):
         assert _verify(verifier, forged).verdict is Verdict.FORGED
@@ -148,18 +143,18 @@ def test_what_is_refused_leaves_nothing_behind() -> None:
 def test_a_rotation_loses_no_packet() -> None:
     following = GroupKey(4, b"k" * 32)
     sender, receiver = KeyRing([KEY], 0.0), KeyRing([KEY], 0.0)
-    signer, verifier = PacketSigner(sender), PacketVerifier(receiver)
+    signer, verifier = PacketTrust(sender, lambda: WALL), PacketTrust(receiver, lambda: WALL)
     sender.take([following], 100.0)
     receiver.take([following], 125.0)
     for now in range(90, 300, 5):
-        signed = signer.sign(BEACON, KeyPurpose.BEACON, float(now), WALL)
+        signed = signer.sign(BEACON, float(now))
         assert _verify(verifier, signed, now=float(now)).verdict is Verdict.ACCEPTED
 
 
-def _numbered(signer: PacketSigner, number: int) -> bytes:
+def _numbered(signer: PacketTrust, number: int) -> bytes:
     """A packet of this number, which a module with the group key can make for any run."""
     signer._number = number - 1
-    return signer.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    return signer.sign(BEACON, NOW)
 
 
 def test_a_revoked_module_cannot_silence_the_run_of_a_member() -> None:
@@ -167,53 +162,53 @@ def test_a_revoked_module_cannot_silence_the_run_of_a_member() -> None:
     revoked, present = KeyRing([KEY], 0.0), KeyRing([KEY], 0.0)
     following = GroupKey(4, b"k" * 32)
     present.take([following], 1.0, proves_from=4)
-    member, verifier = PacketSigner(present), PacketVerifier(present)
+    member, verifier = PacketTrust(present, lambda: WALL), PacketTrust(present, lambda: WALL)
     for now in (1.0, limits.KEY_SPREAD, limits.KEY_SPREAD + limits.KEY_OVERLAP + 1):
-        forged = _numbered(PacketSigner(revoked), (1 << 64) - 1 - int(now))
+        forged = _numbered(PacketTrust(revoked, lambda: WALL), (1 << 64) - 1 - int(now))
         assert _verify(verifier, forged, now=now).verdict in {Verdict.OLD_KEY, Verdict.REPLAYED}
-        signed = member.sign(BEACON, KeyPurpose.BEACON, now, WALL)
+        signed = member.sign(BEACON, now)
         assert _verify(verifier, signed, now=now).verdict is Verdict.ACCEPTED
 
 
 def test_a_member_cannot_silence_another_run_by_one_packet() -> None:
-    verifier, member = _verifier(), _signer()
+    verifier, member = _trust(), _trust()
     assert _verify(verifier, _numbered(member, 1)).verdict is Verdict.ACCEPTED
-    assert _verify(verifier, _numbered(_signer(), (1 << 64) - 1)).verdict is Verdict.LEAP
+    assert _verify(verifier, _numbered(_trust(), (1 << 64) - 1)).verdict is Verdict.LEAP
     assert _verify(verifier, _numbered(member, 2)).verdict is Verdict.ACCEPTED
 
 
 def test_packets_with_old_keys_push_no_run_out() -> None:
-    verifier = PacketVerifier(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0))
-    fresh = _signer(GroupKey(4, b"k" * 32)).sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    verifier = PacketTrust(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0), lambda: WALL)
+    fresh = _trust(GroupKey(4, b"k" * 32)).sign(BEACON, NOW)
     assert _verify(verifier, fresh).verdict is Verdict.ACCEPTED
     for number in range(limits.RUNS_MAX):
         run = number.to_bytes(len(BEACON), "little")
-        old = _signer(KEY).sign(run, KeyPurpose.BEACON, NOW, WALL)
-        verifier.verify(old, KeyPurpose.BEACON, (0, 16), NOW + number, WALL)
+        old = _trust(KEY).sign(run, NOW)
+        verifier.verify(old, (0, 16), NOW + number)
     assert _verify(verifier, fresh).verdict is Verdict.REPEATED
 
 
 def test_old_packets_take_nothing_from_modules_that_were_away() -> None:
     """Repeated, or with an old time, by something without any key."""
-    verifier = PacketVerifier(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0))
-    away = _signer(KEY)
-    first = away.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)
+    verifier = PacketTrust(KeyRing([KEY, GroupKey(4, b"k" * 32)], 0.0), lambda: WALL)
+    away = _trust(KEY)
+    first = away.sign(BEACON, NOW)
     assert _verify(verifier, first).verdict is Verdict.OLD_KEY
     for _ in range(20):
         assert _verify(verifier, first).verdict is Verdict.REPEATED
         assert _verify(verifier, first, WALL + 60).verdict is Verdict.CLOCK
-    assert _verify(verifier, away.sign(BEACON, KeyPurpose.BEACON, NOW, WALL)).verdict is Verdict.OLD_KEY
+    assert _verify(verifier, away.sign(BEACON, NOW)).verdict is Verdict.OLD_KEY
 
 
 @given(st.binary(max_size=300))
 def test_anything_at_all_is_refused(data: bytes) -> None:
-    assert _verify(_verifier(), data).verdict is not Verdict.ACCEPTED
+    assert _verify(_trust(), data).verdict is not Verdict.ACCEPTED
 
 
 @given(st.binary(min_size=32, max_size=300), st.floats(0, 2**33))
 def test_what_is_signed_is_accepted(packet: bytes, wall: float) -> None:
-    signed = _signer().sign(packet, KeyPurpose.BEACON, NOW, wall)
-    assert _verify(_verifier(), signed, wall) == Verification(Verdict.ACCEPTED, len(packet), 0)
+    signed = _trust(wall=wall).sign(packet, NOW)
+    assert _verify(_trust(), signed, wall) == Verification(Verdict.ACCEPTED, len(packet), 0)
 
 
 def test_the_fuzz_target_takes_its_seeds() -> None:

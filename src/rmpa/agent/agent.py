@@ -8,13 +8,12 @@ import errno
 import logging
 import os
 import random
-import socket
 import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.network import Network
 from rmpa.agent.process import Reloader, WebProcess, run_process, serve, web_command, web_environment
-from rmpa.agent.trust import AgentTrust, PlainOperations, TrustOperations, open_membership
+from rmpa.agent.trust import AgentTrust, TrustCommands, open_membership
 from rmpa.bridge.bridge import Bridge, TwinWatch
 from rmpa.bridge.nodes import Nodes
 from rmpa.bridge.params.follower import Params
@@ -25,7 +24,6 @@ from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, is_own
-from rmpa.discovery.network import list_interfaces
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlOperations, ControlServer, control_access
 from rmpa.observe.health import Diagnostics
@@ -43,14 +41,13 @@ from rmpa.ros.node.slave_node import LoggerServices
 from rmpa.runtime import process as garbage_collector
 from rmpa.runtime.kernel_tcp import may_end_connections
 from rmpa.runtime.loop import SystemClock
-from rmpa.trust.permissions import Permissions, host_names, page_hosts
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
-    from rmpa.core.identity import Identity
     from rmpa.observe.control_server import Handler
     from rmpa.observe.snapshot import AgentInfo
     from rmpa.ros.core.external import Core
@@ -191,7 +188,7 @@ class Agent:
         realtime: tuple[str, ...] = (),
         load: Callable[[], Loaded] | None = None,
     ) -> None:
-        self._settings = settings
+        self.settings = settings
         clock = SystemClock()
         membership = open_membership(settings, clock)
         self.core: Core = make_core(settings)
@@ -209,7 +206,7 @@ class Agent:
         self.trust: AgentTrust | None = None
         """This module's part in a secured mesh; ``None``: trust is off."""
         if membership is not None:
-            self.trust = AgentTrust(membership, self.bridge, clock, random.random, self._page_hosts)
+            self.trust = AgentTrust(settings, membership, self.bridge, clock)
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
@@ -242,7 +239,7 @@ class Agent:
         self.operations = ControlOperations(
             settings.name, self.bridge, self.params, self.snapshots, nodes, self.sites
         )
-        self.trust_commands = self._trust_operations()
+        self.trust_commands = TrustCommands(settings, self.trust)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
             "why": self.why.answer,
@@ -250,7 +247,7 @@ class Agent:
             "graph": GraphRevisions(self.core, rows=settings.core_mode == "embedded").after,
             "trust": self.trust_commands.answer_command,
         }
-        self._control = ControlServer(
+        self.control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
             settings.name,
             handlers,
@@ -258,23 +255,19 @@ class Agent:
             access=control_access(settings.control_group),
         )
 
-    def add_operations(self, handlers: Mapping[str, Handler]) -> None:
-        """Add operations to the control socket, before ``start()``."""
-        self._control.add(handlers)
-
     async def start(self) -> None:
         """Start every part; the network comes last, so that peers find a complete agent.
 
         Raises:
             StartError: The name, the core's port or the mesh's port is taken.
         """
-        for note in permission_notes(self._settings, secured=self.bridge.gate.on):
+        for note in permission_notes(self.settings, secured=self.bridge.gate.on):
             _log.warning("! %s", note)
         self._warn_of_stale_connections()
         async with contextlib.AsyncExitStack() as undo:
-            self._control.lock()
-            undo.push_async_callback(self._control.close)
-            await start_core(self.core, self._settings)
+            self.control.lock()
+            undo.push_async_callback(self.control.close)
+            await start_core(self.core, self.settings)
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
@@ -286,26 +279,11 @@ class Agent:
             undo.callback(loggers.close)
             await self.network.start()
             undo.push_async_callback(self.network.close)
-            await self._control.start()
+            await self.control.start()
             garbage_collector.take_over()
             undo.callback(garbage_collector.give_back)
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
-
-    def _trust_operations(self) -> PlainOperations | TrustOperations:
-        if self.trust is None:
-            return PlainOperations(self._settings)
-        return TrustOperations(self.trust, self.bridge, self._identity)
-
-    def _page_hosts(self) -> tuple[str, ...]:
-        """The names and addresses by which this module's page is opened; a gateway has none."""
-        if self._settings.relay:
-            return ()
-        addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
-        return page_hosts((*host_names(socket.gethostname()), *self._settings.web.hosts, *sorted(addresses)))
-
-    def _identity(self) -> Identity | None:
-        return self.network.endpoint.identity if self.network.endpoint is not None else None
 
     async def close(self) -> None:
         """Close every part: the goodbye comes first, then the proxies leave the local graph, the core is last."""
@@ -314,7 +292,7 @@ class Agent:
     def _notes(self) -> Iterator[str]:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
-        yield from permission_notes(self._settings, secured=self.bridge.gate.on)
+        yield from permission_notes(self.settings, secured=self.bridge.gate.on)
         if self.trust is not None:
             yield from self.trust.notes()
         for notes in self.other_notes:
@@ -322,7 +300,7 @@ class Agent:
 
     def _warn_of_stale_connections(self) -> None:
         """Say beforehand what happens when the host of a direct subscriber vanishes, if the agent may not end it."""
-        if self._settings.allows_direct and (problem := may_end_connections()):
+        if self.settings.allows_direct and (problem := may_end_connections()):
             reason, _, remedy = problem.partition("; ")
             effect = "when that of a direct subscriber does, a rospy publisher without queue_size may hang"
             text = f"the agent may not end connections that a vanished host leaves behind ({reason}): {effect}"
@@ -330,7 +308,7 @@ class Agent:
 
     def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""
-        before, self._settings = self._settings, settings
+        before, self.settings = self.settings, settings
         if not before.allows_direct:
             self._warn_of_stale_connections()
         logging.getLogger().setLevel(settings.log_level.upper())

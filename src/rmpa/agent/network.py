@@ -25,7 +25,6 @@ from rmpa.runtime.accept import open_mesh_port
 from rmpa.runtime.loop import SystemClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from ipaddress import IPv4Address
 
     from rmpa.agent.trust import AgentTrust
@@ -44,29 +43,17 @@ class NetworkEndpoint:
     """Discovery and mesh under one identity, feeding the bridge.
 
     Args:
-        settings: The agent's settings.
-        bridge: Gets links, their messages and their end.
+        network: Has the settings, the bridge, which gets links, and this module's part in a secured mesh.
         port: The mesh port; 0 lets the system choose.
-        on_displaced: Called when the machine has lost the address in the GUID.
-        trust: This module's part in a secured mesh; ``None``: trust is off.
 
     Raises:
         StartError: The port cannot be bound.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        bridge: Bridge,
-        *,
-        port: int,
-        on_displaced: Callable[[], None],
-        trust: AgentTrust | None = None,
-    ) -> None:
-        self._clock = clock = SystemClock()
-        self._settings = settings
+    def __init__(self, network: Network, port: int) -> None:
+        settings, bridge, trust, clock = network.settings, network.bridge, network.trust, SystemClock()
+        self._network = network
         self._bridge = bridge
-        self._on_displaced = on_displaced
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
         usable = choose(list_interfaces(), settings.interfaces)
@@ -81,6 +68,8 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
+        if trust is not None:
+            trust.identity = self.identity
         self._members: set[Guid] = set()
         self.mesh = Mesh(
             self.identity,
@@ -120,33 +109,26 @@ class NetworkEndpoint:
         self._udp.close()
         await self.mesh.close()
 
-    def _count(self, guid: Guid, *, present: bool) -> None:
-        """Take in that a peer has become a member, or is none any more."""
-        (self._members.add if present else self._members.discard)(guid)
-        self.mesh.count_peers(len(self._members))
-
     def _event(self, event: PeerEvent) -> None:
         identity = event.identity
         match event.change:
             case "found":
                 _log.info("+ %s found", identity)
-                self._count(identity.guid, present=True)
+                self._members.add(identity.guid)
                 self.mesh.peer_found(identity, event.source[0] if event.source else None)
             case "changed":
                 self.mesh.peer_found(identity)
             case "lost":
                 _log.info("- %s %s", identity, event.reason)
-                self._count(identity.guid, present=False)
+                self._members.discard(identity.guid)
                 self.mesh.peer_gone(identity.guid)
             case "doubted":
-                self._check_link(identity.guid)
+                # A link at rest would notice after many seconds that its peer is gone.
+                if (link := self.mesh.link(identity.guid)) is not None:
+                    link.touch()
             case "conflict":
                 pass  # discovery has logged the error, at a bounded rate
-
-    def _check_link(self, guid: Guid) -> None:
-        """Wake the link of a peer that may be gone: a link at rest would notice that after many seconds."""
-        if (link := self.mesh.link(guid)) is not None:
-            link.touch()
+        self.mesh.count_peers(len(self._members))
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
@@ -160,9 +142,9 @@ class NetworkEndpoint:
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
         """Handle a change of the machine's interfaces; return whether the GUID's address is still valid."""
-        displaced = is_displaced(self.identity.guid.address, everything, self._settings.interfaces)
+        displaced = is_displaced(self.identity.guid.address, everything, self._network.settings.interfaces)
         if displaced:
-            self._on_displaced()
+            self._network.move()
         return not displaced
 
 
@@ -176,9 +158,9 @@ class Network:
     """
 
     def __init__(self, settings: Settings, bridge: Bridge, trust: AgentTrust | None = None) -> None:
-        self._settings = settings
-        self._bridge = bridge
-        self._trust = trust
+        self.settings = settings
+        self.bridge = bridge
+        self.trust = trust
         self._moving: asyncio.Task[None] | None = None
         self._over = asyncio.Event()
         self.endpoint: NetworkEndpoint | None = None
@@ -190,8 +172,8 @@ class Network:
         Raises:
             StartError: The mesh's port is taken.
         """
-        await self._join(self._settings.port)
-        if self._trust is None and self.endpoint is not None:
+        await self._join(self.settings.port)
+        if self.trust is None and self.endpoint is not None:
             text = "! trust is off: every program that reaches port %d may join this mesh; rmpa trust init"
             _log.warning(text, self.endpoint.port)
 
@@ -203,9 +185,7 @@ class Network:
         await self._leave()
 
     async def _join(self, port: int) -> None:
-        self.endpoint = NetworkEndpoint(
-            self._settings, self._bridge, port=port, on_displaced=self._displaced, trust=self._trust
-        )
+        self.endpoint = NetworkEndpoint(self, port)
         try:
             await self.endpoint.start()
         except BaseException:
@@ -215,15 +195,18 @@ class Network:
     async def _leave(self) -> None:
         if self.endpoint is not None:
             endpoint, self.endpoint = self.endpoint, None
+            if self.trust is not None:
+                self.trust.identity = None
             await endpoint.close()
 
-    def _displaced(self) -> None:
+    def move(self) -> None:
+        """Take a new GUID, with an address that the machine has."""
         if self._moving is None:
             self._moving = asyncio.create_task(self._move(), name="move to the new address")
 
     async def _move(self) -> None:
         try:
-            port = self.endpoint.port if self.endpoint is not None else self._settings.port
+            port = self.endpoint.port if self.endpoint is not None else self.settings.port
             _log.info("= the machine's addresses have changed: taking a new GUID")
             await self._leave()
             while self.endpoint is None and not self._over.is_set():

@@ -8,9 +8,12 @@ import contextlib
 import inspect
 import logging
 import os
+import random
+import socket
 import time
+from functools import partial
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -19,33 +22,33 @@ from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import state_dir
 from rmpa.core.counters import Backoff, RefusalLog, TokenBucket
 from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.discovery.network import list_interfaces
 from rmpa.trust import limits
 from rmpa.trust.permissions import (
+    HAVE,
+    Document,
     DocumentSpreading,
+    Have,
     InviteReply,
     JoinStep,
-    Notice,
     TrustReply,
     TrustStatus,
-    have_args,
-    read_document,
-    read_have,
+    host_names,
+    page_hosts,
 )
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.runtime.loop import SystemClock
     from rmpa.trust.authority import MeshAuthority
-    from rmpa.trust.certificates import DocumentKind
     from rmpa.trust.joining import JoinServer
     from rmpa.trust.membership import Membership
 
+_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 RENEW: Final = "trust.renew"
@@ -87,36 +90,30 @@ class AgentTrust(Part):
     """The part of a bridge that keeps a membership up to date; it exists only in a secured mesh.
 
     Args:
+        settings: The agent's.
         membership: This module's.
         bridge: Its sessions and requests; counts ``trust.document_refused``.
         clock: Monotonic seconds.
-        rng: Uniform numbers in [0, 1), for the delays of renewals.
-        hosts: The names and addresses by which this module's page is opened now; its certificate is to have them.
 
     Raises:
         StartError: A file of the authority is broken.
     """
 
-    def __init__(
-        self,
-        membership: Membership,
-        bridge: Bridge,
-        clock: SystemClock,
-        rng: Callable[[], float],
-        hosts: Callable[[], tuple[str, ...]] = tuple,
-    ) -> None:
-        from rmpa.trust.authority import MeshAuthority  # noqa: PLC0415
-        from rmpa.trust.certificates import DocumentKind  # noqa: PLC0415 - as in ``open_membership``
+    # More than 12 fields: documents, renewals of others and the renewal of its own need all of the membership.
+
+    def __init__(self, settings: Settings, membership: Membership, bridge: Bridge, clock: SystemClock) -> None:
+        from rmpa.trust.authority import MeshAuthority  # noqa: PLC0415 - as in ``open_membership``
         from rmpa.trust.joining import JoinServer  # noqa: PLC0415
 
         self.membership = membership
+        self.identity: Identity | None = None
+        """This module's place in the network; ``None`` while it has none."""
+        self._settings = settings
         self._bridge = bridge
         self._clock = clock
         self._refusals = RefusalLog(_log, bridge.counters)
-        self._hosts = hosts
         self._hosts_asked: tuple[str, ...] = ()
-        self._kinds: dict[Notice, DocumentKind] = {Notice.DENY: DocumentKind.DENY, Notice.KEYS: DocumentKind.KEYS}
-        self._spreading = DocumentSpreading(self._number)
+        self._spreading = DocumentSpreading(membership.number)
         self._authority_peer: PeerSession | None = None
         self.authority: MeshAuthority | None = None
         """What the authority has; ``None``: this module is not it."""
@@ -125,19 +122,18 @@ class AgentTrust(Part):
         if membership.store.is_authority:
             self.authority = MeshAuthority.load(membership.store, membership)
             self.joins = JoinServer(self.authority, membership, clock, self.is_linked, bridge.counters)
-        self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, rng)
+        self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, random.random)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}
         self._wake = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
         self._problem = ""
-        rpc = bridge.rpc
+        bridge.rpc.on_notification(HAVE, self._have, Needs((), "numbers of the documents that each member has"))
         signed = Needs((), "a document holds by the signature of the mesh's authority")
-        rpc.on_notification(Notice.HAVE, self._have, Needs((), "numbers of the documents that each member has"))
-        rpc.on_notification(Notice.DENY, lambda session, args: self._document(session, Notice.DENY, args), signed)
-        rpc.on_notification(Notice.KEYS, lambda session, args: self._document(session, Notice.KEYS, args), signed)
+        for kind in Document:
+            bridge.rpc.on_notification(kind.notice, partial(self._document, kind), signed)
         own = Needs((), "the certificate for the peer's own certified name, unless that is revoked")
-        rpc.on_request(RENEW, self._renew_other, own)
+        bridge.rpc.on_request(RENEW, self._renew_other, own)
 
     # --- life -------------------------------------------------------------------------------------------------
 
@@ -163,54 +159,54 @@ class AgentTrust(Part):
         """The state, as ``rmpa trust status`` and the snapshot show it."""
         from rmpa.trust.joining import status_of  # noqa: PLC0415
 
-        linked = {session.link.name for session in self._bridge.sessions.linked()}
-        return status_of(
-            self.membership, self.authority, agent="secured", linked=linked, authority_name=self.authority_name()
-        )
+        linked, name = self.linked(), self.authority_name()
+        return status_of(self.membership, self.authority, agent="secured", linked=linked, authority_name=name)
+
+    def linked(self) -> set[str]:
+        """The names of the linked modules."""
+        return {session.link.name for session in self._bridge.sessions.linked()}
 
     # --- documents --------------------------------------------------------------------------------------------
 
     def link_up(self, session: PeerSession) -> None:
         """Tell a new link what this module has."""
         self._spreading.link_up(session.peer)
-        args = have_args(self._number, is_authority=self.authority is not None)
-        self._bridge.rpc.notify(session, Notice.HAVE, args)
+        member = self.membership
+        have = Have(member.deny.number, member.keys.number, self.authority is not None)
+        self._bridge.rpc.notify(session, HAVE, msgspec.to_builtins(have))
 
     def link_down(self, session: PeerSession) -> None:
         """Forget what the peer has."""
         self._spreading.link_down(session.peer)
-        if self._authority_peer is session and not session.linked:
-            self._authority_peer = None
+        if not session.linked:
+            self.gone(session)
 
     def gone(self, session: PeerSession) -> None:
         """Forget that the peer was the authority's module."""
         if self._authority_peer is session:
             self._authority_peer = None
 
-    def _number(self, kind: Notice) -> int:
-        return self.membership.numbers[self._kinds[kind]]
-
     def _have(self, session: PeerSession, args: dict[str, Any]) -> None:
-        numbers, is_authority = read_have(args)
-        if is_authority and self.authority is None:
-            if session.link.name == self.membership.authority:
+        have, name = _read(args, Have), session.link.name
+        if have.authority and self.authority is None:
+            if name == self.membership.keys.authority:
                 self._authority_found(session)
             else:
-                name = session.link.name
                 self._refuse("trust.no_authority", name, f"{name} says that it is the authority, which it is not")
-        self._send(session, self._spreading.have(session.peer, numbers))
+        self._spreading.has(session.peer, have.numbers)
+        self.spread()
 
-    def _document(self, session: PeerSession, kind: Notice, args: dict[str, Any]) -> None:
-        data = read_document(args)
+    def _document(self, kind: Document, session: PeerSession, args: dict[str, Any]) -> None:
+        data, name = _read(args.get("document"), str).encode(), session.link.name
         try:
-            newer = self.membership.accept_document(self._kinds[kind], data)
+            newer = self.membership.accept_document(kind, data)
         except RemoteProtocolError as error:
-            name = session.link.name
             self._refuse("trust.document_refused", name, f"{name} sent a document that does not hold: {error}")
             return
         if newer:
-            self._spreading.received(session.peer, kind, self._number(kind))
-            _log.info("= %s %d by %s", kind.removeprefix("trust."), self._number(kind), session.link.name)
+            number = self.membership.number(kind)
+            self._spreading.has(session.peer, {kind: number})
+            _log.info("= %s %d by %s", kind, number, name)
             self.spread()
 
     def _refuse(self, counter: str, name: str, text: str) -> None:
@@ -219,15 +215,10 @@ class AgentTrust(Part):
     def spread(self) -> None:
         """Send newer documents to all that lack them."""
         sessions = {session.peer: session for session in self._bridge.sessions.linked()}
-        for peer, kinds in self._spreading.changed():
+        for peer, kind in self._spreading.lacking():
             if peer in sessions:
-                self._send(sessions[peer], kinds)
-
-    def _send(self, session: PeerSession, kinds: tuple[Notice, ...]) -> None:
-        for kind in kinds:
-            if session.linked:
-                document = self.membership.document(self._kinds[kind]).decode()
-                self._bridge.rpc.notify(session, kind, {"document": document})
+                document = self.membership.document(kind).decode()
+                self._bridge.rpc.notify(sessions[peer], kind.notice, {"document": document})
 
     # --- renewal ----------------------------------------------------------------------------------------------
 
@@ -282,7 +273,7 @@ class AgentTrust(Part):
         It is asked once for the same ones: it may refuse some. Only a link serves for that, so that a module which is
         away does not dial for it.
         """
-        hosts = self._hosts()
+        hosts = self.page_hosts()
         missing = set(hosts) - self.membership.certificate.hosts
         linked = self._authority_peer is not None and self._authority_peer.linked
         return bool(missing) and hosts != self._hosts_asked and (self.authority is not None or linked)
@@ -294,7 +285,7 @@ class AgentTrust(Part):
             RmpaError: The authority cannot be reached, or refuses.
         """
         if self.authority is not None:
-            self._hosts_asked = self._hosts()
+            self._hosts_asked = self.page_hosts()
             self.authority.renew_own(self._hosts_asked)
         elif self._authority_peer is not None and self._authority_peer.linked:
             await self._renew_by_link(self._authority_peer)
@@ -305,10 +296,10 @@ class AgentTrust(Part):
         _log.info("= the certificate is renewed until %s", _when(self.membership.certificate.expires))
 
     async def _renew_by_link(self, session: PeerSession) -> None:
-        hosts = self._hosts()
-        request = base64.b64encode(self.membership.request(hosts)).decode()
-        reply = await self._bridge.rpc.request(session, RENEW, {"request": request}, limits.JOIN_STEP_TIMEOUT)
-        self.membership.renewed(_bytes(reply, "certificate"))
+        hosts = self.page_hosts()
+        request = {"request": base64.b64encode(self.membership.request(hosts)).decode()}
+        reply = await self._bridge.rpc.request(session, RENEW, request, limits.JOIN_STEP_TIMEOUT)
+        self.membership.renewed(_read(reply.get("certificate") if isinstance(reply, dict) else None, bytes))
         self._hosts_asked = hosts
 
     async def _renew_by_dial(self) -> None:
@@ -317,11 +308,7 @@ class AgentTrust(Part):
         place = self.membership.store.load_authority()
         if place is None:
             raise UnreachableError("authority", "any link", "start its agent; rmpa peer list shows the links")
-        grant = await renew_at_authority(self.membership, place.address, place.port)
-        self.membership.renewed(grant.certificate)
-        for kind, data in ((Notice.DENY, grant.deny), (Notice.KEYS, grant.keys)):
-            if data:
-                self.membership.accept_document(self._kinds[kind], data)
+        await renew_at_authority(self.membership, place.address, place.port)
         self.spread()
 
     def _renew_other(self, session: PeerSession, args: dict[str, Any]) -> dict[str, str]:
@@ -337,9 +324,16 @@ class AgentTrust(Part):
         bucket = self._renewals.setdefault(name, TokenBucket(limits.RENEWALS_RATE, limits.RENEWALS_BURST))
         if not bucket.take(self._clock.now()):
             raise RmpaError(f"{name} asks for certificates too often: once a minute is allowed")
-        _, certificate = self.authority.issue(_bytes(args, "request"), name)
+        _, certificate = self.authority.issue(_read(args.get("request"), bytes), name)
         _log.info("= %s has a new certificate", session.link.name)
         return {"certificate": base64.b64encode(certificate).decode()}
+
+    def page_hosts(self) -> tuple[str, ...]:
+        """The names and addresses by which this module's page is opened; a gateway has none."""
+        if self._settings.relay:
+            return ()
+        addresses = [str(address) for interface in list_interfaces() for address in interface.addresses]
+        return page_hosts((*host_names(socket.gethostname()), *self._settings.web.hosts, *sorted(addresses)))
 
     def authority_name(self) -> str:
         """The name of the authority, as far as it is known; empty: it is not."""
@@ -349,21 +343,19 @@ class AgentTrust(Part):
 
     def is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
-        names = (self.membership.name, *(session.link.name for session in self._bridge.sessions.linked()))
-        return name.casefold() in {each.casefold() for each in names}
+        return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
 
 
-def _bytes(args: object, key: str) -> bytes:
-    """Bytes in base64 in the arguments of a request, or in its reply.
+def _read(raw: object, form: type[_T]) -> _T:
+    """The arguments of a peer's message, or one of them; bytes are in base64.
 
     Raises:
-        RemoteProtocolError: There are none.
+        RemoteProtocolError: It is missing or malformed.
     """
-    text = args.get(key) if isinstance(args, dict) else None
     try:
-        return base64.b64decode(text if isinstance(text, str) else "", validate=True)
-    except ValueError:
-        raise RemoteProtocolError(f"{key} is not in base64") from None
+        return msgspec.convert(raw, form)
+    except msgspec.ValidationError as error:
+        raise RemoteProtocolError(f"a message about trust: {error}") from None
 
 
 def _when(wall: float) -> str:
@@ -378,56 +370,21 @@ _STEP_WAIT: Final = 5.0
 Args = dict[str, object]
 
 
-class PlainOperations:
-    """The commands that an agent without trust answers: its state, and that it must be started again.
+_JOINED: Final = "it has joined since it started: start it again"
+_COMMANDS: Final = ("status", "invite", "step", "withdraw", "renew", "rotate", "revoke", "sign")
+
+
+class TrustCommands:
+    """The commands of ``rmpa trust`` that an agent answers; without trust only ``status``.
 
     Args:
-        settings: The agent's settings.
+        settings: The agent's.
+        part: Its part in a secured mesh; ``None``: trust is off.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, part: AgentTrust | None) -> None:
         self._settings = settings
-
-    async def answer_command(self, args: Args) -> TrustStatus:
-        """``what``: only ``status``.
-
-        Raises:
-            PeerRefused: It is another one.
-        """
-        name, store = self._settings.name, trust_store(self._settings)
-        joined = store is not None and store.exists
-        restart = "it has joined since it started: start it again"
-        if args.get("what") != "status":
-            remedy = restart if joined else "rmpa trust init, or rmpa trust join TOKEN; then start it again"
-            raise PeerRefused(f"agent {name}", "it runs without trust", remedy)
-        problems = (f"the agent {name} still runs without trust: {restart}",) if joined else ()
-        folder = str(store.folder) if store is not None else ""
-        return TrustStatus(on=False, module=name, folder=folder, agent="plain", problems=problems)
-
-
-class TrustOperations:
-    """The commands that a secured agent answers.
-
-    Args:
-        trust: Its part in the mesh.
-        bridge: Its sessions.
-        identity: Its place in the network; ``None`` while it has none.
-    """
-
-    def __init__(self, trust: AgentTrust, bridge: Bridge, identity: Callable[[], Identity | None]) -> None:
-        self._trust = trust
-        self._bridge = bridge
-        self._identity = identity
-        self._handlers: dict[str, Callable[[Args], object]] = {
-            "status": self.status,
-            "invite": self.invite,
-            "step": self.step,
-            "withdraw": self.withdraw,
-            "renew": self.renew,
-            "rotate": self.rotate,
-            "revoke": self.revoke,
-            "sign": self.sign,
-        }
+        self._part = part
 
     async def answer_command(self, args: Args) -> object:
         """``what``: the name of one of the methods below; the other arguments are its own.
@@ -436,15 +393,28 @@ class TrustOperations:
             RmpaError: It is refused; the text is for the user.
         """
         what = str(args.get("what", ""))
-        handler = self._handlers.get(what)
-        if handler is None:
+        if what not in _COMMANDS:
             raise ConfigError("what", f"{what!r} is no command of trust")
-        reply = handler(args)
+        reply = getattr(self, what)(args)
         return await reply if inspect.isawaitable(reply) else reply
+
+    @property
+    def _trust(self) -> AgentTrust:
+        if self._part is None:
+            begin = "rmpa trust init, or rmpa trust join TOKEN; then start it again"
+            remedy = _JOINED if self._plain().problems else begin
+            raise PeerRefused(f"agent {self._settings.name}", "it runs without trust", remedy)
+        return self._part
 
     def status(self, _args: Args) -> TrustStatus:
         """The state, as ``rmpa trust status`` shows it."""
-        return self._trust.status()
+        return self._part.status() if self._part is not None else self._plain()
+
+    def _plain(self) -> TrustStatus:
+        name, store = self._settings.name, trust_store(self._settings)
+        joined, folder = store is not None and store.exists, str(store.folder) if store is not None else ""
+        problems = (f"the agent {name} still runs without trust: {_JOINED}",) if joined else ()
+        return TrustStatus(on=False, module=name, folder=folder, agent="plain", problems=problems)
 
     def invite(self, args: Args) -> InviteReply:
         """Make a token: ``name``, ``lifetime``, ``address`` and ``port``, each with a default."""
@@ -462,7 +432,7 @@ class TrustOperations:
 
     def _place(self, args: Args) -> tuple[str, int]:
         """Where a joining module reaches this one: as the user says, else as beacons say."""
-        identity, address, port = self._identity(), args.get("address"), args.get("port")
+        identity, address, port = self._trust.identity, args.get("address"), args.get("port")
         if identity is None:
             raise UnreachableError("network", "this agent", "it has no address at this moment; try again")
         return str(address or identity.guid.address), port if isinstance(port, int) else identity.guid.port
@@ -497,9 +467,8 @@ class TrustOperations:
     def revoke(self, args: Args) -> TrustReply:
         """Revoke a module: ``name``; ``force``: also if no certificate of that name is known."""
         name = str(args.get("name", ""))
-        linked = {session.link.name for session in self._bridge.sessions.linked()}
         try:
-            deny = self._authority().revoke_known(name, linked, force=args.get("force") is True)
+            deny = self._authority().revoke_known(name, self._trust.linked(), force=args.get("force") is True)
         finally:
             self._trust.spread()  # what was made holds here, so it must hold everywhere
         _log.warning("= %s is revoked (deny list %d); there is a new group key", name, deny.number)

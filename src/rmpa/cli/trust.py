@@ -396,18 +396,13 @@ def _renew_files(place: TrustPlace) -> TrustReply:
     else:
         import asyncio
 
-        from rmpa.trust.certificates import DocumentKind
         from rmpa.trust.joining import renew_at_authority
 
         known = place.store.load_authority()
         if known is None:
             remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
             raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
-        grant = asyncio.run(renew_at_authority(membership, known.address, known.port))
-        membership.renewed(grant.certificate)
-        for kind, data in ((DocumentKind.DENY, grant.deny), (DocumentKind.KEYS, grant.keys)):
-            if data:
-                membership.accept_document(kind, data)
+        asyncio.run(renew_at_authority(membership, known.address, known.port))
     return TrustReply(module=place.name, done=True, expires=int(membership.certificate.expires))
 
 

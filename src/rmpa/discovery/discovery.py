@@ -30,7 +30,7 @@ from rmpa.discovery.beacon import (
 from rmpa.discovery.membership import MembershipProtocol
 from rmpa.runtime.loop import MachineTimer, yield_to_data
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.packets import KeyPurpose, Verdict
+from rmpa.trust.packets import Verdict
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ class PacketFilter:
         if len(data) > limits.BEACON_MAX_BYTES:
             self._counters.add(MALFORMED)
             return None
-        found = trust.verifier.verify(data, KeyPurpose.BEACON, RUN_AT, now, trust.wall())
+        found = trust.verify(data, RUN_AT, now)
         if found.verdict is Verdict.ACCEPTED:
             return found
         # One address must not use up what there is for all.
@@ -550,9 +550,9 @@ class Discovery:
 
     def _send(self, beacon: Beacon, address: Address | None, key: int) -> None:
         """Send a beacon, signed in a secured mesh; the arguments as for ``announcing.OutgoingBeacon``."""
-        packet, trust = beacon.serialize(), self._trust
-        if trust is not None:
-            packet = trust.signer.sign(packet, KeyPurpose.BEACON, time.monotonic(), trust.wall(), key=key)
+        packet = beacon.serialize()
+        if self._trust is not None:
+            packet = self._trust.sign(packet, time.monotonic(), key)
         if address is None:
             _log.debug("> group: %s", beacon)
             self._sender.multicast(packet, self.interfaces)

@@ -55,7 +55,7 @@ class Gateway:
         self.agent = Agent(self._settings, realtime, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
-        self.agent.add_operations({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
+        self.agent.control.add({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
         self.session: OpenSession | None = None
         """The session; ``None`` until it is open."""

@@ -14,10 +14,10 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CertificateError, DenyList, DocumentKind, KeyList, sign
+from rmpa.trust.certificates import CertificateError, DenyList, KeyList, sign
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.packets import GroupKey
-from rmpa.trust.permissions import TrustReason, server_names
+from rmpa.trust.permissions import Document, TrustReason, server_names
 from rmpa.trust.store import Issued, MemberFiles
 from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
 
@@ -54,7 +54,7 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
     request = certificates.read_request(certificates.make_request(key, name))
     certificate = certificates.issue(request, ca, ca_key, _serial(), wall)
-    keys = KeyList.of(1, [GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES))], name)
+    keys = KeyList(1, (GroupKey(1, os.urandom(limits.GROUP_KEY_BYTES)),), name)
     store.write(files_of.CA_KEY, ca_pem)
     store.save(MemberFiles(key_pem, certificate, ca, sign(keys, ca_key)))
     store.save_issued([_issued(name, wall, request.public_key)])
@@ -173,8 +173,7 @@ class MeshAuthority:
         """A certificate, and what else a member has; arguments and errors as for ``issue``."""
         _, certificate = self.issue(request, name)
         member = self._membership
-        keys, deny = member.document(DocumentKind.KEYS), member.document(DocumentKind.DENY)
-        return CertificateGrant(certificate, member.files.ca, keys, deny)
+        return CertificateGrant(certificate, member.files.ca, member.files.keys, member.files.deny)
 
     def _granted(self, asked: CertificateRequest) -> tuple[str, ...]:
         """Of the hosts that a module asks for those that are of no other module: the first one that asks has them."""
@@ -276,7 +275,7 @@ class MeshAuthority:
         """
         last = self._issued.get(name)  # later than now, if the clock went back since
         deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
-        self._membership.accept_document(DocumentKind.DENY, sign(deny, self._ca_key))
+        self._membership.accept_document(Document.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
         unused = [each for each in self.book.invitations if not each.used_by]
@@ -301,14 +300,14 @@ class MeshAuthority:
         member = self._membership
         ring, wall = member.ring, member.wall()
         key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
-        keys = KeyList.of(
-            member.numbers[DocumentKind.KEYS] + 1,
-            [*ring.keys, key][-limits.KEYS_MAX :],
+        keys = KeyList(
+            member.keys.number + 1,
+            (*ring.keys, key)[-limits.KEYS_MAX :],
             member.name,
-            proves_from=key.number if revoking else member.proves_from,
+            proves_from=key.number if revoking else member.keys.proves_from,
             made=0 if wall is None else int(wall),
         )
-        member.accept_document(DocumentKind.KEYS, sign(keys, self._ca_key))
+        member.accept_document(Document.KEYS, sign(keys, self._ca_key))
         return key.number
 
 

@@ -18,8 +18,7 @@ import hashlib
 import ipaddress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from enum import StrEnum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 import msgspec
 from cryptography import x509
@@ -29,11 +28,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.identity import peer_name_problem
-from rmpa.core.limits import UINT32_MAX
+from rmpa.core.identity import BASE_NAME, peer_name_problem
+from rmpa.core.limits import PEER_NAME_MAX, UINT32_MAX
 from rmpa.trust import limits
-from rmpa.trust.packets import GroupKey
-from rmpa.trust.permissions import TrustError, TrustReason, page_hosts, server_names
+from rmpa.trust.packets import GroupKey  # noqa: TC001 - msgspec reads the annotation
+from rmpa.trust.permissions import Document, TrustError, TrustReason, page_hosts, server_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -49,13 +48,9 @@ if TYPE_CHECKING:
 
 
 _ALGORITHM: Final = ec.ECDSA(hashes.SHA256())
-
-
-class DocumentKind(StrEnum):
-    """What a document is; the value is the label under its signature."""
-
-    DENY = "rmpa deny 1"
-    KEYS = "rmpa keys 1"
+_Number = Annotated[int, msgspec.Meta(ge=0, le=UINT32_MAX)]
+_ModuleName = Annotated[str, msgspec.Meta(pattern=rf"\A{BASE_NAME}\Z", max_length=PEER_NAME_MAX)]
+_NameOrNone = Annotated[str, msgspec.Meta(pattern=rf"\A({BASE_NAME})?\Z", max_length=PEER_NAME_MAX)]
 
 
 class DocumentError(RemoteProtocolError):
@@ -70,25 +65,25 @@ class _Signed(msgspec.Struct, frozen=True):
 class DenyEntry(msgspec.Struct, frozen=True):
     """One revoked module.
 
-    Args:
+    Attributes:
         name: The module's.
         before: Certificates of that name that were issued up to this time are refused; seconds since 1970.
     """
 
-    name: str
+    name: _ModuleName
     before: int
 
 
 class DenyList(msgspec.Struct, frozen=True):
     """The names that were revoked.
 
-    Args:
+    Attributes:
         number: Grows with each change; 0: nothing was ever revoked.
         entries: One for each name.
     """
 
-    number: int = 0
-    entries: tuple[DenyEntry, ...] = ()
+    number: _Number = 0
+    entries: Annotated[tuple[DenyEntry, ...], msgspec.Meta(max_length=limits.DENY_MAX)] = ()
 
     def denies(self, name: str, issued: float) -> bool:
         """Whether a certificate is refused.
@@ -119,18 +114,10 @@ class DenyList(msgspec.Struct, frozen=True):
         return DenyList(self.number + 1, entries)
 
 
-class _KeyEntry(msgspec.Struct, frozen=True):
-    number: int
-    key: bytes
-
-    def __repr__(self) -> str:
-        return f"_KeyEntry({self.number})"
-
-
 class KeyList(msgspec.Struct, frozen=True):
     """The group keys of a mesh. It is secret: only members get it, over their links.
 
-    Args:
+    Attributes:
         number: Grows with each change.
         keys: By number.
         authority: The name of the authority, so that no other member can pass for it; empty: not known.
@@ -138,94 +125,53 @@ class KeyList(msgspec.Struct, frozen=True):
         made: When the newest key was made, by the authority's clock in seconds since 1970; 0: it was not set.
     """
 
-    number: int
-    keys: tuple[_KeyEntry, ...]
-    authority: str = ""
+    number: _Number
+    keys: Annotated[tuple[GroupKey, ...], msgspec.Meta(min_length=1, max_length=limits.KEYS_MAX)]
+    authority: _NameOrNone = ""
     proves_from: int = 0
     made: int = 0
 
-    @classmethod
-    def of(
-        cls, number: int, keys: Iterable[GroupKey], authority: str = "", *, proves_from: int = 0, made: int = 0
-    ) -> KeyList:
-        """The list of these keys; arguments as for the class."""
-        entries = tuple(_KeyEntry(key.number, key.secret) for key in keys)
-        return cls(number, entries, authority, proves_from, made)
-
-    @property
-    def group_keys(self) -> tuple[GroupKey, ...]:
-        """The keys."""
-        return tuple(GroupKey(entry.number, entry.key) for entry in self.keys)
-
-    def __repr__(self) -> str:
-        """The numbers alone: secrets never come into a log."""
-        return f"KeyList(number={self.number}, keys={[entry.number for entry in self.keys]})"
+    def __post_init__(self) -> None:
+        if len({key.number for key in self.keys}) != len(self.keys):
+            raise ValueError("two group keys of one number")
 
 
-_T = TypeVar("_T", DenyList, KeyList)
+_T = TypeVar("_T", bound=DenyList | KeyList)
+_KINDS: Final[dict[type[msgspec.Struct], Document]] = {DenyList: Document.DENY, KeyList: Document.KEYS}
 
 
 def sign(document: DenyList | KeyList, key: ec.EllipticCurvePrivateKey) -> bytes:
     """A document with the CA's signature, as it is sent and stored."""
-    kind = DocumentKind.DENY if isinstance(document, DenyList) else DocumentKind.KEYS
     text = msgspec.json.encode(document).decode()
-    return msgspec.json.encode(_Signed(text, key.sign(_under_signature(kind, text), _ALGORITHM)))
+    return msgspec.json.encode(_Signed(text, key.sign(_under_signature(type(document), text), _ALGORITHM)))
 
 
-def read_deny_list(data: bytes, key: ec.EllipticCurvePublicKey) -> DenyList:
-    """Read a signed deny list.
+def read_document(data: bytes, key: ec.EllipticCurvePublicKey, form: type[_T]) -> _T:
+    """Read a signed document.
 
     Args:
         data: As ``sign`` made it.
         key: The CA's key.
+        form: Which of the two it must be.
 
     Raises:
         LimitExceeded: It is too long.
         DocumentError: It is malformed, or not signed with that key.
     """
-    found = _read_document(data, key, DocumentKind.DENY, DenyList)
-    if len(found.entries) > limits.DENY_MAX:
-        raise DocumentError(f"{len(found.entries)} names on a deny list")
-    for entry in found.entries:
-        if problem := peer_name_problem(entry.name):
-            raise DocumentError(problem)
-    return found
-
-
-def read_key_list(data: bytes, key: ec.EllipticCurvePublicKey) -> KeyList:
-    """Read a signed list of group keys; arguments and errors as for ``read_deny_list``."""
-    found = _read_document(data, key, DocumentKind.KEYS, KeyList)
-    if not 0 < len(found.keys) <= limits.KEYS_MAX:
-        raise DocumentError(f"{len(found.keys)} group keys")
-    if found.authority and (problem := peer_name_problem(found.authority)):
-        raise DocumentError(problem)
-    try:
-        numbers = [each.number for each in found.group_keys]
-    except ValueError as error:
-        raise DocumentError(str(error)) from None
-    if len(set(numbers)) != len(numbers):
-        raise DocumentError("two group keys of one number")
-    return found
-
-
-def _read_document(data: bytes, key: ec.EllipticCurvePublicKey, kind: DocumentKind, form: type[_T]) -> _T:
     if len(data) > limits.DOCUMENT_MAX:
         raise LimitExceeded("a signed document", len(data), limits.DOCUMENT_MAX)
     try:
         envelope = msgspec.json.decode(data, type=_Signed)
-        key.verify(envelope.signature, _under_signature(kind, envelope.signed), _ALGORITHM)
-        document = msgspec.json.decode(envelope.signed, type=form)
+        key.verify(envelope.signature, _under_signature(form, envelope.signed), _ALGORITHM)
+        return msgspec.json.decode(envelope.signed, type=form)
     except InvalidSignature:
         raise DocumentError("the document is not signed by our authority") from None
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DocumentError(f"the document cannot be read: {error!s:.200}") from None
-    if not 0 <= document.number <= UINT32_MAX:
-        raise DocumentError(f"the document's number is {document.number}")
-    return document
 
 
-def _under_signature(kind: DocumentKind, text: str) -> bytes:
-    return kind.value.encode() + b"\x00" + text.encode()
+def _under_signature(form: type[msgspec.Struct], text: str) -> bytes:
+    return f"rmpa {_KINDS[form]} 1\0{text}".encode()
 
 
 URN: Final = "urn:rmpa:"

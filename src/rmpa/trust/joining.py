@@ -16,7 +16,7 @@ from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CertificateError, read_deny_list, read_key_list
+from rmpa.trust.certificates import CertificateError, DenyList, KeyList, read_document
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, join_context, member_context
@@ -296,24 +296,25 @@ def check_grant(grant: CertificateGrant, name: str, request: bytes) -> None:
     if found.public_key != certificates.read_request(request).public_key:
         raise certificates.CertificateError(TrustReason.FOREIGN, "the certificate is of another key")
     key = certificates.ca_public_key(grant.ca)
-    read_key_list(grant.keys, key)
+    read_document(grant.keys, key, KeyList)
     if grant.deny:
-        read_deny_list(grant.deny, key)
+        read_document(grant.deny, key, DenyList)
 
 
-async def renew_at_authority(membership: Membership, address: str, port: int) -> CertificateGrant:
-    """Ask for a certificate over a connection of its own, with one that may have ended; raises as ``join_mesh``."""
+async def renew_at_authority(membership: Membership, address: str, port: int) -> None:
+    """Renew a certificate, which may have ended, over a connection of its own; raises as ``join_mesh``."""
     store = membership.store
     files = store.path(files_of.CERTIFICATE), store.path(files_of.KEY)
 
     def question(server: bytes) -> Renew:
         name = certificates.verify(server, membership.files.ca, None).name
-        if name != membership.authority:
+        if name != membership.keys.authority:
             raise RemoteProtocolError(f"the module at {address}:{port} is {name}, not the authority")
         return Renew(membership.request())
 
     context = member_context(*files, membership.files.ca, ALPN_JOIN, server_side=False)
-    return (await _ask(address, port, context, question))[0]
+    grant, _ = await _ask(address, port, context, question)
+    membership.take_grant(grant)
 
 
 # Builds the state that ``rmpa trust status``, the snapshot and ``/diagnostics`` show.

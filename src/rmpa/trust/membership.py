@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CURVE, DenyList, DocumentKind, KeyList, read_deny_list, read_key_list
-from rmpa.trust.packets import KeyRing, PacketSigner, PacketTrust, PacketVerifier
-from rmpa.trust.permissions import TrustError, TrustReason
+from rmpa.trust.certificates import CURVE, DenyList, KeyList, read_document
+from rmpa.trust.packets import KeyRing, PacketTrust
+from rmpa.trust.permissions import Document, TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, member_context
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from rmpa.runtime.loop import SystemClock
     from rmpa.trust.store import MemberFiles, TrustStore
+    from rmpa.trust.tokens import CertificateGrant
 
 
 # Private keys of modules and of the CA, as PEM.
@@ -34,7 +35,9 @@ if TYPE_CHECKING:
 
 def new_key() -> bytes:
     """A private key (PKCS #8, PEM) for a module or a CA."""
-    return _key_pem(ec.generate_private_key(CURVE))
+    return ec.generate_private_key(CURVE).private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
 
 
 def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
@@ -56,14 +59,7 @@ def private_key(data: bytes, where: str) -> ec.EllipticCurvePrivateKey:
     return key
 
 
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-
-
 _log = logging.getLogger(__name__)
-_FILES: Final = {DocumentKind.DENY: files_of.DENY, DocumentKind.KEYS: files_of.KEYS}
 _REMEDY: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here"
 
 
@@ -92,12 +88,14 @@ class Membership:
             self._ca_key = certificates.ca_public_key(files.ca)
             self.certificate = certificates.verify(files.certificate, files.ca, None)
         with _named(store, files_of.KEYS):
-            self._keys = read_key_list(files.keys, self._ca_key)
+            self.keys = read_document(files.keys, self._ca_key, KeyList)
+            """The list of group keys that holds."""
         with _named(store, files_of.DENY):
-            self._deny = read_deny_list(files.deny, self._ca_key) if files.deny else DenyList()
-        proves_from, age = self._keys.proves_from, self._age(self._keys, limits.KEY_SPREAD)
-        self.ring = KeyRing(self._keys.group_keys, clock.now(), proves_from=proves_from, age=age)
-        self.packets = PacketTrust(PacketSigner(self.ring), PacketVerifier(self.ring), self.wall)
+            self.deny = read_document(files.deny, self._ca_key, DenyList) if files.deny else DenyList()
+            """The deny list that holds."""
+        proves_from, age = self.keys.proves_from, self._age(self.keys, limits.KEY_SPREAD)
+        self.ring = KeyRing(self.keys.keys, clock.now(), proves_from=proves_from, age=age)
+        self.packets = PacketTrust(self.ring, self.wall)
         self.on_denied: list[Callable[[], None]] = []
         """Called after a newer deny list holds: links that match end at once."""
         self.save: Callable[[str, bytes], None] = store.write
@@ -111,36 +109,20 @@ class Membership:
 
     def __repr__(self) -> str:
         """Name and numbers alone: secrets never come into a log."""
-        return f"Membership({self.name!r}, deny={self._deny.number}, keys={self._keys.number})"
+        return f"Membership({self.name!r}, deny={self.deny.number}, keys={self.keys.number})"
 
     @property
     def name(self) -> str:
         """The module's name, as its certificate proves it."""
         return self.certificate.name
 
-    @property
-    def authority(self) -> str:
-        """The name of the authority, as the signed list of group keys has it; empty: the list does not say."""
-        return self._keys.authority
+    def number(self, kind: Document) -> int:
+        """The number of the document that holds."""
+        return self.deny.number if kind is Document.DENY else self.keys.number
 
-    @property
-    def proves_from(self) -> int:
-        """The number of the group key that the last revocation made; older ones only recognise."""
-        return self._keys.proves_from
-
-    @property
-    def deny(self) -> DenyList:
-        """The deny list that holds."""
-        return self._deny
-
-    @property
-    def numbers(self) -> dict[DocumentKind, int]:
-        """The numbers of the documents that hold."""
-        return {DocumentKind.DENY: self._deny.number, DocumentKind.KEYS: self._keys.number}
-
-    def document(self, kind: DocumentKind) -> bytes:
+    def document(self, kind: Document) -> bytes:
         """A document that holds, signed; empty: there is none yet."""
-        return self.files.deny if kind is DocumentKind.DENY else self.files.keys
+        return self.files.deny if kind is Document.DENY else self.files.keys
 
     # --- clock ------------------------------------------------------------------------------------------------
 
@@ -164,7 +146,7 @@ class Membership:
         """
         wall = self.wall()
         if isinstance(certificate, bytes | bytearray):
-            certificates.verify(bytes(certificate), self.files.ca, wall, name=claimed or "", deny=self._deny)
+            certificates.verify(bytes(certificate), self.files.ca, wall, name=claimed or "", deny=self.deny)
             return
         name, begin, expires = member_name(certificate), *_times(certificate)
         if wall is not None and wall < begin:
@@ -174,8 +156,8 @@ class Membership:
             raise TrustError(TrustReason.EXPIRED, f"the certificate of {name} ended {wall - expires:.0f} s ago")
         if claimed is not None and claimed != name:
             raise TrustError(TrustReason.NAME, f"the certificate is of {name}, not of {claimed}")
-        if self._deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
-            raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self._deny.number})")
+        if self.deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
+            raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self.deny.number})")
 
     def request(self, hosts: Iterable[str] = ()) -> bytes:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
@@ -184,7 +166,7 @@ class Membership:
 
     # --- what is newer ----------------------------------------------------------------------------------------
 
-    def accept_document(self, kind: DocumentKind, data: bytes) -> bool:
+    def accept_document(self, kind: Document, data: bytes) -> bool:
         """Take a signed document if it is newer than the one that holds; return whether it is.
 
         A new group key signs ``limits.KEY_SPREAD`` after it was made, or at once if a revocation made it. A document
@@ -194,22 +176,31 @@ class Membership:
             LimitExceeded: It is too long.
             DocumentError: It is malformed, or not signed by this mesh's authority.
         """
-        if kind is DocumentKind.DENY:
-            deny = read_deny_list(data, self._ca_key)
-            if deny.number <= self._deny.number:
+        if kind is Document.DENY:
+            deny = read_document(data, self._ca_key, DenyList)
+            if deny.number <= self.deny.number:
                 return False
-            self._deny = deny
-            self.files = replace(self.files, deny=data)
-        else:
-            keys = read_key_list(data, self._ca_key)
-            if keys.number <= self._keys.number:
-                return False
-            self._take_keys(keys, data)
-        if kind is DocumentKind.DENY:  # before a slow disk is written
-            for call in tuple(self.on_denied):
+            self.deny, self.files = deny, replace(self.files, deny=data)
+            for call in tuple(self.on_denied):  # before a slow disk is written
                 call()
-        self._write(_FILES[kind], data)
+        else:
+            keys = read_document(data, self._ca_key, KeyList)
+            if keys.number <= self.keys.number:
+                return False
+            self.keys, self.files = keys, replace(self.files, keys=data)
+            self.ring.take(keys.keys, self._clock.now(), proves_from=keys.proves_from, age=self._age(keys, 0.0))
+        try:
+            self.save(files_of.DENY if kind is Document.DENY else files_of.KEYS, data)
+        except StartError as error:
+            _log.error("! %s", error)
         return True
+
+    def take_grant(self, grant: CertificateGrant) -> None:
+        """Take a newer certificate and the documents beside it; raises as ``renewed`` and ``accept_document``."""
+        self.renewed(grant.certificate)
+        for kind, data in ((Document.DENY, grant.deny), (Document.KEYS, grant.keys)):
+            if data:
+                self.accept_document(kind, data)
 
     def renewed(self, certificate: bytes) -> None:
         """Take a newer certificate (DER) of this module and its key: links that come up from now on have it.
@@ -225,22 +216,10 @@ class Membership:
         self.certificate, self.files = found, replace(self.files, certificate=certificate)
         self._make_contexts()
 
-    def _take_keys(self, keys: KeyList, data: bytes) -> None:
-        age = self._age(keys, 0.0)
-        self.ring.take(keys.group_keys, self._clock.now(), proves_from=keys.proves_from, age=age)
-        self._keys = keys
-        self.files = replace(self.files, keys=data)
-
     def _age(self, keys: KeyList, unknown: float) -> float:
         """Seconds since the newest group key was made; ``unknown`` where a clock is not set."""
         wall = self.wall()
         return unknown if wall is None or not keys.made else max(0.0, wall - keys.made)
-
-    def _write(self, name: str, data: bytes) -> None:
-        try:
-            self.save(name, data)
-        except StartError as error:
-            _log.error("! %s", error)
 
     def _make_contexts(self) -> None:
         """Make the contexts for connections that are accepted, joins at the authority too, and for dialled ones."""

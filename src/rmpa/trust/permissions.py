@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import msgspec
 
@@ -49,11 +48,10 @@ _DONE: Final = {
 """Each access as a verb, for texts."""
 
 
-@dataclass(frozen=True, slots=True)
-class PermissionDecision:
+class PermissionDecision(NamedTuple):
     """Whether a module may do something here, and the rule that decided.
 
-    Args:
+    Attributes:
         allowed: Whether it may.
         rule: The rule as text: ``[[permission]] 2 denies call of '/motors/**' to '*'``.
         number: The number of the rule in the file, from 1; ``None``: ``trust.default`` decided.
@@ -64,16 +62,6 @@ class PermissionDecision:
     number: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Pattern:
-    """One glob over names, of one rule, for one module."""
-
-    glob: str
-    effect: Effect
-    number: int
-    text: str
-
-
 class Permissions:
     """The permissions of other modules in this one.
 
@@ -82,7 +70,7 @@ class Permissions:
     """
 
     def __init__(self, settings: TrustSettings) -> None:
-        self._known: dict[str, dict[Access, tuple[_Pattern, ...]]] = {}
+        self._known: dict[str, dict[Access, list[tuple[str, PermissionDecision]]]] = {}
         self.reload(settings)
 
     def reload(self, settings: TrustSettings) -> None:
@@ -104,9 +92,9 @@ class Permissions:
             module: Its name, as its certificate proves it.
             name: The topic, service, parameter or node, by its name here.
         """
-        for pattern in self._patterns(module)[access]:
-            if matches(pattern.glob, name):
-                return PermissionDecision(pattern.effect is Effect.ALLOW, pattern.text, pattern.number)
+        for glob, decision in self._decisions(module)[access]:
+            if matches(glob, name):
+                return decision
         if self._settings.default == Effect.ALLOW:
             return PermissionDecision(True, 'no [[permission]] fits, and trust.default = "allow"')
         return PermissionDecision(False, f"no [[permission]] lets {module} {_DONE[access]} {name}")
@@ -122,25 +110,22 @@ class Permissions:
         """The groups that a module is in, in the order of the file."""
         return tuple(name for name, globs in self._groups.items() if _first(globs, module) is not None)
 
-    def _patterns(self, module: str) -> dict[Access, tuple[_Pattern, ...]]:
-        """The globs of the rules about a module, by access, those that deny first."""
+    def _decisions(self, module: str) -> dict[Access, list[tuple[str, PermissionDecision]]]:
+        """By access: the globs of the rules about a module, each with its decision; those that deny first."""
         known = self._known.get(module)
         if known is None:
             if len(self._known) >= limits.MODULES_REMEMBERED:
                 self._known.clear()
-            found: dict[Access, list[_Pattern]] = {access: [] for access in Access}
+            known = self._known[module] = {access: [] for access in Access}
             for number, rule in enumerate(self._settings.rules, 1):
-                for access, pattern in self._rule_patterns(number, rule, module):
-                    found[access].append(pattern)
-            # sorted() is stable: among denials, and among allowances, the order of the file stays.
-            known = self._known[module] = {
-                access: tuple(sorted(patterns, key=lambda p: p.effect is Effect.ALLOW))
-                for access, patterns in found.items()
-            }
+                for access, glob, text in self._globs(number, rule, module):
+                    known[access].append((glob, PermissionDecision(rule.effect is Effect.ALLOW, text, number)))
+            for found in known.values():
+                found.sort(key=lambda each: each[1].allowed)  # stable: among equals the order of the file stays
         return known
 
-    def _rule_patterns(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, _Pattern]]:
-        """The globs of one rule, if it is about a module."""
+    def _globs(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, str, str]]:
+        """The globs of one rule, if it is about a module: the access, the glob, and the rule as text."""
         whom = self._fit(rule, module)
         if whom is None:
             return
@@ -150,10 +135,10 @@ class Permissions:
                 text = f"[[permission]] {number} {verb} {key} of {written!r} to {whom}"
                 filled = written.replace(PEER, module)
                 if key not in (ACTION_CLIENT, ACTION_SERVER):
-                    yield Access(key), _Pattern(filled, rule.effect, number, text)
+                    yield Access(key), filled, text
                     continue
                 for access, topic in action_topics(key, filled):
-                    yield access, _Pattern(topic, rule.effect, number, text)
+                    yield access, topic, text
 
     def _fit(self, rule: PermissionRule, module: str) -> str | None:
         """Why a rule is about a module, as text; ``None``: it is not."""
@@ -196,25 +181,40 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
 # How signed documents reach every module: which linked peer lacks which document (docs/design/trust.md).
 #
 # Each module tells a new link the numbers of its documents (``trust.have``); the side with a higher number sends
-# that
-# document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So a
-# document is everywhere after as many trips as the mesh is wide, and in a mesh that was split once it is whole
+# that document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So
+# a document is everywhere after as many trips as the mesh is wide, and in a mesh that was split once it is whole
 # again.
 
 
-class Notice(StrEnum):
-    """The notifications between two agents; the value is their name on the wire."""
+class Document(StrEnum):
+    """The signed documents, in the order in which they are sent: a module that was revoked gets no new key."""
 
-    HAVE = "trust.have"
-    """``{"deny": 7, "keys": 3}``: the numbers that the sender has; ``"authority": true`` at the authority."""
-    DENY = "trust.deny"
-    """``{"document": TEXT}``: the signed deny list."""
-    KEYS = "trust.keys"
-    """Likewise: the signed list of group keys."""
+    DENY = "deny"
+    """The deny list."""
+    KEYS = "keys"
+    """The list of group keys."""
+
+    @property
+    def notice(self) -> str:
+        """The notification that brings it: ``{"document": TEXT}``."""
+        return f"trust.{self}"
 
 
-DOCUMENTS: Final = (Notice.DENY, Notice.KEYS)
-"""The documents in the order in which they are sent: a module that was revoked gets no new key."""
+HAVE: Final = "trust.have"
+"""The notification of what a module has, as ``Have``."""
+
+
+class Have(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The numbers of the documents that the sender has, and whether it is the authority."""
+
+    deny: Annotated[int, msgspec.Meta(ge=0, le=UINT32_MAX)]
+    keys: Annotated[int, msgspec.Meta(ge=0, le=UINT32_MAX)]
+    authority: bool = False
+
+    @property
+    def numbers(self) -> dict[Document, int]:
+        """The numbers by document."""
+        return {Document.DENY: self.deny, Document.KEYS: self.keys}
 
 
 class DocumentSpreading:
@@ -224,9 +224,9 @@ class DocumentSpreading:
         number: The number of the document that this module has.
     """
 
-    def __init__(self, number: Callable[[Notice], int]) -> None:
+    def __init__(self, number: Callable[[Document], int]) -> None:
         self._number = number
-        self._known: dict[int, dict[Notice, int]] = {}
+        self._known: dict[int, dict[Document, int]] = {}
 
     def link_up(self, peer: int) -> None:
         """A peer is linked; it has not said what it has."""
@@ -236,67 +236,22 @@ class DocumentSpreading:
         """A peer is not linked any more."""
         self._known.pop(peer, None)
 
-    def have(self, peer: int, numbers: Mapping[Notice, int]) -> tuple[Notice, ...]:
-        """A peer said what it has; return the documents that it is to be sent."""
-        known = self._known.get(peer)
-        if known is None:
-            return ()
-        for kind, number in numbers.items():
-            known[kind] = max(number, known.get(kind, 0))
-        return self._take(peer, DOCUMENTS)
+    def has(self, peer: int, numbers: Mapping[Document, int]) -> None:
+        """A peer has these documents, as it says or as it sent them."""
+        known = self._known.get(peer, {})
+        known.update({kind: max(number, known.get(kind, 0)) for kind, number in numbers.items()})
 
-    def received(self, peer: int, kind: Notice, number: int) -> None:
-        """A peer sent a valid document, so it has it."""
-        known = self._known.get(peer)
-        if known is not None:
-            known[kind] = max(number, known.get(kind, 0))
-
-    def changed(self) -> list[tuple[int, tuple[Notice, ...]]]:
-        """This module has newer documents: each peer that is known to lack some, and which."""
-        return [(peer, lacking) for peer in list(self._known) if (lacking := self._take(peer, DOCUMENTS))]
-
-    def _take(self, peer: int, kinds: tuple[Notice, ...]) -> tuple[Notice, ...]:
-        """The documents that a peer lacks; they count as sent."""
-        known = self._known[peer]
-        lacking = tuple(kind for kind in kinds if kind in known and known[kind] < self._number(kind))
-        for kind in lacking:
-            known[kind] = self._number(kind)
-        return lacking
-
-
-def have_args(number: Callable[[Notice], int], *, is_authority: bool) -> dict[str, Any]:
-    """The arguments of ``trust.have``."""
-    args: dict[str, Any] = {kind.removeprefix("trust."): number(kind) for kind in DOCUMENTS}
-    return args | {"authority": True} if is_authority else args
-
-
-def read_have(args: Mapping[str, Any]) -> tuple[dict[Notice, int], bool]:
-    """The numbers that a peer has, and whether it is the authority.
-
-    Raises:
-        RemoteProtocolError: They are malformed.
-    """
-    numbers = {kind: args.get(kind.removeprefix("trust.")) for kind in DOCUMENTS}
-    checked = {
-        kind: number
-        for kind, number in numbers.items()
-        if isinstance(number, int) and not isinstance(number, bool) and 0 <= number <= UINT32_MAX
-    }
-    if len(checked) != len(numbers):
-        raise RemoteProtocolError("trust.have without the numbers of two documents")
-    return checked, args.get("authority") is True
-
-
-def read_document(args: Mapping[str, Any]) -> bytes:
-    """The document in ``trust.deny`` or ``trust.keys``.
-
-    Raises:
-        RemoteProtocolError: There is none.
-    """
-    text = args.get("document")
-    if not isinstance(text, str):
-        raise RemoteProtocolError("a notification without its document")
-    return text.encode()
+    def lacking(self) -> list[tuple[int, Document]]:
+        """Each peer that is known to lack a document, and which; they count as sent."""
+        found = [
+            (peer, kind)
+            for peer, known in self._known.items()
+            for kind in Document
+            if kind in known and known[kind] < self._number(kind)
+        ]
+        for peer, kind in found:
+            self._known[peer][kind] = self._number(kind)
+        return found
 
 
 # The reasons for which a secured mesh refuses a connection: one word each, for wire, counters, commands and logs.

@@ -21,7 +21,7 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.membership import PeerEvent
 from rmpa.discovery.network import Interface, list_interfaces
-from rmpa.trust.packets import GroupKey, KeyRing, PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -171,7 +171,7 @@ async def test_a_flood_without_proofs_pauses_the_reading_and_members_still_meet(
 ) -> None:
     rings = [KeyRing([GroupKey(1, bytes(32))], 0.0) for _ in range(2)]
     base, arm = (
-        Agent(name, settings, trust=PacketTrust(PacketSigner(ring), PacketVerifier(ring), time.time))
+        Agent(name, settings, trust=PacketTrust(ring, time.time))
         for name, ring in zip(("base", "arm"), rings, strict=True)
     )
     await start(agents, base)
@@ -405,7 +405,7 @@ async def test_seeds_that_do_not_answer_and_another_domain_are_told(
 
 def _trust(secret: bytes) -> PacketTrust:
     ring = KeyRing([GroupKey(1, secret * 32)], 0.0)
-    return PacketTrust(PacketSigner(ring), PacketVerifier(ring), time.time)
+    return PacketTrust(ring, time.time)
 
 
 async def test_a_secured_mesh_hears_its_members_alone(agents: list[Agent], settings: Settings) -> None:

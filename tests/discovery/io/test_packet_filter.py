@@ -11,7 +11,7 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.discovery import PacketFilter
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.packets import GroupKey, KeyPurpose, KeyRing, PacketSigner, PacketTrust, PacketVerifier
+from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 
 if TYPE_CHECKING:
     import pytest
@@ -96,14 +96,13 @@ class SecuredDoor:
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._signer = PacketSigner(RING)
-        self.intake = PacketFilter(
-            0, self.counters, trust=PacketTrust(self._signer, PacketVerifier(RING), lambda: WALL)
-        )
+        self._signer = PacketTrust(RING, lambda: WALL)
+        self.intake = PacketFilter(0, self.counters, trust=PacketTrust(RING, lambda: WALL))
 
     def signed(self, sequence: int, wall: float = WALL) -> bytes:
         beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, sequence)
-        return self._signer.sign(beacon.serialize(), KeyPurpose.BEACON, 10.0, wall)
+        self._signer.wall = lambda: wall
+        return self._signer.sign(beacon.serialize(), 10.0)
 
     def hears(self, data: bytes, host: str = "10.0.0.2", now: float = 10.0) -> bool:
         return self.intake.parse(data, (host, 4000), now, multicast=True, interface=1) is not None
@@ -121,13 +120,13 @@ def test_a_secured_mesh_hears_its_members_once() -> None:
 
 def test_a_secured_mesh_hears_nothing_else() -> None:
     door = SecuredDoor()
-    foreign = PacketSigner(KeyRing([GroupKey(1, b"x" * 32)], 0.0))
+    foreign = PacketTrust(KeyRing([GroupKey(1, b"x" * 32)], 0.0), lambda: WALL)
     body = Beacon(BeaconKind.ANNOUNCE, FRIEND, 16_000, 1).serialize()
-    newer = PacketSigner(KeyRing([GroupKey(2, b"x" * 32)], 0.0))
+    newer = PacketTrust(KeyRing([GroupKey(2, b"x" * 32)], 0.0), lambda: WALL)
     for data, reason in (
         (packet(FRIEND, 1), "untagged"),
-        (foreign.sign(body, KeyPurpose.BEACON, 10.0, WALL), "forged"),
-        (newer.sign(body, KeyPurpose.BEACON, 10.0, WALL), "unknown_key"),
+        (foreign.sign(body, 10.0), "forged"),
+        (newer.sign(body, 10.0), "unknown_key"),
         (door.signed(1, WALL - 3600), "clock"),
         (bytes(2000), "malformed"),
     ):
@@ -142,16 +141,14 @@ class RotatedDoor:
     def __init__(self) -> None:
         ring = KeyRing([GroupKey(1, b"k" * 32), GroupKey(2, b"n" * 32)], 0.0)
         self.counters = Counters()
-        self.member, self.old = PacketSigner(ring), PacketSigner(RING)
-        self._intake = PacketFilter(
-            0, self.counters, trust=PacketTrust(self.member, PacketVerifier(ring), lambda: WALL)
-        )
+        self.member, self.old = PacketTrust(ring, lambda: WALL), PacketTrust(RING, lambda: WALL)
+        self._intake = PacketFilter(0, self.counters, trust=PacketTrust(ring, lambda: WALL))
 
     def found(
-        self, signer: PacketSigner, number: int, now: float, host: str = "10.0.0.2"
+        self, signer: PacketTrust, number: int, now: float, host: str = "10.0.0.2"
     ) -> tuple[Beacon, int | None] | None:
         beacon = Beacon(BeaconKind.HEARTBEAT, FRIEND, 16_000, number).serialize()
-        data = signer.sign(beacon, KeyPurpose.BEACON, now, WALL)
+        data = signer.sign(beacon, now)
         return self._intake.parse(data, (host, 4000), now, multicast=True, interface=1)
 
 

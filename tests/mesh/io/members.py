@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rmpa.runtime.loop import SystemClock
-from rmpa.trust.certificates import DocumentKind, sign
+from rmpa.trust.certificates import sign
 from rmpa.trust.membership import Membership
+from rmpa.trust.permissions import Document
 from rmpa.trust.store import CERTIFICATE, KEY, MemberFiles, TrustStore
 from tests.mesh.io.meshes import Peer, introduce
 from tests.trust.authority import Authority, new_key
@@ -59,7 +60,7 @@ class Member(Membership):
     def revoke(self, name: str) -> None:
         """Let a newer deny list hold here."""
         deny = sign(self.deny.with_name(name, time.time()), self._ca.key)
-        assert self.accept_document(DocumentKind.DENY, deny)
+        assert self.accept_document(Document.DENY, deny)
 
 
 @asynccontextmanager

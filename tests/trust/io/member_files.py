@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-KEYS = KeyList.of(1, [GroupKey(1, b"k" * 32)])
+KEYS = KeyList(1, (GroupKey(1, b"k" * 32),))
 
 
 @dataclass

@@ -13,10 +13,10 @@ from rmpa.core.errors import StartError
 from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import DenyList, DocumentError, DocumentKind, KeyList, sign
+from rmpa.trust.certificates import DenyList, DocumentError, KeyList, sign
 from rmpa.trust.membership import Membership
-from rmpa.trust.packets import GroupKey, KeyPurpose, Verdict
-from rmpa.trust.permissions import TrustError, TrustReason
+from rmpa.trust.packets import GroupKey, Verdict
+from rmpa.trust.permissions import Document, TrustError, TrustReason
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
@@ -109,10 +109,10 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
     base.on_denied.append(lambda: called.append(base.deny.number))
     certificate = mesh.authority.module("arm")
     newer = sign(DenyList().with_name("arm", WALL + 1), mesh.authority.key)
-    assert base.accept_document(DocumentKind.DENY, newer)
-    assert not base.accept_document(DocumentKind.DENY, newer)
+    assert base.accept_document(Document.DENY, newer)
+    assert not base.accept_document(Document.DENY, newer)
     assert called == [1]
-    assert base.document(DocumentKind.DENY) == newer
+    assert base.document(Document.DENY) == newer
     assert reason_of(base, certificate, "arm") is TrustReason.REVOKED
     base.judge_member(mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
     again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
@@ -124,26 +124,26 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
 def test_a_document_of_another_authority_changes_nothing(mesh: SecuredMesh, tmp_path: Path) -> None:
     base, other = mesh.member("base"), SecuredMesh(tmp_path).authority
     with pytest.raises(DocumentError):
-        base.accept_document(DocumentKind.DENY, sign(DenyList().with_name("arm", WALL), other.key))
+        base.accept_document(Document.DENY, sign(DenyList().with_name("arm", WALL), other.key))
     with pytest.raises(DocumentError):
-        base.accept_document(DocumentKind.KEYS, sign(KEYS, other.key))
-    assert list(base.numbers.values()) == [0, 1]
+        base.accept_document(Document.KEYS, sign(KEYS, other.key))
+    assert (base.deny.number, base.keys.number) == (0, 1)
 
 
 def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
     base, arm = mesh.member("base"), mesh.member("arm")
-    data = sign(KeyList.of(2, [*KEYS.group_keys, GroupKey(2, b"n" * 32)]), mesh.authority.key)
-    assert base.accept_document(DocumentKind.KEYS, data)
+    data = sign(KeyList(2, (*KEYS.keys, GroupKey(2, b"n" * 32))), mesh.authority.key)
+    assert base.accept_document(Document.KEYS, data)
 
     def heard_by_arm() -> Verdict:
         now = mesh.clock.now()
-        packet = base.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, WALL)
-        return arm.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, WALL).verdict
+        packet = base.packets.sign(PACKET, now)
+        return arm.packets.verify(packet, (0, 8), now).verdict
 
     assert heard_by_arm() is Verdict.ACCEPTED  # the new key does not sign yet
     mesh.clock.seconds += limits.KEY_SPREAD
     assert heard_by_arm() is Verdict.UNKNOWN_KEY
-    assert arm.accept_document(DocumentKind.KEYS, data)
+    assert arm.accept_document(Document.KEYS, data)
     assert heard_by_arm() is Verdict.ACCEPTED
     assert Membership.load(arm.store, mesh.clock, mesh.clock.wall).ring.newest.number == 2
 
@@ -151,16 +151,16 @@ def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
 def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: SecuredMesh) -> None:
     """The others sign with the key before for half a minute, and some have not heard of the new one."""
     base, arm = mesh.member("base"), mesh.member("arm")
-    rotated = KeyList.of(2, [*KEYS.group_keys, GroupKey(2, b"n" * 32)], made=int(WALL))
-    assert base.accept_document(DocumentKind.KEYS, sign(rotated, mesh.authority.key))
+    rotated = KeyList(2, (*KEYS.keys, GroupKey(2, b"n" * 32)), made=int(WALL))
+    assert base.accept_document(Document.KEYS, sign(rotated, mesh.authority.key))
     mesh.clock.seconds += 10
     mesh.clock.wall_seconds = WALL + 10
     again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
 
     def heard(sender: Membership, receiver: Membership) -> Verdict:
-        now, wall = mesh.clock.now(), mesh.clock.wall()
-        packet = sender.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, wall)
-        return receiver.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, wall).verdict
+        now = mesh.clock.now()
+        packet = sender.packets.sign(PACKET, now)
+        return receiver.packets.verify(packet, (0, 8), now).verdict
 
     assert heard(again, arm) is heard(arm, again) is Verdict.ACCEPTED
     mesh.clock.seconds += 21
@@ -170,14 +170,14 @@ def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: Se
 
 def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart(mesh: SecuredMesh) -> None:
     base, revoked = mesh.member("base"), mesh.member("eve")
-    keys = [*KEYS.group_keys, GroupKey(2, b"n" * 32)]
+    keys = [*KEYS.keys, GroupKey(2, b"n" * 32)]
     for number, made in enumerate((keys, [*keys, GroupKey(3, b"o" * 32)]), 2):  # a rotation of the usual kind follows
-        listed = KeyList.of(number, made, proves_from=2, made=int(WALL))
-        assert base.accept_document(DocumentKind.KEYS, sign(listed, mesh.authority.key))
+        listed = KeyList(number, tuple(made), proves_from=2, made=int(WALL))
+        assert base.accept_document(Document.KEYS, sign(listed, mesh.authority.key))
         for member in (base, Membership.load(base.store, mesh.clock, mesh.clock.wall)):
             now = mesh.clock.now()
-            packet = revoked.packets.signer.sign(PACKET, KeyPurpose.BEACON, now, WALL)
-            heard = member.packets.verifier.verify(packet, KeyPurpose.BEACON, (0, 8), now, WALL)
+            packet = revoked.packets.sign(PACKET, now)
+            heard = member.packets.verify(packet, (0, 8), now)
             assert heard.verdict is Verdict.OLD_KEY
             assert member.ring.signing(now).number == 2, "a key of a revocation signs at once"
 

@@ -436,10 +436,10 @@ def revoked_modules(settings: Settings) -> tuple[str, ...]:
     files = store.load()
     if not files.deny:
         return ()
-    from rmpa.trust.certificates import ca_public_key, read_deny_list  # noqa: PLC0415 - the extra rmpa[trust]
+    from rmpa.trust.certificates import DenyList, ca_public_key, read_document  # noqa: PLC0415 - the extra rmpa[trust]
 
     try:
-        deny = read_deny_list(files.deny, ca_public_key(files.ca))
+        deny = read_document(files.deny, ca_public_key(files.ca), DenyList)
     except RemoteProtocolError as error:
         raise StartError(str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status") from None
     ended = time.time() - CERTIFICATE_LIFETIME
