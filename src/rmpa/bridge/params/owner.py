@@ -195,16 +195,17 @@ class _Follower:
 
     Args:
         session: The peer.
+        asker: The same, for its permissions.
         keys: What it follows.
-        told: The text that it was told last of each key: ``None`` if there was no value, empty if it is above
-            ``limits.PARAM_SMALL``.
+        told: The mark (``_mark``) of the value that it was told last of each key.
         changed: The keys of which it is to be told.
         task: Tells it.
     """
 
     session: PeerSession
+    asker: _Asker
     keys: set[str] = field(default_factory=set)
-    told: dict[str, str | None] = field(default_factory=dict)
+    told: dict[str, int] = field(default_factory=dict)
     changed: set[str] = field(default_factory=set)
     task: asyncio.Task[None] | None = None
 
@@ -255,12 +256,9 @@ class ParamOwner:
         Returns:
             Whether a peer follows it, a namespace around it, or something inside it.
         """
-        found = False
         for follower in self._followers.values():
-            keys = {followed for followed in follower.keys if overlap(followed, key)}
-            self._tell_soon(follower, keys)
-            found = found or bool(keys)
-        return found
+            self._tell_soon(follower, {followed for followed in follower.keys if overlap(followed, key)})
+        return any(overlap(followed, key) for followed in self.followed)
 
     async def look(self, *, restarted: bool) -> None:
         """Compare the values with those that were told, and subscribe again: a core may have lost a notification.
@@ -272,10 +270,10 @@ class ParamOwner:
             followers = [one for one in self._followers.values() if key in one.keys]
             await self._core.follow(key)
             changed = followers if restarted else []
-            if not restarted and {one.told.get(key, "") for one in followers} != {""}:
+            if not restarted and any(one.told.get(key) for one in followers):
                 with contextlib.suppress(LocalProtocolError):  # too large, which was reported when it was told
-                    text = _small(await self._core.get_text(key))
-                    changed = [one for one in followers if one.told.get(key, "") not in {"", text}]
+                    mark = _mark(await self._core.get_text(key))
+                    changed = [one for one in followers if one.told.get(key, 0) not in {0, mark}]
             for one in changed:
                 self._tell_soon(one, {key})
         for one in self._followers.values():
@@ -284,7 +282,7 @@ class ParamOwner:
     def judge_again(self) -> None:
         """Tell the peers of parameters that the new rules no longer let them follow."""
         for one in self._followers.values():
-            self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one, key)})
+            self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one.asker, key)})
 
     async def close(self) -> None:
         """Stop telling peers."""
@@ -327,7 +325,12 @@ class ParamOwner:
             name = given.rstrip("/") or "/"
             self._refuse(key_problem(given) or why_not_set(self._settings, name) or self._why_denied(asker, name))
             parameters.append((name, one))
-        await self._keep_others(asker, key, [name for name, _ in parameters])
+        if self._gate.on:  # parameters that the peer may not set must not be lost by it
+            around = "/".join(key.split("/")[:2])
+            _, present = await self._core.get(around)
+            lost = list(replaced((name for name, _ in parameters), around, present))
+            if any(self._why_denied(asker, name) for name in yielding_to_data(lost)):
+                raise RmpaError(refusal(Access.PARAM, str(asker), key))
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
@@ -357,16 +360,15 @@ class ParamOwner:
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
-            problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
-            why = problem or why_not_follow(self._settings, key) or self._why_denied(asker, key)
+            why = key_problem(given) or self._why_not_follow(asker, key)
             if not why and key not in wanted and len(wanted) >= most:
                 why = f"more parameters than limits.params = {most} over there; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:
                 wanted.add(key)
-        follower = self._followers.setdefault(session.peer, _Follower(session))
+        follower = self._followers.setdefault(session.peer, _Follower(session, _Asker.read(session, {})))
         follower.keys = wanted
         for key in wanted:
             await self._core.follow(key)
@@ -381,8 +383,7 @@ class ParamOwner:
             names = (name for name, _ in yielding_to_data(leaves(key, value))) if value else names
         return next((why for name in names if (why := why_not_get(self._settings, name))), "")
 
-    def _why_not_follow(self, follower: _Follower, key: str) -> str:
-        asker = _Asker.read(follower.session, {})
+    def _why_not_follow(self, asker: _Asker, key: str) -> str:
         return why_not_follow(self._settings, key) or self._why_denied(asker, key)
 
     def _judge(self, asker: _Asker, name: str) -> tuple[PermissionDecision, str]:
@@ -407,20 +408,6 @@ class ParamOwner:
                 self._gate.refused(Access.PARAM, whose, name, decision)
                 return refusal(Access.PARAM, str(asker), key)  # not the name: it may be a secret
         return ""
-
-    async def _keep_others(self, asker: _Asker, key: str, names: list[str]) -> None:
-        """Refuse to set parameters where others would be lost by it that the peer may not set.
-
-        Raises:
-            RmpaError: It may not.
-        """
-        if not self._gate.on:
-            return
-        around = "/".join(key.split("/")[:2])
-        _, present = await self._core.get(around)
-        for name in yielding_to_data(list(replaced(names, around, present))):
-            if self._why_denied(asker, name):
-                raise RmpaError(refusal(Access.PARAM, str(asker), key))
 
     def _key(self, given: object) -> str:
         self._refuse(key_problem(given))
@@ -455,8 +442,8 @@ class ParamOwner:
 
     async def _tell_one(self, follower: _Follower, key: str) -> bool:
         """Tell a peer a parameter's present value, or why it may not follow it; return whether that has arrived."""
-        asker, text = _Asker.read(follower.session, {}), None
-        if why := self._why_not_follow(follower, key):
+        text = None
+        if why := self._why_not_follow(follower.asker, key):
             follower.keys.discard(key)
         else:
             try:
@@ -464,7 +451,7 @@ class ParamOwner:
                 if found:
                     # What is followed by itself was judged above: the time is shared whatever may be read.
                     hidden = self._why_not_get(key, value) if isinstance(value, dict) else ""
-                    why = self._why_denied(asker, key, value) or hidden
+                    why = self._why_denied(follower.asker, key, value) or hidden
                     text = None if why else await write_text(key, value)
             except RmpaError as error:  # the core does not answer, or the value is too large to cross
                 _log.warning("! peers are not told of %s: %s", key, error)
@@ -475,10 +462,10 @@ class ParamOwner:
         except RmpaError as error:
             _log.warning("! %s is not told of %s: %s", follower.session.link.name, key, error)
             return False
-        follower.told[key] = _small(text)
+        follower.told[key] = _mark(text)
         return True
 
 
-def _small(text: str | None) -> str | None:
-    """A text that is kept for comparison; empty in place of a large one."""
-    return text if text is None or len(text) <= limits.PARAM_SMALL else ""
+def _mark(text: str | None) -> int:
+    """A number by which a value is known again; 0: it is above ``limits.PARAM_SMALL``, and not compared."""
+    return 0 if text is not None and len(text) > limits.PARAM_SMALL else hash(text) or 1

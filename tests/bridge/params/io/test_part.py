@@ -392,7 +392,7 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     sides(again)
     join(again, pad, 2)
     await until(
-        lambda: [one.told for one in again.params.owner._followers.values()] == [{"/robot_description": None}]
+        lambda: [one.told for one in again.params.owner._followers.values()] == [{"/robot_description": hash(None)}]
     )
     await until(lambda: not pad.params._working)
     await again.look()
