@@ -181,7 +181,7 @@ class Pair:
         assert position == (self.epoch, self.sequence(last))
         self.sender.resume(position[1])
         self._trim(last)
-        assert self.receiver.begin(self.epoch, self.sender.first if self.says_first else None)
+        self.receiver.begin(self.epoch, self.sender.first if self.says_first else None)
         self.linked = True
 
     # --- what must be ---------------------------------------------------------------------------------------
@@ -236,23 +236,21 @@ class Pair:
 
     def _handle(self, fragment: Fragment) -> None:
         message, receiver = fragment.message, self.receiver
-        before = (receiver.position(), receiver.gap_total, receiver.next_timer())
-        verdict = receiver.judge(message.sequence, fragment.epoch)
-        assert before == (receiver.position(), receiver.gap_total, receiver.next_timer()), "judging changes nothing"
+        before = (receiver.position(), receiver.next_timer())
+        gap = receiver.gap(message.sequence, fragment.epoch)
+        assert before == (receiver.position(), receiver.next_timer()), "judging changes nothing"
         if not fragment.last:
             return
-        total = receiver.gap_total
-        assert receiver.accept(message.sequence, fragment.epoch, self.now, len(message.payload)) == verdict
-        assert receiver.gap_total == total + verdict.gap
-        if not verdict.deliver:
+        assert receiver.accept(message.sequence, fragment.epoch, self.now, len(message.payload)) == gap
+        if gap is None:
             return
         number = number_of(message.payload)
         assert number not in self.doubled, f"message {number} was delivered twice"
         self.doubled.add(number)
         previous = self.delivered[-1] if self.delivered else self.start - 1
         if self.delivered or self.says_first:
-            assert verdict.gap == number - previous - 1, "the gap is exact"
+            assert gap == number - previous - 1, "the gap is exact"
         else:
-            assert verdict.gap == 0, "nothing is claimed that is not known"
+            assert gap == 0, "nothing is claimed that is not known"
         self.gaps += number - previous - 1
         self.delivered.append(number)

@@ -231,6 +231,10 @@ class Life:
     receiver: ReliableReceiver = field(default_factory=ReliableReceiver)
     received: list[Received] = field(default_factory=list)
     epochs: list[int] = field(default_factory=list)
+    gaps: int = 0
+    """Messages that are said to be lost."""
+    duplicates: int = 0
+    """Messages that came again or too late."""
     unseen: dict[int, int] = field(default_factory=dict)
     """By epoch: messages that are said to be lost behind the last one that came."""
 
@@ -295,6 +299,7 @@ class Importer:
                     life.epochs.append(message["epoch"])
                 life.receiver.begin(message["epoch"], message["first"])
                 skipped = life.receiver.skip(message["following"])
+                life.gaps += skipped
                 life.unseen[message["epoch"]] = life.unseen.get(message["epoch"], 0) + skipped
                 if skipped:
                     self.world.note("importer", f"< {skipped} are lost")
@@ -304,20 +309,22 @@ class Importer:
 
     def _data(self, wire: Wire, epoch: int, frame: Frame, life: Life) -> None:
         if frame.flags & FIRST:
-            wire.pieces = [] if life.receiver.judge(frame.sequence, epoch).deliver else None
+            wire.pieces = [] if life.receiver.gap(frame.sequence, epoch) is not None else None
         if wire.pieces is not None:
             wire.pieces.append(frame.payload)
         if not frame.flags & LAST:
             return
         # A message that only its last fragment shows to be a duplicate came over two links at once.
-        verdict = life.receiver.accept(frame.sequence, epoch, self.world.now, len(frame.payload))
-        if verdict.deliver:
+        missing = life.receiver.accept(frame.sequence, epoch, self.world.now, len(frame.payload))
+        life.duplicates += missing is None
+        if missing is not None:
+            life.gaps += missing
             assert wire.pieces is not None
             whole = b"".join(wire.pieces)
             number, size = int.from_bytes(whole[:4], "big"), int.from_bytes(whole[4:8], "big")
             assert len(whole) == 8 + size, "a half message was delivered"
             assert frame.stamp_ns == number + 1
-            gap = verdict.gap + life.unseen.pop(epoch, 0)
+            gap = missing + life.unseen.pop(epoch, 0)
             life.received.append(Received(epoch, number, gap))
             self.world.note("importer", f"< {number} gap {gap}")
 

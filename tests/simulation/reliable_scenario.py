@@ -130,8 +130,7 @@ class ReliableScenario:
                 assert got.gap == got.number - before - 1, f"{got} behind {before}"
                 last[got.epoch] = got.number
             seen = sum(got.gap for got in life.received)
-            assert life.receiver.gap_total == seen + sum(life.unseen.values())
-            assert life.receiver.breaks == max(0, len(life.epochs) - 1)
+            assert life.gaps == seen + sum(life.unseen.values())
         self._check_last_epoch()
         if self.bounds == Bounds() and not self.broken and not exporter.gave_up:
             first = exporter.starts[self.importer.lives[0].epochs[0]]

@@ -19,9 +19,8 @@ inline, for speed.
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Hashable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
@@ -83,12 +82,14 @@ class ReliableSender:
         self._dropped_in_flight: deque[tuple[int, int]] = deque()
         """``(sequence, size)`` of the messages that were dropped after they were sent, and may have arrived. All of
         them are older than the kept messages, and the window bounds their number."""
-        self._bytes = 0
+        self.pending_bytes = 0
+        """The number of bytes kept."""
         self._in_flight_bytes = 0
         self._linked = True
         self._next = self.first
-        self._acknowledged = serial_add(first, -1)
-        self._highest = self._acknowledged
+        self.confirmed = serial_add(first, -1)
+        """The last message that is known to have arrived, with all messages before it."""
+        self._highest = self.confirmed
         """The highest sequence that was sent over any link, or reported as lost."""
 
     @property
@@ -97,19 +98,9 @@ class ReliableSender:
         return serial_add(self._next, -1)
 
     @property
-    def confirmed(self) -> int:
-        """The last message that is known to have arrived, with all messages before it."""
-        return self._acknowledged
-
-    @property
     def pending(self) -> int:
         """The number of messages kept."""
         return len(self._sent) + len(self._unsent)
-
-    @property
-    def pending_bytes(self) -> int:
-        """The number of bytes kept."""
-        return self._bytes
 
     @property
     def in_flight(self) -> int:
@@ -138,9 +129,9 @@ class ReliableSender:
         """Queue one more message. The payload is kept, so it must not be a view of a buffer that changes."""
         self._unsent.append(Outgoing(self._next, stamp_ns, payload))
         self._next = self._next + 1 & SERIAL_MASK
-        self._bytes += len(payload)
+        self.pending_bytes += len(payload)
         count = len(self._sent) + len(self._unsent)
-        while count > self._depth or (self._bytes > self._max_bytes and count > 1):
+        while count > self._depth or (self.pending_bytes > self._max_bytes and count > 1):
             self._drop_oldest()
             count -= 1
 
@@ -186,7 +177,7 @@ class ReliableSender:
         Raises:
             RemoteProtocolError: ``sequence`` was never sent.
         """
-        ahead = sequence - self._acknowledged & SERIAL_MASK
+        ahead = sequence - self.confirmed & SERIAL_MASK
         if not self._linked or not 0 < ahead < SERIAL_HALF:
             return
         self._check(ahead, sequence, "acknowledges")
@@ -208,7 +199,7 @@ class ReliableSender:
         Raises:
             RemoteProtocolError: ``after`` was never sent, or is before the last acknowledgement; nothing has changed.
         """
-        ahead = serial_distance(self._acknowledged, after)
+        ahead = serial_distance(self.confirmed, after)
         self._check(ahead, after, "resumes")
         self.suspend()
         self._forget(ahead)
@@ -226,15 +217,15 @@ class ReliableSender:
         they may have arrived.
         """
         if self._linked:
-            self.resume(self._acknowledged)
+            self.resume(self.confirmed)
 
     def _sent_up_to(self, sequence: int) -> None:
         if sequence - self._highest & SERIAL_MASK < SERIAL_HALF:
             self._highest = sequence & SERIAL_MASK
 
     def _check(self, ahead: int, sequence: int, verb: str) -> None:
-        if ahead > self._highest - self._acknowledged & SERIAL_MASK:
-            known = f"sent up to {self._highest}, acknowledged up to {self._acknowledged}"
+        if ahead > self._highest - self.confirmed & SERIAL_MASK:
+            known = f"sent up to {self._highest}, acknowledged up to {self.confirmed}"
             raise RemoteProtocolError(f"a receiver {verb} message {sequence}, of those {known}")
 
     def _forget(self, ahead: int) -> None:
@@ -242,16 +233,16 @@ class ReliableSender:
 
         They may include unsent messages that the old link delivered after the receiver had reported its position.
         """
-        base = self._acknowledged
+        base = self.confirmed
         while self._dropped_in_flight and self._dropped_in_flight[0][0] - base & SERIAL_MASK <= ahead:
             self._in_flight_bytes -= self._dropped_in_flight.popleft()[1]
         while self._sent and self._sent[0].sequence - base & SERIAL_MASK <= ahead:
             size = len(self._sent.popleft().payload)
             self._in_flight_bytes -= size
-            self._bytes -= size
+            self.pending_bytes -= size
         while self._unsent and self._unsent[0].sequence - base & SERIAL_MASK <= ahead:
-            self._bytes -= len(self._unsent.popleft().payload)
-        self._acknowledged = base + ahead & SERIAL_MASK
+            self.pending_bytes -= len(self._unsent.popleft().payload)
+        self.confirmed = base + ahead & SERIAL_MASK
 
     def _drop_oldest(self) -> None:
         """Drop the oldest kept message; if it is in flight, it counts against the window until it is acknowledged."""
@@ -262,38 +253,19 @@ class ReliableSender:
             message = self._unsent.popleft()
             was_sent = not self._linked and not is_earlier(self._highest, message.sequence)
         size = len(message.payload)
-        self._bytes -= size
+        self.pending_bytes -= size
         if was_sent:
             self._dropped_in_flight.append((message.sequence, size))
         else:
             self.overflowed += 1
 
 
-@dataclass(frozen=True, slots=True)
-class ReceiveResult:
-    """What to do with a received message.
-
-    Args:
-        deliver: Whether to deliver it; if not, it was delivered before, or arrived too late.
-        gap: The number of messages directly before it that will never arrive.
-    """
-
-    deliver: bool
-    gap: int = 0
-
-
-DELIVER: Final = ReceiveResult(deliver=True)
-"""Deliver it; nothing is missing before it."""
-DUPLICATE: Final = ReceiveResult(deliver=False)
-"""Do not deliver it."""
-
-
 class ReliableReceiver:
     """The receiving half: accepts each message once, in order, and counts exactly the messages that never arrive.
 
     It outlives links. Only ``begin`` changes its epoch: a message of another epoch, received over a link that is
-    about to be closed, counts as a duplicate. If the sender's first sequence is not known, no gap is reported before
-    the first message.
+    about to be closed, is not a new one. If the sender's first sequence is not known, no gap is reported before the
+    first message.
 
     Args:
         epoch: The sender's, if known; else the first message's is taken.
@@ -307,12 +279,6 @@ class ReliableReceiver:
         self._unacknowledged = 0
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0
-        self.gap_total = 0
-        """The number of messages that will never arrive, over all epochs."""
-        self.duplicates = 0
-        """The number of messages that arrived again or too late, and were not delivered."""
-        self.breaks = 0
-        """How often one epoch followed another; the number of messages lost in between is unknown."""
 
     def position(self) -> tuple[int, int] | None:
         """``(epoch, last received sequence)`` for the sender's ``resume``; ``None`` if there is nothing to resume."""
@@ -320,22 +286,13 @@ class ReliableReceiver:
             return None
         return self._epoch, serial_add(self.next, -1)
 
-    def begin(self, epoch: int, first: int | None = None) -> bool:
-        """Handle a sender's announcement of its epoch and first sequence.
-
-        Returns:
-            Whether every loss is counted: the sender continues the present epoch, or is the first one. ``False``: an
-            unknown number of messages was lost between the two epochs.
-        """
-        if epoch == self._epoch:
-            if self.next is None:
-                self.next = first
-            return True
-        known = self._epoch is not None
-        self._epoch, self.next = epoch, first
-        self._unacknowledged = self._unacknowledged_bytes = 0
-        self.breaks += known
-        return not known
+    def begin(self, epoch: int, first: int | None = None) -> None:
+        """Handle a sender's announcement of its epoch and first sequence."""
+        if epoch != self._epoch:
+            self._epoch, self.next = epoch, first
+            self._unacknowledged = self._unacknowledged_bytes = 0
+        elif self.next is None:
+            self.next = first
 
     def skip(self, following: int) -> int:
         """Handle a sender's announcement of its next message; return how many before it will never arrive."""
@@ -343,38 +300,33 @@ class ReliableReceiver:
             return 0
         gap = serial_distance(self.next, following)
         self.next = following
-        self.gap_total += gap
         return gap
 
-    def judge(self, sequence: int, epoch: int) -> ReceiveResult:
+    def gap(self, sequence: int, epoch: int) -> int | None:
         """Return what ``accept`` would, without changing anything: for the first fragment of a message."""
-        if epoch != self._epoch:
-            return DELIVER if self._epoch is None else DUPLICATE
+        if epoch != self._epoch and self._epoch is not None:
+            return None
         gap = 0 if self.next is None else sequence - self.next & SERIAL_MASK
-        if not gap:
-            return DELIVER
-        return DUPLICATE if gap >= SERIAL_HALF else ReceiveResult(deliver=True, gap=gap)
+        return gap if gap < SERIAL_HALF else None
 
-    def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> ReceiveResult:
-        """Take in a complete message of ``size`` bytes, received at ``now`` (monotonic seconds)."""
-        if epoch != self._epoch:
-            if self._epoch is not None:
-                self.duplicates += 1
-                return DUPLICATE
+    def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> int | None:
+        """Take in a complete message of ``size`` bytes, received at ``now`` (monotonic seconds).
+
+        Returns:
+            The number of messages directly before it that will never arrive; ``None``: it is not to be delivered,
+            because it was delivered before, or arrived too late.
+        """
+        gap = self.gap(sequence, epoch)
+        if self._epoch is None:
             self._epoch = epoch
-        gap = 0 if self.next is None else sequence - self.next & SERIAL_MASK
-        if not self._unacknowledged:
-            self._unacknowledged_since = now
-        self._unacknowledged += 1
-        self._unacknowledged_bytes += size
-        if gap >= SERIAL_HALF:
-            self.duplicates += 1
-            return DUPLICATE
-        self.next = sequence + 1 & SERIAL_MASK
-        if not gap:
-            return DELIVER
-        self.gap_total += gap
-        return ReceiveResult(deliver=True, gap=gap)
+        if epoch == self._epoch:
+            if not self._unacknowledged:
+                self._unacknowledged_since = now
+            self._unacknowledged += 1
+            self._unacknowledged_bytes += size
+        if gap is not None:
+            self.next = sequence + 1 & SERIAL_MASK
+        return gap
 
     def due_ack(self, now: float) -> int | None:
         """The sequence to acknowledge now, which then counts as acknowledged; ``None`` if no acknowledgement is due.
@@ -402,13 +354,6 @@ class ReliableReceiver:
 _Key = TypeVar("_Key", bound=Hashable)
 
 
-@dataclass(slots=True)
-class _Parked:
-    sender: ReliableSender
-    until: float
-    size: int
-
-
 class ResumeTable(Generic[_Key]):
     """Suspended senders by their key, which names the receiver and the source; pure.
 
@@ -418,16 +363,13 @@ class ResumeTable(Generic[_Key]):
     """
 
     def __init__(self) -> None:
-        self._parked: OrderedDict[_Key, _Parked] = OrderedDict()
-        self._bytes = 0
+        self._parked: dict[_Key, tuple[ReliableSender, float]] = {}
+        """The senders, and when each leaves the table; the one that was parked longest first."""
+        self.pending_bytes = 0
+        """Bytes kept by all parked senders."""
 
     def __len__(self) -> int:
         return len(self._parked)
-
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes kept by all parked senders."""
-        return self._bytes
 
     def park(self, key: _Key, sender: ReliableSender, until: float) -> list[_Key]:
         """Suspend a sender and keep its messages for a while; one already parked under this key is replaced.
@@ -442,8 +384,8 @@ class ResumeTable(Generic[_Key]):
         """
         sender.suspend()
         self.claim(key)
-        self._parked[key] = _Parked(sender, until, sender.pending_bytes)
-        self._bytes += sender.pending_bytes
+        self._parked[key] = sender, until
+        self.pending_bytes += sender.pending_bytes
         return self._shrink()
 
     def offer(self, key: _Key, payload: bytes, stamp_ns: int) -> list[_Key]:
@@ -452,42 +394,43 @@ class ResumeTable(Generic[_Key]):
         Returns:
             The keys of senders that left the table for it.
         """
-        parked = self._parked.get(key)
-        if parked is None:
+        if key not in self._parked:
             return []
-        parked.sender.offer(payload, stamp_ns)
-        self._bytes += parked.sender.pending_bytes - parked.size
-        parked.size = parked.sender.pending_bytes
+        sender, _ = self._parked[key]
+        before = sender.pending_bytes
+        sender.offer(payload, stamp_ns)
+        self.pending_bytes += sender.pending_bytes - before
         return self._shrink()
 
     def claim(self, key: _Key) -> ReliableSender | None:
         """Take out a sender, still suspended; ``None`` if there is none."""
-        parked = self._parked.pop(key, None)
-        if parked is None:
+        if key not in self._parked:
             return None
-        self._bytes -= parked.size
-        return parked.sender
+        sender, _ = self._parked.pop(key)
+        self.pending_bytes -= sender.pending_bytes
+        return sender
 
     def limit(self, keys: Iterable[_Key], until: float) -> None:
         """Let the parked senders of these keys leave the table at ``until``, if not before."""
         for key in keys:
-            if (parked := self._parked.get(key)) is not None:
-                parked.until = min(parked.until, until)
+            if key in self._parked:
+                sender, before = self._parked[key]
+                self._parked[key] = sender, min(before, until)
 
     def expire(self, now: float) -> list[_Key]:
         """Take out the senders whose time is over; return their keys."""
-        keys = [key for key, parked in self._parked.items() if parked.until <= now]
+        keys = [key for key, (_, until) in self._parked.items() if until <= now]
         for key in keys:
             self.claim(key)
         return keys
 
     def next_timer(self) -> float | None:
         """When ``expire`` is due, in monotonic seconds."""
-        return min((parked.until for parked in self._parked.values()), default=None)
+        return min((until for _, until in self._parked.values()), default=None)
 
     def _shrink(self) -> list[_Key]:
         keys = []
-        while len(self._parked) > limits.RESUMES_MAX or self._bytes > limits.RESUME_BYTES_MAX:
+        while len(self._parked) > limits.RESUMES_MAX or self.pending_bytes > limits.RESUME_BYTES_MAX:
             keys.append(next(iter(self._parked)))
             self.claim(keys[-1])
         return keys

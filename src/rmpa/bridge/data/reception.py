@@ -273,19 +273,19 @@ class ImportFlow(DataHandler):
     def _accept(self, sequence: int, size: int) -> bool:
         """Whether a complete message is a new one. In any case a reliable one is acknowledged."""
         now = self._loop.time()
-        result = self._numbering.accept(sequence, self._epoch, now, size)
+        gap = self._numbering.accept(sequence, self._epoch, now, size)
         due = self._numbering.next_timer() if self._reliable else None
         if due is not None and due <= now:
             self._acknowledge(now)
         elif due is not None and self._ack_timer is None:
             self._ack_timer = self._loop.call_at(due, self._acknowledge, due)
-        if not result.deliver:
+        if gap is None:
             self._count("late")
             return False
         if self._sequence is not None:
             self.torn()  # its lane is gone, though this side has not noticed yet
-        if result.gap:
-            self._missing(result.gap)
+        if gap:
+            self._missing(gap)
         return True
 
     def _is_replay(self, framed: memoryview | bytearray) -> bool:
@@ -365,7 +365,7 @@ class ImportFlow(DataHandler):
         size = _PREFIX_SIZE + LENGTH.unpack_from(part)[0]
         if size > ros_limits.MESSAGE_MAX:
             raise LimitExceeded("message", size, ros_limits.MESSAGE_MAX)
-        if not self._numbering.judge(sequence, self._epoch).deliver:
+        if self._numbering.gap(sequence, self._epoch) is None:
             self._accept(sequence, 0)
             return
         self.torn()
