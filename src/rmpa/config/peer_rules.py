@@ -22,7 +22,6 @@ from rmpa.config.values import (
     SOME_PEER,
     TIMEOUT,
     TOPIC_GLOB,
-    TRANSPORT,
     TYPE_GLOB,
     BadValue,
     Place,
@@ -37,13 +36,13 @@ from rmpa.config.values import (
     text_type,
     word_of,
 )
+from rmpa.core.contract import Transport
 from rmpa.core.identity import NEVER_CROSSING, is_global_name, matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from rmpa.core.contract import Transport
-
+TRANSPORT: Final = member_of(Transport, "a transport")
 _WITH_PEER: Final = ("/**", f"/{PEER}/**")
 
 

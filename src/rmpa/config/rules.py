@@ -11,6 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
+from rmpa.config.peer_rules import TRANSPORT
 from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting, table
 from rmpa.config.values import (
     BOOL,
@@ -22,7 +23,6 @@ from rmpa.config.values import (
     RATE,
     TEXT,
     TOPIC_GLOB,
-    TRANSPORT,
     TYPE_GLOB,
     BadValue,
     Place,

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.config import limits
 from rmpa.core import limits as core_limits
-from rmpa.core.contract import Transport
 from rmpa.core.identity import peer_name_from, peer_name_problem
 
 if TYPE_CHECKING:
@@ -179,7 +178,6 @@ CORE_MODE: Final = word_of(
     "embedded: the agent's own; external: a roscore that runs already",
     "MODE",
 )
-TRANSPORT: Final = member_of(Transport, "a transport")
 
 # --- switches and numbers -------------------------------------------------------------------------------------------
 
