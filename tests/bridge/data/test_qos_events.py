@@ -44,7 +44,7 @@ def test_nothing_to_watch() -> None:
     watch = QosWatch(Contract(), 5.0)
     assert watch.next_timer() is None
     assert watch.handle_timer(1e9) == []
-    assert (watch.counts, list(watch.recent), watch.alive) == (Counter(), [], True)
+    assert (watch.counts, list(watch.recent)) == (Counter(), [])
     watch.link_down(6.0)
     assert watch.next_timer() is None
 
@@ -169,7 +169,7 @@ def test_a_silent_source_is_lost_and_comes_back() -> None:
     assert watch.next_timer() == 3.25 + limits.WATCH_LOOK
     watch.last = 3.375
     assert watch.handle_timer(3.5) == [QosEvent(QosEventKind.LIVELINESS_RESTORED, 1, "alive again after 500 ms", 3.5)]
-    assert watch.alive
+    assert watch._lost_since is None
     assert watch.next_timer() == 5.375
     assert watch.counts == {QosEventKind.LIVELINESS_LOST: 1, QosEventKind.LIVELINESS_RESTORED: 1}
 
@@ -185,7 +185,7 @@ def test_silence_is_reported_lost_and_restored_once(arrivals: list[float], lease
     lost = [event.now for event in timer.events if event.kind is QosEventKind.LIVELINESS_LOST]
     restored = [event.now for event in timer.events if event.kind is QosEventKind.LIVELINESS_RESTORED]
     assert lost == [before + lease for before, _ in silences]
-    assert len(restored) == len(lost) - (not watch.alive)
+    assert len(restored) == len(lost) - (watch._lost_since is not None)
     for (_, after), now in zip(silences, restored, strict=False):
         assert after <= now <= after + limits.WATCH_LOOK
 
@@ -213,7 +213,7 @@ def test_a_link_that_comes_and_goes_before_the_timer() -> None:
     watch.link_down(3.1)
     assert watch.next_timer() == 5.1
     assert [event.kind for event in watch.handle_timer(5.1)] == [QosEventKind.LIVELINESS_LOST]
-    assert not watch.alive
+    assert watch._lost_since is not None
     assert watch.next_timer() is None
 
 
@@ -279,7 +279,9 @@ def test_memory_is_bounded_and_counts_hold(steps: list[tuple[str, float]]) -> No
             assert event.now == now
         assert len(watch.recent) <= limits.WATCH_RECENT
     assert watch.counts == told
-    assert told[QosEventKind.LIVELINESS_LOST] - told[QosEventKind.LIVELINESS_RESTORED] == (not watch.alive)
+    assert told[QosEventKind.LIVELINESS_LOST] - told[QosEventKind.LIVELINESS_RESTORED] == (
+        watch._lost_since is not None
+    )
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,6 @@ class RouteSender:
         self._held: deque[tuple[int, int, bytes]] = deque()
         """Sequence, stamp and bytes of messages that wait until the lane has changed."""
         self._held_bytes = 0
-        self._open_message: QueuedMessage | None = None
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
         """Stamp and bytes of the message that down-sampling sends next."""
@@ -86,23 +85,15 @@ class RouteSender:
         self._newest = None
         return self._send(stamp_ns, framed)
 
-    def begin(self, stamp_ns: int, size: int) -> bool:
-        """Begin a message of ``size`` bytes; return whether it can be sent in parts; otherwise it must come whole."""
+    def begin(self, stamp_ns: int, size: int) -> tuple[LaneSender, QueuedMessage] | None:
+        """Begin a message of ``size`` bytes: return its lane, and the message there, to which its parts are added.
+
+        ``None``: it cannot be sent in parts, and must come whole.
+        """
         if self._downsampler is not None or not self._lane_for(size):
-            return False
+            return None
         self.sequence = self.sequence + 1 & SERIAL_MASK
-        self._open_message = self._lane.open(self.route, size, self.sequence, stamp_ns)
-        return True
-
-    def part(self, part: Buffer) -> int:
-        """Send a part of a message that was begun; return how many older messages were dropped for it."""
-        return self._lane.extend(self._open_message, part) if self._open_message is not None else 0
-
-    def abort(self) -> None:
-        """Abort the message that was begun: its rest will not come."""
-        if self._open_message is not None:
-            self._lane.abandon(self._open_message)
-            self._open_message = None
+        return self._lane, self._lane.open(self.route, size, self.sequence, stamp_ns)
 
     def fenced(self, number: int) -> None:
         """Take the peer's answer to a fence, and send what has waited over the new lane."""
@@ -233,9 +224,8 @@ class ReliableRouteSender(RouteSender):
             epoch,
         )
 
-    def begin(self, stamp_ns: int, size: int) -> bool:  # noqa: ARG002 - as the other kind
-        """Return ``False``: a message that may have to be sent again is needed whole."""
-        return False
+    def begin(self, stamp_ns: int, size: int) -> None:
+        """A message that may have to be sent again is needed whole."""
 
     def acknowledged(self, sequence: int) -> None:
         """Forget the messages up to ``sequence``, which the peer has, and send what the window allows."""
@@ -323,8 +313,8 @@ class ExportFlow:
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
         """Bytes and stamps of the last messages, for routes that are opened later."""
         self._keeping = False
-        self._streaming: list[RouteSender] = []
-        """The senders that pass on the present message in parts."""
+        self._streaming: dict[RouteSender, tuple[LaneSender, QueuedMessage]] = {}
+        """The senders that pass on the present message in parts, each with its lane."""
         self._whole: bytearray | None = None
         """The present message so far, where a sender or the history needs it whole."""
         self._size = self._received = self._stamp = 0
@@ -378,8 +368,7 @@ class ExportFlow:
         if sender is not None:
             sender.close()
             self._senders = tuple(self.by_peer.values())
-            if sender in self._streaming:
-                self._streaming.remove(sender)
+            self._streaming.pop(sender, None)
 
     def close(self) -> None:
         """Remove all peers, and free the kept messages, which may be large."""
@@ -405,13 +394,14 @@ class ExportFlow:
         self._stamp = time.time_ns()
         self._size, self._received = size, 0
         self.large = True
-        self._streaming = [sender for sender in self._senders if sender.begin(self._stamp, size)]
+        begun = ((sender, sender.begin(self._stamp, size)) for sender in self._senders)
+        self._streaming = {sender: opened for sender, opened in begun if opened is not None}
         self._whole = bytearray() if self._keeping or len(self._streaming) < len(self._senders) else None
 
     def part(self, part: memoryview) -> None:
         """Pass on a part of the message; ``part`` is valid during the call only."""
-        for sender in self._streaming:
-            self.dropped += sender.part(part)
+        for lane, message in self._streaming.values():
+            self.dropped += lane.extend(message, part)
         if self._whole is not None:
             self._whole += part
         self._received += len(part)
@@ -420,15 +410,14 @@ class ExportFlow:
 
     def abort(self) -> None:
         """Abort the message that comes in parts: the publisher closed its connection."""
-        for sender in self._streaming:
-            sender.abort()
-        self._streaming = []
-        self._whole = None
+        for lane, message in self._streaming.values():
+            lane.abandon(message)
+        self._streaming, self._whole = {}, None
 
     def _complete(self) -> None:
         self.messages += 1
         self.bytes += self._size
-        streamed, self._streaming = self._streaming, []
+        streamed, self._streaming = self._streaming, {}
         if self._whole is None:
             return
         whole, self._whole = bytes(self._whole), None

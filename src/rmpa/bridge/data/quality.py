@@ -110,11 +110,6 @@ class QosWatch:
         self._lost_since: float | None = None
         self._look = now  # when to look whether a lost source sends again
 
-    @property
-    def alive(self) -> bool:
-        """Whether the source was alive when it was judged last."""
-        return self._lost_since is None
-
     def lost(self, count: int, now: float) -> QosEvent:
         """Record ``count`` messages (at least one) that never came, as a gap in the sequence or the peer shows."""
         return self._happened(QosEventKind.MESSAGES_LOST, count, "{} lost", now)

@@ -289,10 +289,12 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
     assert not sender.begin(12, BIG), "and so is what comes before the fence is answered"
     sender.message(12, bytes(BIG))
     answer(link, sender)
-    assert sender.begin(13, BIG)
+    opened = sender.begin(13, BIG)
+    assert opened is not None
+    lane, message = opened
     link.drops.extend([1, 2])
-    assert sender.part(memoryview(bytes(BIG - 1))) == 1
-    assert sender.part(memoryview(b"z")) == 2
+    assert lane.extend(message, memoryview(bytes(BIG - 1))) == 1
+    assert lane.extend(message, memoryview(b"z")) == 2
     assert [(lane, number, len(payload)) for lane, number, payload in link.sent] == [
         ("bulk", 1, BIG),
         ("bulk", 2, BIG),
@@ -304,23 +306,23 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
 
 @pytest.mark.usefixtures("clock")
 def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
-    link = Link()
-    sender = best_effort(link, Contract(priority=Priority.HIGH))
-    assert sender.begin(0, BIG)
-    sender.part(bytes(BIG))
+    link, flow = Link(), ExportFlow()
+    flow.add(1, link, 7, Contract(priority=Priority.HIGH), 0)
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(BIG)))
     assert link.lanes == ["express"]
 
 
 @pytest.mark.usefixtures("clock")
 def test_aborted_message_uses_its_number() -> None:
-    link = Link()
-    sender = best_effort(link, large=True)
+    link, flow = Link(), ExportFlow()
+    flow.large = True
+    sender = flow.add(1, link, 7, Contract(), 0)
     answer(link, sender)
-    sender.begin(0, BIG)
-    sender.part(bytes(10))
-    sender.abort()
-    sender.abort()
-    assert sender.part(bytes(10)) == 0
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(10)))
+    flow.abort()
+    flow.abort()
     assert link.log[-2:] == [("bulk", "open", 7, 1, BIG), ("bulk", "abandon", 7, 1)]
     sender.message(0, LARGE)
     assert link.numbers == [2]
@@ -470,7 +472,7 @@ def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
     link = Link()
     sender = reliable(link)
     sender.message(0, SMALL)
-    assert not sender.begin(0, BIG)
+    sender.begin(0, BIG)
     sender.message(0, bytes(BIG))
     sender.message(0, SMALL)
     assert link.log == [("express", "message", 7, 1), ("express", "fence", 7, 1)]
