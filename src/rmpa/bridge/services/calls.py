@@ -311,7 +311,6 @@ class Serving:
         self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._offering = asyncio.Event()
 
     def start(self) -> None:
         """Begin to check that servers live."""
@@ -326,11 +325,6 @@ class Serving:
         for pool in pools:
             pool.close("the agent ends")
             await pool.closed()
-
-    def changed(self) -> None:
-        """Begin with the checks again, if services are offered now."""
-        if self._exports.offered:
-            self._offering.set()
 
     def probe(self, service: str, server: LocalService) -> None:
         """Ask a server for its types; the answer goes to the exports."""
@@ -410,14 +404,12 @@ class Serving:
     async def _look_after(self) -> None:
         """Find killed servers: a node with an offered service whose port has no listener is suspected."""
         while True:
-            if not self._exports.offered:
-                self._offering.clear()
-                await self._offering.wait()
-            servers = dict(self._exports.offered)
-            ports, here, cost = await asyncio.to_thread(_listening)
-            for service, server in yielding_to_data(list(servers.items())):
-                if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
-                    self._core.suspect(server.node)
+            servers, cost = list(self._exports.offered.items()), 0.0
+            if servers:
+                ports, here, cost = await asyncio.to_thread(_listening)
+                for service, server in yielding_to_data(servers):
+                    if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
+                        self._core.suspect(server.node)
             await sleep_to_tick(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
 
 

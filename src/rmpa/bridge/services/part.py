@@ -202,9 +202,6 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         if change.kind is RegistrationKind.SERVICE:
             self.look((change.name,))
 
-    def _settled(self) -> None:
-        self.serving.changed()
-
     def depends(self, session: PeerSession) -> bool:
         """As of ``GraphPart``; or whether nodes of this module have direct connections to the peer's."""
         return super().depends(session) or bool(self.direct_imports.called(session.peer))
