@@ -36,7 +36,8 @@ class Resolver:
         self.asked = 0
 
     async def __call__(self, host: str, port: int) -> list[tuple[str, int]]:
-        assert host == NAME
+        if host != NAME:
+            return [(host, port)]
         self.asked += 1
         if not self.knows:
             raise UnreachableError("machine", host, "the name does not resolve here (as asked)")
