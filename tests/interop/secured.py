@@ -52,7 +52,7 @@ class SecuredMesh:
 
     def _authority(self) -> MeshAuthority:
         store = self.store(self.authority)
-        return MeshAuthority.load(store, Membership.load(store, SystemClock(), time.time))
+        return MeshAuthority(Membership.load(store, SystemClock(), time.time))
 
     def add(self, *names: str) -> None:
         """Make modules members, as a join does, before their agents run."""
@@ -78,7 +78,7 @@ class SecuredMesh:
     @property
     def group_key(self) -> str:
         """The newest group key, hexadecimal: what a thief of a member's disk has."""
-        return self._authority()._membership.ring.newest.secret.hex()
+        return self._authority().membership.ring.newest.secret.hex()
 
 
 def foreign_files(home: Path, name: str) -> TrustStore:

@@ -120,8 +120,8 @@ class AgentTrust(Part):
         self.joins: JoinServer | None = None
         """The joins at the authority."""
         if membership.store.is_authority:
-            self.authority = MeshAuthority.load(membership.store, membership)
-            self.joins = JoinServer(self.authority, membership, clock, self.is_linked, bridge.counters)
+            self.authority = MeshAuthority(membership)
+            self.joins = JoinServer(self.authority, clock, self.is_linked, bridge.counters)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, random.random)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}

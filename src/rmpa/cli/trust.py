@@ -160,7 +160,7 @@ class TrustPlace:
             place = self.store.load_authority()
             where = f"do it at {place.name}" if place is not None and place.name else "do it at the authority"
             raise StartError(f"the module {self.name}", "is not the authority of its mesh", where)
-        return MeshAuthority.load(self.store, membership)
+        return MeshAuthority(membership)
 
 
 def find_place(name: str | None, file: str | None) -> TrustPlace:

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
     from ipaddress import IPv4Address
 
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     from rmpa.trust.certificates import CertificateRequest, ModuleCertificate
     from rmpa.trust.membership import Membership
     from rmpa.trust.store import TrustStore
@@ -64,28 +62,21 @@ class MeshAuthority:
     """Issues certificates and signs documents; writes what it changes at once.
 
     Args:
-        store: The files.
-        membership: This module's, which newer documents are given to.
-        ca_key: The CA's key.
+        membership: This module's, whose store has the CA's key, and which newer documents are given to.
 
     Raises:
         StartError: The CA's key is another one, or a file is broken.
     """
 
-    def __init__(self, store: TrustStore, membership: Membership, ca_key: ec.EllipticCurvePrivateKey) -> None:
-        self._store = store
-        self._membership = membership
-        self._ca_key = ca_key
-        if ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
+    def __init__(self, membership: Membership) -> None:
+        self.membership = membership
+        self._store = store = membership.store
+        self._ca_key = private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY)))
+        if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
             raise StartError(str(store.path(files_of.CA_KEY)), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
         self.book = store.load_tokens()
         """The tokens."""
-
-    @classmethod
-    def load(cls, store: TrustStore, membership: Membership) -> MeshAuthority:
-        """Read the files of the authority; errors as for the class."""
-        return cls(store, membership, private_key(store.load_ca_key(), str(store.path(files_of.CA_KEY))))
 
     @property
     def issued(self) -> tuple[Issued, ...]:
@@ -108,7 +99,7 @@ class MeshAuthority:
             ValueError: No module can have that name, or nothing can be reached at the address.
         """
         secret = os.urandom(limits.TOKEN_SECRET_BYTES)
-        token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self._membership.files.ca), secret)
+        token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self.membership.files.ca), secret)
         self.book.invite(token, name)
         self.save_tokens()
         return token
@@ -132,14 +123,14 @@ class MeshAuthority:
         Raises:
             StartError: The clock is not set.
         """
-        wall = self._membership.wall()
+        wall = self.membership.wall()
         if wall is None:
             raise StartError("the clock of this machine", "is not set", _CLOCK)
         return wall
 
     def _wall_for(self, name: str) -> float:
         """The time at which a certificate of a module is issued: behind its revocation, also in the same second."""
-        entry = next((entry for entry in self._membership.deny.entries if entry.name == name), None)
+        entry = next((entry for entry in self.membership.deny.entries if entry.name == name), None)
         return self.wall() if entry is None else max(self.wall(), entry.before + 1.0)
 
     def issue(self, request: bytes, name: str = "") -> tuple[CertificateRequest, bytes]:
@@ -160,7 +151,7 @@ class MeshAuthority:
         last = self._issued.get(asked.name)
         if name and last is not None and last.key not in (b"", asked.public_key):
             raise CertificateError(TrustReason.REVOKED, f"another module has joined as {name} since")
-        ca = self._membership.files.ca
+        ca = self.membership.files.ca
         hosts, wall = self._granted(asked), self._wall_for(asked.name)
         certificate = certificates.issue(asked, ca, self._ca_key, _serial(), wall, hosts=hosts)
         self._issued[asked.name] = _issued(asked.name, wall, asked.public_key, hosts)
@@ -172,7 +163,7 @@ class MeshAuthority:
     def grant(self, request: bytes, name: str = "") -> CertificateGrant:
         """A certificate, and what else a member has; arguments and errors as for ``issue``."""
         _, certificate = self.issue(request, name)
-        member = self._membership
+        member = self.membership
         return CertificateGrant(certificate, member.files.ca, member.files.keys, member.files.deny)
 
     def _granted(self, asked: CertificateRequest) -> tuple[str, ...]:
@@ -192,15 +183,15 @@ class MeshAuthority:
         Raises:
             CertificateError: It is of another CA, ended too long ago, or was revoked.
         """
-        member = self._membership
+        member = self.membership
         return certificates.verify(
             certificate, member.files.ca, self.wall(), deny=member.deny, grace=limits.RENEWAL_GRACE
         )
 
     def renew_own(self, hosts: Iterable[str] = ()) -> None:
         """Renew the certificate of the authority itself, with these hosts of its page; raises as ``issue``."""
-        _, certificate = self.issue(self._membership.request(hosts))
-        self._membership.renewed(certificate)
+        _, certificate = self.issue(self.membership.request(hosts))
+        self.membership.renewed(certificate)
 
     def has_issued(self, name: str, again: str = "") -> bool:
         """Whether a module of a name has a certificate that has not ended, be it present or not.
@@ -251,10 +242,10 @@ class MeshAuthority:
             ConfigError: It is this module, or no member is known by that name.
             StartError: The clock is not set, or a file cannot be written.
         """
-        if name == self._membership.name:
+        if name == self.membership.name:
             text = f"{name} is the authority itself"
             raise ConfigError("NAME", text, "a new authority is a new mesh: rmpa trust leave, rmpa trust init")
-        known = {*self._issued, *linked} - {self._membership.name}
+        known = {*self._issued, *linked} - {self.membership.name}
         if name not in known and not force:
             similar = did_you_mean(name, sorted(known))
             remedy = f"did you mean {similar}?" if similar else "rmpa trust status lists them"
@@ -274,8 +265,8 @@ class MeshAuthority:
             ValueError: No module can have that name, or the list is full.
         """
         last = self._issued.get(name)  # later than now, if the clock went back since
-        deny = self._membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
-        self._membership.accept_document(Document.DENY, sign(deny, self._ca_key))
+        deny = self.membership.deny.with_name(name, max(self.wall(), last.issued if last is not None else 0.0))
+        self.membership.accept_document(Document.DENY, sign(deny, self._ca_key))
         self._issued.pop(name, None)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
         unused = [each for each in self.book.invitations if not each.used_by]
@@ -297,7 +288,7 @@ class MeshAuthority:
         Args:
             revoking: Whether a module that has the keys before was revoked: from now on they only recognise.
         """
-        member = self._membership
+        member = self.membership
         ring, wall = member.ring, member.wall()
         key = GroupKey(ring.newest.number + 1, os.urandom(limits.GROUP_KEY_BYTES))
         keys = KeyList(

@@ -15,6 +15,7 @@ Errors::
 from __future__ import annotations
 
 import hashlib
+import inspect
 import ipaddress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -179,6 +180,7 @@ URN: Final = "urn:rmpa:"
 CURVE: Final = ec.SECP256R1()
 """The curve of all keys; browsers, which ``rmpa web`` serves, know it."""
 _PURPOSES: Final = (ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH)
+_USAGES: Final = tuple(inspect.signature(x509.KeyUsage).parameters)
 _UNREADABLE: Final = (
     ValueError,
     TypeError,
@@ -239,6 +241,20 @@ class ModuleCertificate:
         """When it should be renewed, seconds since 1970."""
         return self.issued + (self.expires - self.issued) * limits.RENEWAL_SHARE
 
+    def judge(self, wall: float | None, name: str = "", deny: DenyList | None = None, grace: float = 0.0) -> None:
+        """Check times, name and revocation; arguments and errors as for ``verify``."""
+        begin = self.issued - limits.CERTIFICATE_BACKDATE
+        if wall is not None and wall < begin:
+            text = f"the certificate of {self.name} begins in {begin - wall:.0f} s: one of the clocks is off"
+            raise CertificateError(TrustReason.CLOCK, text)
+        if wall is not None and wall > self.expires + grace:
+            text = f"the certificate of {self.name} ended {wall - self.expires:.0f} s ago"
+            raise CertificateError(TrustReason.EXPIRED, text)
+        if name and self.name != name:
+            raise CertificateError(TrustReason.NAME, f"the certificate is of {self.name}, not of {name}")
+        if deny is not None and deny.denies(self.name, self.issued):
+            raise CertificateError(TrustReason.REVOKED, f"{self.name} was revoked (deny list {deny.number})")
+
     def __str__(self) -> str:
         """``arm (certificate 1f0a…)``."""
         return f"{self.name} (certificate {self.serial:x})"
@@ -256,23 +272,36 @@ def make_ca(key: ec.EllipticCurvePrivateKey, label: str, serial: int, wall: floa
         serial: A random positive number of at most 159 bits.
         wall: Seconds since 1970.
     """
-    name = _name(f"RMPA {label}"[:64])
-    begin = _time(wall - limits.CERTIFICATE_BACKDATE)
-    usage = _key_usage(signs_certificates=True)
-    certificate = (
+    name, begin = _name(f"RMPA {label}"[:64]), _time(wall - limits.CERTIFICATE_BACKDATE)
+    end = _time(wall) + timedelta(seconds=limits.CA_LIFETIME)
+    certificate = _builder(name, name, key.public_key(), serial, begin, end, ca=True).sign(key, hashes.SHA256())
+    return certificate.public_bytes(serialization.Encoding.DER)
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
+    serial: int,
+    begin: datetime,
+    end: datetime,
+    *,
+    ca: bool,
+) -> x509.CertificateBuilder:
+    """What the certificates of CA and modules have alike."""
+    usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True, "key_cert_sign": ca, "crl_sign": ca}
+    return (
         x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
         .serial_number(serial)
         .not_valid_before(begin)
-        .not_valid_after(_time(wall) + timedelta(seconds=limits.CA_LIFETIME))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(usage, critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA256())
+        .not_valid_after(end)
+        .add_extension(x509.BasicConstraints(ca=ca, path_length=0 if ca else None), critical=True)
+        .add_extension(x509.KeyUsage(**usage), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
-    return certificate.public_bytes(serialization.Encoding.DER)
 
 
 def make_request(key: ec.EllipticCurvePrivateKey, name: str, hosts: Iterable[str] = ()) -> bytes:
@@ -320,19 +349,11 @@ def issue(
     authority = x509.load_der_x509_certificate(ca)
     key = _load_key(request.public_key)
     names = (*server_names(request.name), "127.0.0.1", *hosts)
+    begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + lifetime)
     certificate = (
-        x509.CertificateBuilder()
-        .subject_name(_name(request.name))
-        .issuer_name(authority.subject)
-        .public_key(key)
-        .serial_number(serial)
-        .not_valid_before(_time(wall - limits.CERTIFICATE_BACKDATE))
-        .not_valid_after(_time(wall + lifetime))
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        _builder(_name(request.name), authority.subject, key, serial, begin, end, ca=False)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
         .add_extension(_subject_alternative(request.name, names), critical=False)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
         .sign(ca_key, hashes.SHA256())
     )
@@ -382,23 +403,8 @@ def verify(
             these.
     """
     found = _read(data, ca)
-    if wall is not None:
-        _check_times(found, wall, grace)
-    if name and found.name != name:
-        raise CertificateError(TrustReason.NAME, f"the certificate is of {found.name}, not of {name}")
-    if deny is not None and deny.denies(found.name, found.issued):
-        raise CertificateError(TrustReason.REVOKED, f"{found.name} was revoked (deny list {deny.number})")
+    found.judge(wall, name, deny, grace)
     return found
-
-
-def _check_times(found: ModuleCertificate, wall: float, grace: float) -> None:
-    begin = found.issued - limits.CERTIFICATE_BACKDATE
-    if wall < begin:
-        text = f"the certificate of {found.name} begins in {begin - wall:.0f} s: one of the clocks is off"
-        raise CertificateError(TrustReason.CLOCK, text)
-    if wall > found.expires + grace:
-        text = f"the certificate of {found.name} ended {wall - found.expires:.0f} s ago"
-        raise CertificateError(TrustReason.EXPIRED, text)
 
 
 def _read(data: bytes, ca: bytes) -> ModuleCertificate:
@@ -511,20 +517,6 @@ def _subject_alternative(name: str, hosts: Iterable[str]) -> x509.SubjectAlterna
         except ValueError:
             names.append(x509.DNSName(host))
     return x509.SubjectAlternativeName(names)
-
-
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=True,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        encipher_only=False,
-        decipher_only=False,
-    )
 
 
 def _time(wall: float) -> datetime:

@@ -22,12 +22,12 @@ from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustReason,
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, join_context, member_context
 from rmpa.trust.tokens import (
     LENGTH,
+    TOKEN_PROBLEMS,
     CertificateGrant,
     Join,
     JoinMessage,
     JoinRefused,
     Renew,
-    TokenProblem,
     decode_message,
     encode_message,
     fingerprint_of,
@@ -44,16 +44,10 @@ if TYPE_CHECKING:
     from rmpa.runtime.tls import TlsHandshake
     from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.membership import Membership
-    from rmpa.trust.tokens import Invitation, Token
+    from rmpa.trust.tokens import Token
 
 _log = logging.getLogger(__name__)
 _READ = 16 * 1024
-_PROBLEMS = {
-    TokenProblem.TOKEN: "is unknown here",
-    TokenProblem.USED: "was used",
-    TokenProblem.LATE: "has ended",
-    TokenProblem.NAME: "is for another module",
-}
 
 
 class JoinServer:
@@ -61,7 +55,6 @@ class JoinServer:
 
     Args:
         authority: Issues the certificates.
-        membership: This module's.
         clock: Monotonic seconds.
         is_linked: Whether a member that is linked has a name.
         counters: Counts what is refused: ``trust.join_refused``, ``trust.renewal_refused``.
@@ -70,13 +63,11 @@ class JoinServer:
     def __init__(
         self,
         authority: MeshAuthority,
-        membership: Membership,
         clock: SystemClock,
         is_linked: Callable[[str], bool],
         counters: Counters,
     ) -> None:
         self._authority = authority
-        self._membership = membership
         self._clock = clock
         self._refusals = RefusalLog(_log, counters)
         self._is_linked = is_linked
@@ -132,7 +123,7 @@ class JoinServer:
         except CertificateError as error:
             refused = JoinRefused(error.reason.label, str(error))
         except StartError as error:
-            refused = JoinRefused("clock" if self._membership.wall() is None else "authority", str(error))
+            refused = JoinRefused("clock" if self._authority.membership.wall() is None else "authority", str(error))
         else:
             return grant
         return self._refuse(what, host, refused)
@@ -150,9 +141,10 @@ class JoinServer:
         invitation = book.find(asked.token)
         problem = book.judge(asked.token, name, authority.wall())
         # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
-        proof = proof_of(invitation.key if invitation is not None else b"", asked.request, self._server())
-        if problem is not None:
-            refused = JoinRefused(problem.value, f"{name} cannot join: the token {_PROBLEMS[problem]}")
+        server = self._authority.membership.files.certificate
+        proof = proof_of(invitation.key if invitation is not None else b"", asked.request, server)
+        if problem:
+            refused = JoinRefused(problem, f"{name} cannot join: the token {TOKEN_PROBLEMS[problem]}")
         elif not hmac.compare_digest(proof, asked.proof):
             refused = JoinRefused("token", "the request is not signed with the token's key")
         elif self._is_linked(name) or authority.has_issued(name, invitation.name if invitation is not None else ""):
@@ -167,9 +159,6 @@ class JoinServer:
         if invitation is not None:
             self._step(asked.token, "refused", name, refused)
         return self._refuse("join", host, refused)
-
-    def _server(self) -> bytes:
-        return self._membership.files.certificate
 
     # --- the user who invites ---------------------------------------------------------------------------------
 
@@ -356,8 +345,25 @@ def status_of(
         key=membership.ring.newest.number,
         deny_number=deny.number,
         revoked=tuple(sorted(entry.name for entry in deny.entries)),
-        members=_members(membership, authority, linked),
-        tokens=tuple(_token(each, wall) for each in authority.book.invitations) if authority is not None else (),
+        members=tuple(
+            MemberInfo(
+                name=each.name,
+                issued=each.issued,
+                expires=each.expires,
+                linked=None if linked is None else each.name in {*linked, membership.name},
+            )
+            for each in (authority.issued if authority is not None else ())
+        ),
+        tokens=tuple(
+            TokenInfo(
+                id=each.token_id.hex(),
+                state="used" if each.used_by else "ended" if wall is not None and wall >= each.expires else "open",
+                expires=each.expires,
+                name=each.name,
+                used_by=each.used_by,
+            )
+            for each in (authority.book.invitations if authority is not None else ())
+        ),
         problems=problems_of(membership, name),
     )
 
@@ -379,31 +385,3 @@ def problems_of(membership: Membership, authority_name: str = "") -> tuple[str, 
         text = f"the certificate of {membership.name} ends in {left / 3600:.0f} h, and could not be renewed"
         return (f"{text}: is {where} running and reachable?",)
     return ()
-
-
-def _members(
-    membership: Membership, authority: MeshAuthority | None, linked: Collection[str] | None
-) -> tuple[MemberInfo, ...]:
-    if authority is None:
-        return ()
-    return tuple(
-        MemberInfo(
-            name=each.name,
-            issued=each.issued,
-            expires=each.expires,
-            linked=None if linked is None else each.name in linked or each.name == membership.name,
-        )
-        for each in authority.issued
-    )
-
-
-def _token(invitation: Invitation, wall: float | None) -> TokenInfo:
-    ended = wall is not None and wall >= invitation.expires
-    state = "used" if invitation.used_by else "ended" if ended else "open"
-    return TokenInfo(
-        id=invitation.token_id.hex(),
-        state=state,
-        expires=invitation.expires,
-        name=invitation.name,
-        used_by=invitation.used_by,
-    )

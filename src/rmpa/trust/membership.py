@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CURVE, DenyList, KeyList, read_document
+from rmpa.trust.certificates import CURVE, DenyList, KeyList, ModuleCertificate, read_document
 from rmpa.trust.packets import KeyRing, PacketTrust
 from rmpa.trust.permissions import Document, TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK, member_context
@@ -144,20 +144,12 @@ class Membership:
             TrustError: It is malformed (``foreign``), not valid yet (``clock``), ``expired``, of another module
                 (``name``), or ``revoked``.
         """
-        wall = self.wall()
         if isinstance(certificate, bytes | bytearray):
-            certificates.verify(bytes(certificate), self.files.ca, wall, name=claimed or "", deny=self.deny)
+            certificates.verify(bytes(certificate), self.files.ca, self.wall(), name=claimed or "", deny=self.deny)
             return
         name, begin, expires = member_name(certificate), *_times(certificate)
-        if wall is not None and wall < begin:
-            text = f"the certificate of {name} begins in {begin - wall:.0f} s: one of the clocks is off"
-            raise TrustError(TrustReason.CLOCK, text)
-        if wall is not None and wall > expires:
-            raise TrustError(TrustReason.EXPIRED, f"the certificate of {name} ended {wall - expires:.0f} s ago")
-        if claimed is not None and claimed != name:
-            raise TrustError(TrustReason.NAME, f"the certificate is of {name}, not of {claimed}")
-        if self.deny.denies(name, begin + limits.CERTIFICATE_BACKDATE):
-            raise TrustError(TrustReason.REVOKED, f"{name} was revoked (deny list {self.deny.number})")
+        found = ModuleCertificate(name, 0, begin + limits.CERTIFICATE_BACKDATE, expires, b"")
+        found.judge(self.wall(), claimed or "", self.deny)
 
     def request(self, hosts: Iterable[str] = ()) -> bytes:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""

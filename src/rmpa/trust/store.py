@@ -438,38 +438,25 @@ _SHOWN = 5
 def check_open(
     trust: TrustSettings, state: Path | None, module: str, environ: Mapping[str, str], option: str = "--name"
 ) -> None:
-    """Check that a module without files of trust may start by its settings.
+    """Check that a module without files of trust may start, and that this is what the user wants.
 
     Args:
         trust: The settings: ``require`` forbids it, ``insecure`` permits it also beside other modules' keys.
-        state: As for ``check_open_start``, like those that follow.
-        module: Likewise.
-        environ: Likewise.
-        option: Likewise.
-
-    Raises:
-        StartError: It may not.
-    """
-    if trust.require:
-        problem = f"the module {module} has joined no secured mesh"
-        remedy = "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority"
-        raise StartError("trust.require", problem, remedy)
-    if not trust.insecure:
-        check_open_start(state, module, environ, option)
-
-
-def check_open_start(state: Path | None, module: str, environ: Mapping[str, str], option: str = "--name") -> None:
-    """Check that an open module is what the user wants.
-
-    Args:
         state: The state directory in use; ``None``: there is none.
         module: The module, which has no files of trust there.
         environ: Says where other state directories are.
         option: The command's option for a name, for errors.
 
     Raises:
-        StartError: Another module, or another state directory, has keys of a secured mesh; or it cannot be known.
+        StartError: It may not; or another module, or another state directory, has keys of a secured mesh, or it
+            cannot be known.
     """
+    if trust.require:
+        problem = f"the module {module} has joined no secured mesh"
+        remedy = "join one: rmpa trust join TOKEN, with a token of rmpa trust invite at the authority"
+        raise StartError("trust.require", problem, remedy)
+    if trust.insecure:
+        return
     here = modules_with_keys(state) if state is not None else []
     if here:
         start = [f"start as {name}: {option} {name}" for name in _startable(here, module)]

@@ -25,7 +25,6 @@ import hmac
 import re
 import struct
 from dataclasses import dataclass, field
-from enum import StrEnum
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
 
@@ -49,17 +48,13 @@ _TEXT: Final = re.compile(r"[a-z2-7]+")
 _REMEDY: Final = "copy it whole from the output of rmpa trust invite"
 
 
-class TokenProblem(StrEnum):
-    """Why a token is not taken; the value is the word for ``--json`` and counters."""
-
-    TOKEN = "token"  # noqa: S105 - a word, not a secret
-    """It is unknown at this authority, or was withdrawn."""
-    USED = "used"
-    """A module has joined with it."""
-    LATE = "late"
-    """Its time is over."""
-    NAME = "name"
-    """It is for another module."""
+TOKEN_PROBLEMS: Final = {
+    "token": "is unknown here",  # or was withdrawn
+    "used": "was used",
+    "late": "has ended",
+    "name": "is for another module",
+}
+"""Why a token is not taken: the word for the wire, ``--json`` and counters, and what is wrong with the token."""
 
 
 @dataclass(eq=False)
@@ -204,9 +199,6 @@ class TokenBook:
     def __init__(self, invitations: Iterable[Invitation] = ()) -> None:
         self._all = {invitation.token_id: invitation for invitation in invitations}
 
-    def __len__(self) -> int:
-        return len(self._all)
-
     @property
     def invitations(self) -> tuple[Invitation, ...]:
         """All that are remembered, for the file and ``rmpa trust status``."""
@@ -232,8 +224,8 @@ class TokenBook:
         """A token by its id; ``None`` if it is unknown."""
         return self._all.get(token_id)
 
-    def judge(self, token_id: bytes, name: str, wall: float) -> TokenProblem | None:
-        """Why a module may not join with a token; ``None``: it may.
+    def judge(self, token_id: bytes, name: str, wall: float) -> str:
+        """Why a module may not join with a token, a word of ``TOKEN_PROBLEMS``; empty: it may.
 
         Args:
             token_id: The token's.
@@ -242,19 +234,17 @@ class TokenBook:
         """
         invitation = self._all.get(token_id)
         if invitation is None:
-            return TokenProblem.TOKEN
+            return "token"
         if invitation.used_by:
-            return TokenProblem.USED
+            return "used"
         if wall >= invitation.expires:
-            return TokenProblem.LATE
-        if invitation.name and invitation.name != name:
-            return TokenProblem.NAME
-        return None
+            return "late"
+        return "name" if invitation.name not in ("", name) else ""
 
-    def use(self, token_id: bytes, name: str, wall: float) -> TokenProblem | None:
+    def use(self, token_id: bytes, name: str, wall: float) -> str:
         """Let a module join with a token, which then is used; return why not, as ``judge``."""
         problem = self.judge(token_id, name, wall)
-        if problem is None:
+        if not problem:
             invitation = self._all[token_id]
             invitation.used_by, invitation.key = name, b""
         return problem
@@ -337,7 +327,7 @@ class JoinRefused(msgspec.Struct, frozen=True, tag="refuse", tag_field="op"):
     """There is no certificate.
 
     Args:
-        reason: One word: of ``TokenProblem`` or ``TrustReason``, ``taken`` (a member has the name), or of a later
+        reason: One word: of ``TOKEN_PROBLEMS`` or ``TrustReason``, ``taken`` (a member has the name), or of a later
             release.
         text: What is wrong.
     """

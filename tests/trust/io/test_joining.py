@@ -60,8 +60,8 @@ class Lab:
         self.store = TrustStore(self.folder, "base")
         found_mesh(self.store, "base", "lab", WALL)
         self.base = Membership.load(self.store, self.clock, self.clock.wall)
-        self.authority = MeshAuthority.load(self.store, self.base)
-        self.server = JoinServer(self.authority, self.base, self.clock, self.taken.__contains__, Counters())
+        self.authority = MeshAuthority(self.base)
+        self.server = JoinServer(self.authority, self.clock, self.taken.__contains__, Counters())
 
     def invite(self, name: str = "", *, lifetime: float = 900.0) -> Token:
         return self.authority.invite(IPv4Address("127.0.0.1"), self.port, lifetime, name)
@@ -336,7 +336,7 @@ async def test_a_module_whose_name_another_one_has_by_now_renews_no_certificate(
             with pytest.raises(PeerRefused, match=r"another module has joined as arm.*\(revoked\); join again"):
                 await renew_at_authority(old, "127.0.0.1", lab.port)
         assert sum("refused a renewal by" in text for text in caplog.messages) == 1, "it does not fill the log"
-        again = MeshAuthority.load(lab.store, lab.base)
+        again = MeshAuthority(lab.base)
         with pytest.raises(CertificateError, match="another module has joined as arm"):
             again.issue(old.request(), "arm")
         await renew_at_authority(new, "127.0.0.1", lab.port)
@@ -432,4 +432,4 @@ def test_the_key_of_another_ca_is_an_error_of_the_start(lab: Lab, tmp_path: Path
     other = Lab(tmp_path / "other")
     lab.store.write(files_of.CA_KEY, other.store.load_ca_key())
     with pytest.raises(StartError, match=r"ca\.key: is not the key of ca\.crt"):
-        MeshAuthority.load(lab.store, lab.base)
+        MeshAuthority(lab.base)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.module_name import note_state_dir
+from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import StartError
-from rmpa.trust.store import TrustStore, check_open_start
+from rmpa.trust.store import TrustStore, check_open
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,7 +58,7 @@ def test_what_may_be_a_secured_module_never_counts_as_an_open_one(
     try:
         secured = TrustStore(state, module).exists
         if not secured:
-            check_open_start(state, module, {"HOME": str(tmp_path)})
+            check_open(TrustSettings(), state, module, {"HOME": str(tmp_path)})
     except StartError as error:
         assert error.remedy  # noqa: PT017 - either is right: secured, or an error
     else:
@@ -66,11 +67,11 @@ def test_what_may_be_a_secured_module_never_counts_as_an_open_one(
 
 def test_keys_of_another_name_are_named_with_what_to_do(tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path)}
-    check_open_start(tmp_path, "other", home)
+    check_open(TrustSettings(), tmp_path, "other", home)
     _keys(tmp_path)
     (tmp_path / "plain").mkdir()
     with pytest.raises(StartError) as error:
-        check_open_start(tmp_path, "other", home)
+        check_open(TrustSettings(), tmp_path, "other", home)
     text = str(error.value)
     assert "the module other: has no keys" in text
     assert f"beside keys of sec here in {tmp_path}" in text
@@ -85,15 +86,15 @@ def test_another_or_a_forgotten_state_directory_is_noticed(tmp_path: Path) -> No
     note_state_dir(home, data)
     for used in (usual, tmp_path / "third"):  # forgotten; and another one
         with pytest.raises(StartError, match=f"in {data}; start with RMPA_STATE_DIR={data} --name sec; or"):
-            check_open_start(used, "sec", home)
+            check_open(TrustSettings(), used, "sec", home)
     with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} --name sec"):
-        check_open_start(usual, "other", home)
+        check_open(TrustSettings(), usual, "other", home)
     _keys(usual)
     with pytest.raises(StartError, match=f"keys of sec in {usual}"):
-        check_open_start(tmp_path / "third", "sec", home)
+        check_open(TrustSettings(), tmp_path / "third", "sec", home)
     _keys(data, "arm")
     with pytest.raises(StartError, match=f"RMPA_STATE_DIR={data} --agent arm"):  # where its own keys are
-        check_open_start(tmp_path / "third", "arm", home, "--agent")
+        check_open(TrustSettings(), tmp_path / "third", "arm", home, "--agent")
 
 
 @pytest.mark.parametrize("environ", [{}, {"HOME": "/nonexistent", "SUDO_UID": str(os.geteuid())}])
@@ -102,20 +103,20 @@ def test_keys_in_the_home_directory_are_noticed_without_home_and_under_sudo(
 ) -> None:
     user = pwd.struct_passwd(("me", "x", os.geteuid(), 0, "", str(tmp_path), "/bin/sh"))
     monkeypatch.setattr(pwd, "getpwuid", {os.geteuid(): user}.__getitem__)
-    check_open_start(None, "other", environ)
+    check_open(TrustSettings(), None, "other", environ)
     _keys(tmp_path / ".local/state/rmpa")
     with pytest.raises(StartError, match="keys of sec in "):
-        check_open_start(None, "other", environ)
+        check_open(TrustSettings(), None, "other", environ)
 
 
 def test_a_directory_that_is_not_in_use_and_belongs_to_another_user_does_not_matter(tmp_path: Path) -> None:
     (tmp_path / "rmpa").write_text("")
-    check_open_start(tmp_path / "own", "m", {"XDG_STATE_HOME": str(tmp_path)})
+    check_open(TrustSettings(), tmp_path / "own", "m", {"XDG_STATE_HOME": str(tmp_path)})
 
 
 def test_a_gateway_is_not_told_to_start_as_the_module(tmp_path: Path) -> None:
     _keys(tmp_path)
     with pytest.raises(StartError) as error:
-        check_open_start(tmp_path, "sec_gateway", {"HOME": str(tmp_path)})
+        check_open(TrustSettings(), tmp_path, "sec_gateway", {"HOME": str(tmp_path)})
     assert "; let sec_gateway join: rmpa trust join TOKEN --name sec_gateway; or" in str(error.value)
     assert "--name sec;" not in str(error.value)

@@ -12,7 +12,7 @@ import pytest
 from rmpa.core.errors import StartError
 from rmpa.trust import limits, store
 from rmpa.trust.store import MemberFiles, TrustStore
-from rmpa.trust.tokens import Token, TokenProblem
+from rmpa.trust.tokens import Token
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -158,9 +158,9 @@ def test_tokens_survive_and_stay_used(trust: TrustStore) -> None:
     trust.save_tokens(book)
     again = trust.load_tokens()
     assert [each.key for each in again.invitations] == [token.key]
-    assert again.use(token.token_id, "arm", 0.0) is None
+    assert again.use(token.token_id, "arm", 0.0) == ""
     trust.save_tokens(again)
-    assert trust.load_tokens().use(token.token_id, "arm", 0.0) is TokenProblem.USED
+    assert trust.load_tokens().use(token.token_id, "arm", 0.0) == "used"
     assert b"s" * 16 not in trust.path(store.TOKENS).read_bytes()
     trust.write(store.TOKENS, b"{}")
     with pytest.raises(StartError, match=r"tokens.json: is broken: .*; remove it"):
