@@ -7,9 +7,8 @@ status texts differ.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
 from rmpa.ros import limits
 from rmpa.ros.master import parameters as params
@@ -18,7 +17,7 @@ from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.core.counters import Yielder
 
@@ -33,68 +32,44 @@ _DOES: Final = {
     RegistrationKind.SERVICE: "provides",
 }
 
-# --- checks of the Master API's parameters: they refuse what rosmaster answers with code -1 -------------------------
-#
-# They are stricter in one point: ``limits.PARAM_DEPTH_MAX`` bounds the namespaces in a parameter's name. Each is
-# called with ``(value, the parameter's name, caller id)`` and returns the value to use. It raises ``ValueError`` for
-# what the caller has to correct; the text names the parameter and the fault.
 
-Check: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
+def checked(name: str, value: XmlRpcValue, caller_id: str) -> XmlRpcValue:
+    """The value to use for a parameter of the Master API.
 
+    Refuses what rosmaster answers with code -1; stricter only in the number of a parameter's namespaces.
 
-def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Check
-    """Accept every value."""
-    return value
+    Args:
+        name: The parameter's name in the API, which tells its kind.
+        value: The value, as the caller gave it; names are resolved, URIs and types kept as they are.
+        caller_id: The caller's name.
 
-
-def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
-    """A string that is not empty."""
+    Raises:
+        ValueError: The caller has to correct the value; the text names the parameter and the fault.
+    """
+    if name in ("msg", "value") or (name == "subgraph" and value == ""):
+        return value
     if not isinstance(value, str) or not value:
         raise ValueError(f"{name} must be a non-empty string, not {brief(value)}")
-    return value
-
-
-def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """A parameter's name, resolved."""
-    resolved = resolve(text(value, name, caller_id), caller_id)
-    if resolved.count("/") > limits.PARAM_DEPTH_MAX:
+    match name:
+        case "caller_api" | "service_api":  # kept unchanged: roscpp recognises itself by the exact text
+            if not value.startswith(("http://", "rosrpc://")):
+                raise ValueError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
+            return value
+        case "topic_type":
+            if value != ANY_TYPE and value.count("/") != 1:
+                raise ValueError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
+            return value
+        case "name":
+            return value
+        case "topic" | "service" | "node":
+            if ":" in value or " " in value:
+                raise ValueError(f"{name} {brief(value)} is not a graph name: it has a colon or a space in it")
+            if value == "/" and name != "node":
+                raise ValueError(f"{name} cannot be the root namespace")
+    resolved = resolve(value, caller_id)
+    if name == "key" and resolved.count("/") > limits.PARAM_DEPTH_MAX:
         raise ValueError(f"{name} has more than {limits.PARAM_DEPTH_MAX} namespaces")
     return resolved
-
-
-def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """A graph name, resolved; one with a colon or a space is refused."""
-    given = text(value, name, caller_id)
-    if ":" in given or " " in given:
-        raise ValueError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
-    return resolve(given, caller_id)
-
-
-def resource(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """The name of a topic or service, resolved; not the root."""
-    resolved = node_name(value, name, caller_id)
-    if value == "/":
-        raise ValueError(f"{name} cannot be the root namespace")
-    return resolved
-
-
-def subgraph(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """A namespace, resolved, or the empty string for all."""
-    return resolve(text(value, name, caller_id), caller_id) if value != "" else ""
-
-
-def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
-    """A URI of a slave API or service, kept unchanged: roscpp recognises itself by the exact text."""
-    if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
-        raise ValueError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
-    return value
-
-
-def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Check
-    """``package/Name``, or ``*`` for any type."""
-    if not isinstance(value, str) or (value != ANY_TYPE and value.count("/") != 1):
-        raise ValueError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
-    return value
 
 
 class MasterApi:
@@ -135,21 +110,19 @@ class MasterApi:
         """
         if method not in self._methods:
             raise RosFault(1, f"this master has no method {brief(method)}; system.listMethods names them")
-        function, error_value, checks = self._methods[method]
-        if len(arguments) != 1 + len(checks):
-            wanted = ", ".join(["caller_id", *checks])
+        function, error_value, names = self._methods[method]
+        if len(arguments) != 1 + len(names.split()):
+            wanted = ", ".join(["caller_id", *names.split()])
             return RosReply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", error_value)
         caller_id, *rest = arguments
         if not isinstance(caller_id, str):
             return RosReply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", error_value)
         try:
-            checked = [
-                check(value, name, caller_id) for (name, check), value in zip(checks.items(), rest, strict=True)
-            ]
+            values = [checked(name, value, caller_id) for name, value in zip(names.split(), rest, strict=True)]
+            return function(caller_id, *values)
         except ValueError as error:
             _log.info("! %s: %s: %s", caller_id, method, error)
             return RosReply(ERROR, str(error), error_value)
-        return function(caller_id, *checked)
 
     def answer(self, method: str, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
         """Answer an XML-RPC call: one of the API's, ``system.listMethods`` or ``system.multicall``.
@@ -204,13 +177,8 @@ class MasterApi:
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
         if params.holds_nil(value, self._yielder):
-            text = "value is nil or contains one, which ROS does not have"
-            _log.info("! %s: setParam: %s", caller_id, text)
-            return RosReply(ERROR, text, 0)
-        try:
-            self.parameters.set(key, value)
-        except TypeError as error:
-            return RosReply(ERROR, str(error), 0)
+            raise ValueError("value is nil or contains one, which ROS does not have")
+        self.parameters.set(key, value)
         self.registrations.calls += params.updates(self._param_subscribers, key, value, caller_id, self._yielder)
         return RosReply(SUCCESS, f"set {key}", 0)
 
@@ -288,35 +256,31 @@ class MasterApi:
             tables.append([[key, list(nodes)] for key, nodes in providers])
         return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 
-    def _table(self) -> dict[str, tuple[Callable[..., RosReply], XmlRpcValue, dict[str, Check]]]:
+    def _table(self) -> dict[str, tuple[Callable[..., RosReply], XmlRpcValue, str]]:
         """Each method's function, the value in the reply of an error, and its parameters after ``caller_id``."""
-        topic: dict[str, Check] = {"topic": resource}
-        service: dict[str, Check] = {"service": resource, "service_api": uri}
-        typed: dict[str, Check] = {**topic, "topic_type": type_name, "caller_api": uri}
-        subscription: dict[str, Check] = {"caller_api": uri, "key": key}
         publisher, subscriber, provider = _DOES
         return {
-            "shutdown": (self._shutdown, 0, {"msg": anything}),
-            "getUri": (lambda _: RosReply(SUCCESS, "", self.uri), "", {}),
-            "getPid": (lambda _: RosReply(SUCCESS, "", self._pid), -1, {}),
-            "deleteParam": (self._delete_param, 0, {"key": key}),
-            "setParam": (self._set_param, 0, {"key": key, "value": anything}),
-            "getParam": (self._get_param, 0, {"key": key}),
-            "searchParam": (self._search_param, 0, {"key": text}),
-            "subscribeParam": (self._subscribe_param, 0, subscription),
-            "unsubscribeParam": (self._unsubscribe_param, 0, subscription),
+            "shutdown": (self._shutdown, 0, "msg"),
+            "getUri": (lambda _: RosReply(SUCCESS, "", self.uri), "", ""),
+            "getPid": (lambda _: RosReply(SUCCESS, "", self._pid), -1, ""),
+            "deleteParam": (self._delete_param, 0, "key"),
+            "setParam": (self._set_param, 0, "key value"),
+            "getParam": (self._get_param, 0, "key"),
+            "searchParam": (self._search_param, 0, "name"),
+            "subscribeParam": (self._subscribe_param, 0, "caller_api key"),
+            "unsubscribeParam": (self._unsubscribe_param, 0, "caller_api key"),
             # rosmaster puts the name into the status, and old clients read it.
-            "hasParam": (lambda _, key: RosReply(SUCCESS, key, self.parameters.has(key)), False, {"key": key}),
-            "getParamNames": (lambda _: RosReply(SUCCESS, "", list(self._yielder(self.parameters.names()))), [], {}),
-            "registerService": (partial(self._register, provider), 0, {**service, "caller_api": uri}),
-            "unregisterService": (partial(self._unregister, provider), 0, service),
-            "lookupService": (self._lookup_service, "", {"service": resource}),
-            "registerSubscriber": (partial(self._register, subscriber), [], typed),
-            "unregisterSubscriber": (partial(self._unregister, subscriber), 0, {**topic, "caller_api": uri}),
-            "registerPublisher": (partial(self._register, publisher), [], typed),
-            "unregisterPublisher": (partial(self._unregister, publisher), 0, {**topic, "caller_api": uri}),
-            "lookupNode": (self._lookup_node, "", {"node": node_name}),
-            "getPublishedTopics": (self._get_published_topics, 0, {"subgraph": subgraph}),
-            "getTopicTypes": (self._get_topic_types, [], {}),
-            "getSystemState": (self._get_system_state, [[], [], []], {}),
+            "hasParam": (lambda _, key: RosReply(SUCCESS, key, self.parameters.has(key)), False, "key"),
+            "getParamNames": (lambda _: RosReply(SUCCESS, "", list(self._yielder(self.parameters.names()))), [], ""),
+            "registerService": (partial(self._register, provider), 0, "service service_api caller_api"),
+            "unregisterService": (partial(self._unregister, provider), 0, "service service_api"),
+            "lookupService": (self._lookup_service, "", "service"),
+            "registerSubscriber": (partial(self._register, subscriber), [], "topic topic_type caller_api"),
+            "unregisterSubscriber": (partial(self._unregister, subscriber), 0, "topic caller_api"),
+            "registerPublisher": (partial(self._register, publisher), [], "topic topic_type caller_api"),
+            "unregisterPublisher": (partial(self._unregister, publisher), 0, "topic caller_api"),
+            "lookupNode": (self._lookup_node, "", "node"),
+            "getPublishedTopics": (self._get_published_topics, 0, "subgraph"),
+            "getTopicTypes": (self._get_topic_types, [], ""),
+            "getSystemState": (self._get_system_state, [[], [], []], ""),
         }

@@ -208,14 +208,14 @@ class Parameters:
             value: Stored without a copy; must not be changed afterwards.
 
         Raises:
-            TypeError: ``key`` is the root, and ``value`` is no dict.
+            ValueError: ``key`` is the root, and ``value`` is no dict.
         """
         if parts := _parts(key):
             self.tree = _changed(self.tree, parts, lambda namespace, name: namespace.update({name: value}))
         elif isinstance(value, dict):
             self.tree = value
         else:
-            raise TypeError("the root of the parameter tree can only be set to a dictionary")
+            raise ValueError("the root of the parameter tree can only be set to a dictionary")
 
     def delete(self, key: str) -> None:
         """Delete ``key``.
