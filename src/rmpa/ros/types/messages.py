@@ -110,7 +110,7 @@ class MessageType:
         try:
             return bytes(self._store.serialize_ros1(message, _inner(self.name)))
         except Exception:  # noqa: BLE001 - rosbags does not check values: the exception depends on the field
-            checked = self._make(self.name, self._attributes(self.name, message, ""), "")
+            checked = self._make(self.name, self._attributes(self.name, message, ""), "", deep=True)
             return bytes(self._store.serialize_ros1(checked, _inner(self.name)))
 
     def deserialize(self, raw: Buffer) -> Any:
@@ -165,8 +165,8 @@ class MessageType:
             return _learnt_store(self.name, self.specifications)
         return _known_store()
 
-    def _make(self, name: str, values: Any, path: str) -> object:
-        """A message object from plain values, or from one whose values its program set: each value is checked."""
+    def _make(self, name: str, values: Any, path: str, *, deep: bool = False) -> object:
+        """A message object from plain values; message objects in them are taken as they are, unless ``deep``."""
         fields = self.specifications[name].fields
         if getattr(values, "__msgtype__", None) == _inner(name):
             given: Mapping[str, object] = self._attributes(name, values, path)
@@ -186,7 +186,7 @@ class MessageType:
             raise MessageError(f"{path or name} has no field {min(map(_short, unknown))}; it has {_names(fields)}")
         within = f"{path}." if path else ""
         made: dict[str, Any] = {
-            _python_name(field.name): self._value(field, given.get(field.name), within + field.name)
+            _python_name(field.name): self._value(field, given.get(field.name), within + field.name, deep=deep)
             for field in fields
         }
         if not fields:
@@ -202,9 +202,9 @@ class MessageType:
         except AttributeError:
             raise MessageError(f"{path or name} is a message of {name}, not {_short(message)}") from None
 
-    def _value(self, field: Field, value: Any, path: str) -> object:
+    def _value(self, field: Field, value: Any, path: str, *, deep: bool) -> object:
         if not field.array:
-            return self._scalar(field, value, path)
+            return self._scalar(field, value, path, deep=deep)
         if isinstance(value, str) and field.type in ("uint8", "char"):
             value = list(_text(value, path).encode())
         items = [] if value is None else value
@@ -220,15 +220,20 @@ class MessageType:
         items = items or [None] * (field.size or 0)
         if field.size is not None and len(items) != field.size:
             raise MessageError(f"{path} has {field.size} elements, not {len(items)}")
-        made = [self._scalar(field, item, path) for item in items]
+        made = [self._scalar(field, item, path, deep=deep) for item in items]
         return _numbers(field, made, len(made)) if is_numbers else made
 
-    def _scalar(self, field: Field, value: Any, path: str) -> object:
-        if field.type in _TIMES:
+    def _scalar(self, field: Field, value: Any, path: str, *, deep: bool) -> object:
+        is_time = field.type in _TIMES
+        if is_time or not field.primitive:
+            inner = _TIMES[field.type] if is_time else _inner(field.type)
+            if not deep and getattr(value, "__msgtype__", None) == inner:
+                return value
+        if is_time:
             secs, nsecs = _time(field.type, value, path)
             return self._store.types[_TIMES[field.type]](sec=secs, nanosec=nsecs)
         if not field.primitive:
-            return self._make(field.type, value, path)
+            return self._make(field.type, value, path, deep=deep)
         if not isinstance(value, bool | int | float | str | list | dict | None) and hasattr(value, "item"):
             value = value.item()  # numpy's
         return _primitive(field.type, value, path)
@@ -261,12 +266,7 @@ class HeaderNumbers:
     """
 
     def __init__(self, kind: MessageType) -> None:
-        first = kind.fields[0] if kind.fields else None
-        self._has_header = first is not None and (first.type, first.name, first.array) == (
-            "std_msgs/Header",
-            "header",
-            False,
-        )
+        self._has_header = kind.fields[:1] == (Field("header", "std_msgs/Header"),)
         self._numbers = itertools.count(1)  # of threads that publish at one time, each gets its own
 
     def stamp(self, payload: Buffer) -> Buffer:

@@ -193,7 +193,7 @@ class ParamMirror:
         else:
             try:
                 self._parameters.set(key, value)
-            except TypeError as error:
+            except ValueError as error:
                 _log.debug("! the master tells %s for %s: %s", type(value).__name__, key, error)
 
     def _remove(self, key: str) -> None:
