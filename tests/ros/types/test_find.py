@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
@@ -229,13 +229,13 @@ class Looks:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.walks = 0
         self.now = 1000.0
-        read = installed._entries_of
+        walk = os.walk
 
-        def counted(*args: Any) -> tuple[set[str], set[str]]:
+        def counted(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
             self.walks += 1
-            return read(*args)
+            return walk(str(folder))
 
-        monkeypatch.setattr(installed, "_entries_of", counted)
+        monkeypatch.setattr(os, "walk", counted)
         monkeypatch.setattr(header_types, "monotonic", lambda: self.now)
 
 

@@ -300,7 +300,8 @@ class ExternalCore(Core):
                 self._next_poll = self._loop.time() + limits.MASTER_LOOK_MAX
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
-                self._recheck_dead()
+                if self._mirror.dead and (self._revival is None or self._revival.done()):
+                    self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
             if self._problem or not self._writes:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout_at(self._next_poll):
@@ -408,7 +409,9 @@ class ExternalCore(Core):
         survey = await self._completed(survey)
         if self._ending:
             return True
-        self._found()
+        if self._problem and self._task is not None:
+            _log.warning("= the roscore at %s answers", self.uri)
+        self._problem = ""
         self._take(survey, seen)
         return True
 
@@ -451,12 +454,6 @@ class ExternalCore(Core):
     def _report_changes(self) -> None:
         self.report(yielding_to_data(self._mirror.take_changes()))
 
-    def _found(self) -> None:
-        if self._problem:
-            if self._task is not None:
-                _log.warning("= the roscore at %s answers", self.uri)
-            self._problem = ""
-
     def _lost(self, error: RmpaError) -> None:
         problem = str(error)
         if not self._problem or self._task is None:
@@ -468,10 +465,6 @@ class ExternalCore(Core):
         self.counters.add("node.dead")
         self._mirror.mark_dead(node, api)
         self._report_changes()
-
-    def _recheck_dead(self) -> None:
-        if self._mirror.dead and (self._revival is None or self._revival.done()):
-            self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
 
     async def _revive(self, dead: Mapping[str, str]) -> None:
         """Check whether nodes that were taken for dead accept connections, and restore those that do."""

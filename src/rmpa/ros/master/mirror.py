@@ -12,7 +12,9 @@ the URI shows that a node was restarted.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+
+import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -35,6 +37,7 @@ REGISTRATIONS: Final = {
 }
 """The methods that ``Mirror.apply`` accepts, and what they register."""
 
+_V = TypeVar("_V")
 Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
 """A method of the Master API and its parameters."""
 Entry: TypeAlias = tuple[RegistrationKind, str, str]
@@ -96,8 +99,11 @@ def read_survey(
     if not isinstance(state, list) or len(state) != len(_KINDS):
         raise RemoteProtocolError(f"the master's system state is not three lists: {brief(state)}")
     return Survey(
-        {kind: _holders(table, yielder) for kind, table in zip(_KINDS, state, strict=True)},
-        dict(yielder(_pairs(types))),
+        {
+            kind: _table(table, tuple[str, tuple[str, ...]], yielder)
+            for kind, table in zip(_KINDS, state, strict=True)
+        },
+        _table(types or [], tuple[str, str], yielder),
         f"{pid} {run_id}",
         *read_lookups(answer[len(_HEAD) + 1 :], nodes, services, yielder=yielder),
     )
@@ -130,22 +136,11 @@ def _value(answer: XmlRpcValue) -> XmlRpcValue:
     return None
 
 
-def _holders(table: XmlRpcValue, yielder: Yielder) -> dict[str, tuple[str, ...]]:
-    found: dict[str, tuple[str, ...]] = {}
-    for entry in yielder(table) if isinstance(table, list) else ():
-        match entry:
-            case [str(key), list(nodes)]:
-                found[key] = tuple(node for node in nodes if isinstance(node, str))
-            case _:
-                raise RemoteProtocolError(f"the master's system state has {brief(entry)} in it")
-    return found
-
-
-def _pairs(types: XmlRpcValue) -> Iterable[tuple[str, str]]:
-    for entry in types if isinstance(types, list) else ():
-        match entry:
-            case [str(topic), str(type_name)]:
-                yield topic, type_name
+def _table(rows: Any, row_type: type[tuple[str, _V]], yielder: Yielder) -> dict[str, _V]:
+    try:
+        return dict(msgspec.convert(row, row_type) for row in yielder(rows))
+    except (msgspec.ValidationError, TypeError) as error:
+        raise RemoteProtocolError(f"the master's answer is malformed: {error}") from None
 
 
 def _register(entry: Entry, api: str, detail: str) -> Call:

@@ -156,18 +156,15 @@ def leaves(key: str, value: _V) -> Iterator[tuple[str, _V]]:
 
 def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:
     """Whether a value is or contains nil, at any depth; ROS has no nil, and no response with one can be written."""
-    return any(part is None for part in yielder(_all_parts(value)))
-
-
-def _all_parts(value: XmlRpcValue) -> Iterator[XmlRpcValue]:
     waiting = [value]
-    while waiting:
-        part = waiting.pop()
-        yield part
-        if isinstance(part, dict):
-            waiting.extend(part.values())
-        elif isinstance(part, list | tuple):
-            waiting.extend(part)
+
+    def parts() -> Iterator[XmlRpcValue]:
+        while waiting:
+            yield (part := waiting.pop())
+            if isinstance(part, dict | list | tuple):
+                waiting.extend(part.values() if isinstance(part, dict) else part)
+
+    return any(part is None for part in yielder(parts()))
 
 
 class Parameters:

@@ -191,22 +191,21 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
     what = "message type" if kind == "msg" else "service type"
     if not is_type_name(name):
         raise DefinitionError(name[:80], "is not a type's name", "write it like std_msgs/String", what)
-    package = name.partition("/")[0]
+    package, _, base = name.partition("/")
     ours = known_types() if kind == "msg" else known_services()
-    ours_too = any(each.startswith(f"{package}/") for each in ours)
+    siblings = {each for each in ours if each.startswith(f"{package}/")}
     folders, names = definitions_of(package, path, kind)
     if folders:
         problem = f"is not in package {package} ({', '.join(map(str, folders))})"
-    elif ours_too:
+    elif siblings:
         problem = f"is not in package {package} as it comes with rmpa"
     else:
         problem = "is not known here"
-    there = {f"{package}/{base}" for base in names}.union(each for each in ours if each.startswith(f"{package}/"))
-    base = name.partition("/")[2]
+    there = siblings.union(f"{package}/{each}" for each in names)
     near = did_you_mean(name, there or [each for each in ours if each.endswith(f"/{base}")])
-    guess = f"did you mean {near}? Else " if near else ""
+    remedy = (f"did you mean {near}? Else " if near else "") + _REMEDIES[kind]
     problem += f"; looked in {path}, and at what comes with rmpa"
-    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, fetchable=not ours_too)
+    raise UnknownTypeError(name, problem, remedy, what, fetchable=not siblings)
 
 
 # Finds the message type of a connection header; results are cached, so it can be called for each message.

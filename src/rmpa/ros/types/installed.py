@@ -7,7 +7,6 @@ Pure. A file has a goal, a result and a feedback, separated by lines ``---`` (wi
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
 import re
@@ -195,7 +194,9 @@ def packages_below(root: str) -> tuple[dict[str, tuple[Path, ...]], bool]:
         if not waiting or room <= 0:
             break
         folder, depth = waiting.popleft()
-        files, inner = _entries_of(folder, seen, room)
+        if _is_known(folder, seen):
+            continue
+        _, inner, files = next(os.walk(folder), ("", [], []))
         room -= len(files) + len(inner)
         if "CATKIN_IGNORE" in files:
             continue
@@ -205,7 +206,7 @@ def packages_below(root: str) -> tuple[dict[str, tuple[Path, ...]], bool]:
             (packages if manifest else loose).append((name, folder))
         if manifest or "rospack_nosubdirs" in files:
             continue
-        below = sorted(name for name in inner - DEFINITIONS if not name.startswith("."))
+        below = sorted(name for name in inner if name not in DEFINITIONS and not name.startswith("."))
         if depth < limits.PACKAGE_DEPTH_MAX:
             waiting += [(folder / name, depth + 1) for name in below]
         else:
@@ -216,18 +217,15 @@ def packages_below(root: str) -> tuple[dict[str, tuple[Path, ...]], bool]:
     return folders, whole and not waiting
 
 
-def _entries_of(folder: Path, seen: set[tuple[int, int]], most: int) -> tuple[set[str], set[str]]:
-    """The names of a folder's files and folders; empty if it was searched before or cannot be read."""
-    files: set[str] = set()
-    folders: set[str] = set()
-    with contextlib.suppress(OSError):
+def _is_known(folder: Path, seen: set[tuple[int, int]]) -> bool:
+    """Whether a folder was searched before, by another name, or cannot be read; it is noted."""
+    try:
         about = folder.stat()
-        if (about.st_dev, about.st_ino) not in seen:
-            seen.add((about.st_dev, about.st_ino))
-            with os.scandir(folder) as entries:
-                for entry in islice(entries, most):
-                    (folders if _is_folder(entry) else files).add(entry.name)
-    return files, folders
+    except OSError:
+        return True
+    known = (about.st_dev, about.st_ino) in seen
+    seen.add((about.st_dev, about.st_ino))
+    return known
 
 
 def package_folders(package: str, root: str) -> Iterator[Path]:
@@ -249,13 +247,6 @@ def _is_package(folder: Path, package: str) -> bool:
             return _declared_name(folder) == package
         return (folder / "manifest.xml").exists()
     except OSError:
-        return False
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # a symbolic link to itself
         return False
 
 
