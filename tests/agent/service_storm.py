@@ -20,7 +20,8 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.settings import Multicast, ServiceSettings, Settings
+from rmpa.config.settings import ServiceSettings, Settings
+from rmpa.config.values import Multicast
 from rmpa.ros.wire.tcpros import encode_header, parse_service_uri
 from rmpa.runtime.loop import AgentLoop
 from tests.agent.test_agent import running

@@ -15,7 +15,9 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.bridge import limits
-from rmpa.config.settings import Multicast, PolicySettings, Settings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import Settings
+from rmpa.config.values import Multicast
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import proxied_node
 from rmpa.observe.control_client import ControlClient

@@ -6,7 +6,8 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.config.settings import Multicast, Settings
+from rmpa.config.settings import Settings
+from rmpa.config.values import Multicast
 from rmpa.core.contract import ContractRule
 from rmpa.observe.control_client import ControlClient
 from rmpa.observe.health import TOPIC

@@ -27,7 +27,9 @@ import pytest
 
 from rmpa.agent.agent import Agent
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import Settings
+from rmpa.config.values import Multicast
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind

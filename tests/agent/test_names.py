@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.settings import PeerRule, PolicySettings, Settings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.contract import ContractRule
 from tests.agent.test_agent import Sink, node, running, settings, until
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import TopicInfo
 
 __all__ = ["settings"]  # the fixture

@@ -11,7 +11,8 @@ import msgspec
 import pytest
 
 from rmpa.bridge.nodes import NODES, Nodes
-from rmpa.config.settings import NodeSettings, PeerRule, PolicySettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import NodeSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeFacts, NodePing, PeerNodes

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.agent.agent import Agent
-from rmpa.config.settings import Multicast, Settings
+from rmpa.config.settings import Settings
+from rmpa.config.values import Multicast
 from rmpa.observe.control_client import ControlClient
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import call_api

@@ -17,9 +17,10 @@ import pytest
 
 from rmpa.agent import process as reload
 from rmpa.agent.process import Reloader
-from rmpa.config.peer_rules import ModuleGroup, PermissionRule
+from rmpa.config.peer_rules import ModuleGroup, PeerRule, PermissionRule, PolicySettings
 from rmpa.config.read import Loaded, load_settings
-from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings, TrustSettings
+from rmpa.config.settings import Settings, TrustSettings
+from rmpa.config.values import HostPort
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
 

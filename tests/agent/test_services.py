@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.messages import ServiceOffer
-from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings, Settings
+from rmpa.config.peer_rules import PeerRule, ServiceRule
+from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint

@@ -10,7 +10,8 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition
 from rmpa.bridge.policy import Needs
-from rmpa.config.settings import ServiceRule, ServiceSettings
+from rmpa.config.peer_rules import ServiceRule
+from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import PeerRefused
 from rmpa.ros.node.service_client import ServiceConnection

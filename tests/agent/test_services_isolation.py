@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.config.settings import PeerRule, ServiceSettings
+from rmpa.config.peer_rules import PeerRule
+from rmpa.config.settings import ServiceSettings
 from tests.agent.test_isolation import (
     NODES,
     World,

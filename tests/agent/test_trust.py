@@ -16,7 +16,8 @@ pytest.importorskip("cryptography")
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.trust import RENEW, AgentTrust, trust_store
-from rmpa.config.settings import Multicast, Settings, TrustSettings, WebSettings
+from rmpa.config.settings import Settings, TrustSettings, WebSettings
+from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.trust import limits

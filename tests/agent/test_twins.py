@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.config.settings import PeerRule, Settings
+from rmpa.config.peer_rules import PeerRule
 from tests.agent.test_agent import Sink, node, running, settings, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
+    from rmpa.config.settings import Settings
     from rmpa.ros.node.endpoints import Publisher
 
 __all__ = ["settings"]  # the fixture

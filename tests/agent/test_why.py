@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.offers import CONFLICT
-from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import CheckLevel

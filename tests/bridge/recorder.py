@@ -10,7 +10,8 @@ from rmpa.bridge.services import exports as service_exports
 from rmpa.bridge.services import imports as service_imports
 from rmpa.bridge.topics import exports as topic_exports
 from rmpa.bridge.topics import imports as topic_imports
-from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings, Settings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import LimitSettings, ServiceSettings, Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Contracts
 

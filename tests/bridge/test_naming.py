@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge.context import Names, PeerNames
-from rmpa.config.settings import PeerRule, Settings
+from rmpa.config.peer_rules import PeerRule
+from rmpa.config.settings import Settings
 
 ROBOT = PeerRule(
     "robot*",

@@ -24,7 +24,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.imports import RouteState
-from rmpa.config.settings import PolicySettings
+from rmpa.config.peer_rules import PolicySettings
 from tests.bridge.recorder import (
     AddRoute,
     Connect,

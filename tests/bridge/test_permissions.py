@@ -24,8 +24,8 @@ from rmpa.bridge.offers import DENIED
 from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.config.peer_rules import Access, Effect, PermissionRule
-from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, TimeSettings, TrustSettings
+from rmpa.config.peer_rules import Access, Effect, PeerRule, PermissionRule, PolicySettings
+from rmpa.config.settings import ServiceSettings, TimeSettings, TrustSettings
 from rmpa.core.contract import Contract, Contracts
 from rmpa.core.counters import Counters
 from rmpa.ros.wire.tcpros import ServiceDescription

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge.policy import Policy
-from rmpa.config.settings import PolicySettings
+from rmpa.config.peer_rules import PolicySettings
 from rmpa.core.identity import NEVER_CROSSING
 
 

@@ -17,7 +17,8 @@ from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, d
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths, may_have
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.config.settings import PolicySettings, ServiceSettings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import ServiceSettings
 from tests.bridge.recorder import (
     Exports,
     Imports,

@@ -27,7 +27,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.imports import RouteState
-from rmpa.config.settings import PeerRule, PolicySettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 from tests.bridge.recorder import (
     AddRoute,

@@ -10,7 +10,8 @@ from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, Mismatch, Source, TopicOffer
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.config.settings import PolicySettings, TimeSettings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import TimeSettings
 from rmpa.core.contract import Contracts
 from tests.bridge.recorder import Exports, Imports, Publish, Retract, Send, Warn
 

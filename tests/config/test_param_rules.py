@@ -9,8 +9,8 @@ import pytest
 
 from rmpa.config import limits
 from rmpa.config.read import Loaded, load_settings
-from rmpa.config.rules import overlap, untouchable
-from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
+from rmpa.config.rules import FollowRule, overlap, untouchable
+from rmpa.config.settings import ParamSettings, TimeSettings
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.read import Loaded, load_settings
-from rmpa.config.settings import PeerRule, PolicySettings
 from rmpa.core.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,8 @@ from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
 from rmpa.config.read import load_settings
 from rmpa.config.reference import SCHEMA_FILE, json_schema, json_value, schema_text, with_settings_tables
-from rmpa.config.settings import SETTINGS, TABLES, Multicast
+from rmpa.config.settings import SETTINGS, TABLES
+from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
 

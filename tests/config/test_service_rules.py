@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.read import load_settings
-from rmpa.config.settings import ServiceRule, ServiceSettings
+from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
 from rmpa.core.errors import ConfigError
 

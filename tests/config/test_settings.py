@@ -12,21 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.config import limits
+from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.read import Loaded, find_config_file, line_of, load_settings, parse_config
+from rmpa.config.rules import GatewaySettings, Ros2Settings
 from rmpa.config.settings import (
     SETTINGS,
-    GatewaySettings,
-    HostPort,
     LaneSettings,
     LimitSettings,
-    Multicast,
-    PolicySettings,
     RealtimeSettings,
-    Ros2Settings,
     Settings,
     TrustSettings,
     WebSettings,
 )
+from rmpa.config.values import HostPort, Multicast
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError

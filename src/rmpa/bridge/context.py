@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.policy import PermissionGate
-    from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings
+    from rmpa.config.peer_rules import PeerRule, ServiceRule
+    from rmpa.config.settings import ServiceSettings
     from rmpa.core.contract import Contracts, Transport
 
 

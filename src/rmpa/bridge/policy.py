@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.bridge.messages import Source
-    from rmpa.config.peer_rules import Access
-    from rmpa.config.settings import PeerRule, PolicySettings, TrustSettings
+    from rmpa.config.peer_rules import Access, PeerRule, PolicySettings
+    from rmpa.config.settings import TrustSettings
     from rmpa.core.identity import Identity
     from rmpa.trust.permissions import Permissions
 

@@ -23,7 +23,7 @@ from rmpa.config.peer_rules import (
     PolicySettings,
     ServiceRule,
 )
-from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, CrossingRule, FollowRule, GatewaySettings, Ros2Settings
+from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
 from rmpa.config.schema import setting, settings_of, table
 from rmpa.config.values import (
     BOOL,
@@ -62,32 +62,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.core.contract import ContractRule
-
-__all__ = [
-    "SETTINGS",
-    "TABLES",
-    "CrossingRule",
-    "FollowRule",
-    "GatewaySettings",
-    "HostPort",
-    "LaneSettings",
-    "LimitSettings",
-    "ModuleGroup",
-    "Multicast",
-    "NodeSettings",
-    "ParamSettings",
-    "PeerRule",
-    "PermissionRule",
-    "PolicySettings",
-    "RealtimeSettings",
-    "Ros2Settings",
-    "ServiceRule",
-    "ServiceSettings",
-    "Settings",
-    "TimeSettings",
-    "TrustSettings",
-    "WebSettings",
-]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import AdvertiseServices, ServiceOffer
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
-from rmpa.config.settings import LimitSettings, PeerRule, PolicySettings, ServiceSettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import LimitSettings, ServiceSettings
 from tests.bridge.recorder import Exports, Send, ServiceExports, Warn
 from tests.bridge.services.test_rules import rules
 

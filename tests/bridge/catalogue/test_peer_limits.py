@@ -14,7 +14,8 @@ from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Sou
 from rmpa.bridge.offers import CROWDED
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
-from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import LimitSettings, ServiceSettings
 from rmpa.core.contract import Contracts
 from tests.bridge.recorder import (
     Imports,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.params.rules import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
-from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
+from rmpa.config.rules import FollowRule
+from rmpa.config.settings import ParamSettings, Settings, TimeSettings
 from rmpa.ros.master.parameters import leaves
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndRoute, Probe, Send, ServerGone, ServeRoute, ServiceExports

@@ -16,7 +16,8 @@ from rmpa.bridge.messages import (
     ServiceOpened,
 )
 from rmpa.bridge.services.imports import ServiceRouteState
-from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings
+from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndedService, ForgetAbout, OpenedService, Provide, Send, ServiceImports, Withdraw

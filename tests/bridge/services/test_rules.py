@@ -8,7 +8,8 @@ import pytest
 
 from rmpa.bridge.context import Names, ServiceRules
 from rmpa.bridge.policy import Policy
-from rmpa.config.settings import PeerRule, PolicySettings, ServiceRule, ServiceSettings
+from rmpa.config.peer_rules import PeerRule, PolicySettings, ServiceRule
+from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
 
 

@@ -19,7 +19,8 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import Policy, PolicyDecision
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.config.settings import LimitSettings, PolicySettings
+from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.settings import LimitSettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability, Transport
 from rmpa.mesh.reliable import ReliableSender
 from tests.bridge.recorder import AddRoute, Connect, Disconnect, Exports, RemoveRoute, Send, SuspendRoute, Warn

@@ -19,7 +19,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.imports import RouteState
-from rmpa.config.settings import PolicySettings
+from rmpa.config.peer_rules import PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability, Transport
 from tests.bridge.recorder import Describe, Detach, Imports, Publish, Retract, Send, Warn
 

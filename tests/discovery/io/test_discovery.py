@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.config.settings import HostPort, Multicast, Settings
+from rmpa.config.settings import Settings
+from rmpa.config.values import HostPort, Multicast
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits, membership
 from rmpa.discovery.beacon import Beacon, BeaconKind

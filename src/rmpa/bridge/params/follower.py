@@ -24,7 +24,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
-    from rmpa.config.settings import FollowRule
+    from rmpa.config.rules import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
-from rmpa.config.rules import SIM_TIME, overlap, untouchable
-from rmpa.config.settings import FollowRule
+from rmpa.config.rules import SIM_TIME, FollowRule, overlap, untouchable
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import matches
 from rmpa.ros import limits as ros_limits

@@ -19,7 +19,8 @@ from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
-from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
+from rmpa.config.rules import FollowRule
+from rmpa.config.settings import ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.api import MasterApi

@@ -28,8 +28,8 @@ from rmpa.bridge.topics import subscribers as module
 from rmpa.bridge.topics.exports import LocalSource
 from rmpa.bridge.topics.imports import RouteState
 from rmpa.bridge.topics.subscribers import RemoteSubscribers
-from rmpa.config.peer_rules import PermissionRule
-from rmpa.config.settings import PolicySettings, TrustSettings
+from rmpa.config.peer_rules import PermissionRule, PolicySettings
+from rmpa.config.settings import TrustSettings
 from rmpa.trust.permissions import Permissions
 from tests.bridge.recorder import Exports, Imports
 
