@@ -152,7 +152,7 @@ async def test_a_node_that_does_not_end(settings: Callable[..., Settings], monke
     async with running(settings("a"), settings("b")) as (a, b), node("stubborn", b) as stubborn:
         await stubborn.advertise("/chatter", "std_msgs/String")
         await until(lambda: proxy(a, "stubborn"))
-        monkeypatch.setattr(stubborn._slave, "_on_shutdown", lambda _: None)
+        monkeypatch.setattr(stubborn.slave, "_on_shutdown", lambda _: None)
         assert not (await ask(a, dict[str, bool], "node.kill", "/stubborn"))["gone"]
         reply = await call_api(proxy(a, "stubborn"), "shutdown", "/rosnode", "user request")
         assert reply == (0, "it was asked, and is still there after 0.3 s", 0)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from rmpa.core.errors import LimitExceeded
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros import limits
 from rmpa.ros.types.definitions import SEPARATOR
 from rmpa.ros.types.messages import MessageError, MessageType
-from rmpa.ros.wire.tcpros import MalformedStream, frame_message, split_messages
+from rmpa.ros.wire.tcpros import frame_message, split_messages
 
 _JOY = MessageType("sensor_msgs/Joy")
 _HEADER = f"{SEPARATOR}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -26,7 +26,7 @@ def fuzz(data: bytes) -> None:
     """Every whole message once and in order, however the bytes are cut; each read, or refused by its type."""
     try:
         messages, consumed, wanted = split_messages(memoryview(data))
-    except (LimitExceeded, MalformedStream):
+    except RemoteProtocolError:
         return
     if b"".join(messages) != data[:consumed] or wanted > limits.TCPROS_MESSAGE_MAX + 4:
         raise AssertionError("messages are not what was consumed")
@@ -36,7 +36,7 @@ def fuzz(data: bytes) -> None:
     if start < len(data):
         try:
             rest, _, _ = split_messages(memoryview(data[start:]))
-        except (LimitExceeded, MalformedStream):
+        except RemoteProtocolError:
             rest = []
     if [bytes(m) for m in (*first, *rest)] != [bytes(m) for m in messages]:
         raise AssertionError("a cut changes the messages")

@@ -15,9 +15,8 @@ import pytest
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.node import Node
-from rmpa.ros.node.publication import Publication, PublicationEvents
+from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType

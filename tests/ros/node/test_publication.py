@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.ros import limits
-from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.node.listeners import TcprosServer
-from rmpa.ros.node.publication import Publication, PublicationEvents
+from rmpa.ros.node.publication import AcceptedConnection, Publication, PublicationEvents
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from tests.ros.node.peers import LATCHED, STRING, RawSubscriber, until
 

@@ -19,6 +19,7 @@ from rmpa.ros.node import listeners as shared_listener
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.runtime.accept import Acceptor
 from tests.ros.node.peers import STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
@@ -165,6 +166,10 @@ async def test_missing_device_is_an_error(monkeypatch: pytest.MonkeyPatch) -> No
 
 async def test_addresses_that_lead_nowhere_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SHARED_PROBE_TIMEOUT", 0.05)
-    monkeypatch.setattr(shared_listener._Port, "_accepted", lambda _self, sock, _client: sock.close())
+
+    def deaf(sock: socket.socket, _on_accept: object, *, name: str) -> Acceptor:
+        return Acceptor(sock, lambda accepted, _client: accepted.close(), name=name)
+
+    monkeypatch.setattr(shared_listener, "Acceptor", deaf)
     with pytest.raises(StartError, match=r"a connection to 127\.[0-9.]+ on this machine does not arrive"):
         await SharedListener(SALT).start()

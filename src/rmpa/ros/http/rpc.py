@@ -146,6 +146,20 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     raise error
 
 
+def keep_alive(sock: socket.socket) -> None:
+    """Let the kernel detect a machine that was switched off, with roscpp's timing."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, limits.TCP_KEEPALIVE_IDLE)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, limits.TCP_KEEPALIVE_INTERVAL)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, limits.TCP_KEEPALIVE_COUNT)
+
+
+def tcpros_info(sock: socket.socket) -> str:
+    """The addresses of a connection, in the form of ``rosnode info``."""
+    host, port = sock.getpeername()[:2]
+    return f"TCPROS connection on port {sock.getsockname()[1]} to [{host}:{port}]"
+
+
 async def call(
     uri: str,
     method: str,
@@ -201,6 +215,7 @@ async def exchange(
                 return body
             finally:
                 sock.close()
+                response.close()
     except TimeoutError as error:
         raise UnreachableError(
             "XML-RPC server", uri, f"no answer to {method} in {timeout:g} s; is that program stopped?"

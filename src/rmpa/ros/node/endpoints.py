@@ -1,98 +1,198 @@
-"""Publishers, subscriptions, services and clients of a ``Node``.
-
-The services of a ``Node``: ``Service`` serves one, ``ServiceClient`` calls one.
-"""
+"""Publishers, subscribers, services and clients of a ``Node``, and what it has registered at its master."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
+from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.ros import limits
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
+from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.types.find import type_of_header
-from rmpa.ros.types.messages import HeaderNumbers, MessageError
+from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType, Plain
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
+_REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
+
+
+class MasterClient:
+    """What one node has registered at its master, and its calls there.
+
+    Args:
+        slave: The node's servers.
+        master_uri: The master.
+    """
+
+    def __init__(self, slave: SlaveNode, master_uri: str) -> None:
+        self.slave = slave
+        """The servers of the node, for their connections and counters."""
+        self.name = slave.name
+        self.master_uri = master_uri
+        self._entries: dict[tuple[str, str], Publisher | Subscriber | Service] = {}
+        """By ``Publisher``, ``Subscriber`` or ``Service``, and name."""
+        self._followed: set[str] = set()
+        """The parameters that are subscribed to."""
+
+    @property
+    def uri(self) -> str:
+        """The slave API, ``http://host:port/``."""
+        return self.slave.uri
+
+    async def call_master(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
+        """Call the Master or Parameter API; the caller id is put in front.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            PeerRefused: The master answers with a code other than 1.
+        """
+        reply = await self._call(method, *params)
+        if reply.code != 1:
+            raise PeerRefused(f"the ROS master at {self.master_uri}", f"{method}: {reply.status}")
+        return reply.value
+
+    async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
+        try:
+            return await call_api(self.master_uri, method, self.name, *params)
+        except UnreachableError as error:
+            raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
+
+    async def _add(self, entry: Publisher | Subscriber | Service) -> None:
+        """Serve and register.
+
+        Raises:
+            ValueError: The node has one of that name already.
+        """
+        entry.serve()
+        self._entries[entry.kind_name, entry.key] = entry
+        try:
+            await entry.register()
+        except BaseException:
+            self._entries.pop((entry.kind_name, entry.key), None)
+            entry.withdraw()
+            raise
+
+    async def remove(self, entry: Publisher | Subscriber | Service) -> None:
+        """Unregister and close a publisher, subscriber or service; nothing happens if it is not registered."""
+        if self._entries.pop((entry.kind_name, entry.key), None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master(f"unregister{entry.kind_name}", entry.key, entry.uri)
+            entry.withdraw()
+
+    async def _register_again(self) -> None:
+        """Register everything at a master that has been started anew."""
+        for entry in tuple(self._entries.values()):
+            await entry.register(again=True)
+        for key in tuple(self._followed):
+            await self.call_master("subscribeParam", self.uri, key)
+
+    async def _unregister_all(self) -> None:
+        """Unregister everything, concurrently and with one deadline for a slow master."""
+        at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
+
+        async def unregister(method: str, *params: XmlRpcValue) -> None:
+            try:
+                async with at_once:
+                    await self.call_master(method, *params)
+            except RmpaError as error:
+                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
+
+        try:
+            async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
+                for (kind, key), entry in self._entries.items():
+                    group.create_task(unregister(f"unregister{kind}", key, entry.uri), name=f"unregister {self.name}")
+                for key in self._followed:
+                    group.create_task(unregister("unsubscribeParam", self.uri, key), name=f"unregister {self.name}")
+        except TimeoutError:
+            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
 
 
 class Service:
     """A service of a ``Node``; made by ``Node.advertise_service``.
 
     Args:
+        node: Serves it.
         name: The global name.
-        caller_id: The node's name.
         kind: The type.
         handler: Gets the request as an object; returns the response as an object or as plain values, at once or as an
             awaitable. An exception becomes the client's error.
         timeout: Seconds for a call.
-        on_close: Unregisters the service.
         raw: Whether the handler gets the request's bytes, and returns the response's.
     """
 
+    kind_name = "Service"
+
     def __init__(
-        self,
-        name: str,
-        caller_id: str,
-        kind: ServiceType,
-        handler: Handler,
-        timeout: float,
-        on_close: Callable[[str], Awaitable[None]],
-        *,
-        raw: bool = False,
+        self, node: MasterClient, name: str, kind: ServiceType, handler: Handler, timeout: float, *, raw: bool
     ) -> None:
-        self.name = name
+        self._node = node
+        self.name = self.key = name
         self.kind = kind
         self._raw = raw
         self._handler = handler
-        self._on_close = on_close
         self._tasks: set[asyncio.Task[None]] = set()
-        self.endpoint = ServiceEndpoint(name, caller_id, self._serve, description=kind.describe(), timeout=timeout)
+        self.endpoint = ServiceEndpoint(name, node.name, self._called, description=kind.describe(), timeout=timeout)
+
+    @property
+    def uri(self) -> str:
+        """The URI of the node's services."""
+        return self._node.slave.service_uri
+
+    def serve(self) -> None:
+        """Take clients."""
+        self._node.slave.add_service(self.endpoint)
+
+    async def register(self, *, again: bool = False) -> None:  # noqa: ARG002 - of subscribers
+        """Register it at the master."""
+        await self._node.call_master("registerService", self.name, self.uri, self._node.uri)
+
+    def withdraw(self) -> None:
+        """Close; calls under way get an error."""
+        self._node.slave.remove_service(self.name)
 
     async def close(self) -> None:
         """Unregister the service; calls under way get an error."""
-        await self._on_close(self.name)
+        await self._node.remove(self)
 
-    def _serve(self, call: ServiceCall) -> None:
+    def _called(self, call: ServiceCall) -> None:
         try:
             result = self._handler(bytes(call.request) if self._raw else self.kind.request.deserialize(call.request))
+            if not inspect.isawaitable(result):
+                self._reply(call, result)
+                return
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             self._failed(call, error)
-            return
-        if not inspect.isawaitable(result):
-            self._reply(call, result)
             return
         task = asyncio.get_running_loop().create_task(self._respond(call, result), name=f"call of {self.name}")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-        def gone() -> None:
-            task.cancel()
-
-        call.on_gone = gone
+        call.on_gone = task.cancel
 
     async def _respond(self, call: ServiceCall, result: Awaitable[Any]) -> None:
         try:
@@ -101,16 +201,16 @@ class Service:
             self._failed(call, error)
 
     def _reply(self, call: ServiceCall, result: Any) -> None:
-        try:
-            call.reply(True, result if self._raw else _serialize(self.kind.response, result))
-        except MessageError as error:
-            self._failed(call, error)
+        call.reply(True, result if self._raw else _serialize(self.kind.response, result))
 
     def _failed(self, call: ServiceCall, error: Exception) -> None:
+        text = str(error)
+        if isinstance(error, RmpaError) and text:
+            call.fail(text)
+            return
         if not isinstance(error, RmpaError):
             _log.error("! %s: a call of %s failed", self.name, printable(call.caller_id), exc_info=error)
-        text = str(error)
-        call.fail(text if isinstance(error, RmpaError) and text else f"{type(error).__name__}: {text}")
+        call.fail(f"{type(error).__name__}: {text}")
 
 
 class ServiceClient:
@@ -174,12 +274,6 @@ async def probe(uri: str, service: str, caller_id: str, timeout: float) -> Servi
     return connection
 
 
-__all__ = ["Handler", "Service", "ServiceClient", "ServiceFailed", "probe"]
-
-
-# The topics of a ``Node``: publishers, subscribers and received messages.
-
-
 class Received:
     """One received message.
 
@@ -229,26 +323,28 @@ class Received:
 class Publisher(PublicationEvents):
     """Publishes one topic of a ``Node``; made by ``Node.advertise``."""
 
+    kind_name: Final = "Publisher"
+
     def __init__(
         self,
+        node: MasterClient,
         topic: str,
-        caller_id: str,
         description: TopicDescription,
         kind: MessageType | None,
         queue_messages: int,
-        on_close: Callable[[str], Awaitable[None]],
     ) -> None:
-        self.topic = topic
+        self._node = node
+        self.topic = self.key = topic
+        self.uri = node.uri
+        self.refusals: dict[str, str] = {}
+        """Why subscribers (by caller id) were refused."""
+        self.refusal_log = RefusalLog(_log, Counters())
         self.description = description
         self.kind = kind
         self.numbers = HeaderNumbers(kind) if kind is not None else None
         """Numbers what ``publish`` sends; what ``publish_raw`` sends has its numbers already."""
-        self._on_close = on_close
         self._change = asyncio.Event()
-        self._log = RefusalLog(_log, Counters())
-        self.refusals: dict[str, str] = {}
-        """Why subscribers (by caller id) were refused."""
-        self.publication = Publication(topic, caller_id, description, events=self, queue_messages=queue_messages)
+        self.publication = Publication(topic, node.name, description, events=self, queue_messages=queue_messages)
 
     @property
     def subscribers(self) -> int:
@@ -295,7 +391,19 @@ class Publisher(PublicationEvents):
     async def close(self) -> None:
         """Send the queued messages, unregister, and close the connections."""
         await self.drained()
-        await self._on_close(self.topic)
+        await self._node.remove(self)
+
+    def serve(self) -> None:
+        """Take subscribers."""
+        self._node.slave.add_publication(self.publication)
+
+    async def register(self, *, again: bool = False) -> None:  # noqa: ARG002 - of subscribers
+        """Register it at the master."""
+        await self._node.call_master("registerPublisher", self.topic, self.description.type, self.uri)
+
+    def withdraw(self) -> None:
+        """Close the connections."""
+        self._node.slave.remove_publication(self.topic)
 
     def first_subscriber(self) -> None:
         """Of ``PublicationEvents``."""
@@ -307,9 +415,7 @@ class Publisher(PublicationEvents):
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
         """Of ``PublicationEvents``."""
-        who = printable(fields.get("callerid", ""))
-        _remember(self.refusals, who, text)
-        self._log.refuse(asyncio.get_running_loop().time(), "publication.refused", who, f"{self.topic}: {text}")
+        _refuse(self, "publication.refused", printable(fields.get("callerid", "")), text)
 
     def _known(self) -> MessageType:
         if self.kind is None:
@@ -320,10 +426,13 @@ class Publisher(PublicationEvents):
 class Subscriber:
     """Receives one topic of a ``Node``, by callback or ``async for``; made by ``Node.subscribe``."""
 
+    kind_name: Final = "Subscriber"
+
+    # More than 12 fields: the three ways to receive, and the queue of one of them.
     def __init__(
         self,
+        node: MasterClient,
         topic: str,
-        caller_id: str,
         kind: MessageType | None,
         callback: Callable[[Received], None] | None,
         *,
@@ -332,27 +441,26 @@ class Subscriber:
         own_uri: str = "",
         nodelay: bool,
         queue_messages: int,
-        number: Callable[[], int],
-        on_close: Callable[[str], Awaitable[None]],
     ) -> None:
-        self.topic = topic
+        self._node = node
+        self.topic = self.key = topic
+        self.uri = node.uri
+        self.refusals: dict[str, str] = {}
+        """Why publishers (by slave API URI) refused or do not match."""
+        self.refusal_log = RefusalLog(_log, Counters())
         self.kind = kind
         self.type_name = kind.name if kind is not None else type_name
         self.dropped = 0
         """Messages dropped because the ``async for`` is slow."""
-        self.refusals: dict[str, str] = {}
-        """Why publishers (by slave API URI) refused or do not match."""
         self._callback = callback
         self._on_bytes = on_bytes
-        self._refusals = RefusalLog(_log, Counters())
         self._queue: deque[Received] = deque()
         self._queue_messages = queue_messages
         self._wake = asyncio.Event()
         self._ended = False
-        self._on_close = on_close
         self.subscription = Subscription(
             topic,
-            caller_id,
+            node.name,
             on_message=self._message,
             on_refused=self._refused,
             own_uri=own_uri,
@@ -360,7 +468,7 @@ class Subscriber:
             md5sum=kind.md5sum if kind is not None else ANY,
             definition=kind.definition if kind is not None else "",
             nodelay=nodelay,
-            number=number,
+            number=node.slave.next_number,
         )
 
     @property
@@ -386,12 +494,26 @@ class Subscriber:
     async def close(self) -> None:
         """Unregister and disconnect from all publishers."""
         self.ended()
-        await self._on_close(self.topic)
+        await self._node.remove(self)
 
     def ended(self) -> None:
         """End the ``async for`` once its queue is empty; no further messages arrive."""
         self._ended = True
         self._wake.set()
+
+    def serve(self) -> None:
+        """Follow the publishers of the topic."""
+        self._node.slave.add_subscription(self.subscription)
+
+    async def register(self, *, again: bool = False) -> None:
+        """Register it at the master, and connect to the publishers that it tells."""
+        uris = await self._node.call_master("registerSubscriber", self.topic, self.type_name, self.uri)
+        if isinstance(uris, list):
+            self.subscription.update([str(uri) for uri in uris], keep=again)
+
+    def withdraw(self) -> None:
+        """Disconnect from the publishers."""
+        self._node.slave.remove_subscription(self.topic)
 
     def _message(self, connection: PublisherConnection, framed: memoryview) -> None:
         try:
@@ -413,14 +535,11 @@ class Subscriber:
         self._wake.set()
 
     def _refused(self, connection: PublisherConnection, text: str) -> None:
-        _remember(self.refusals, connection.uri, text)
-        now = asyncio.get_running_loop().time()
-        self._refusals.refuse(
-            now, "subscription.refused", connection.uri, f"{self.topic}: publisher {connection.uri}: {text}"
-        )
+        _refuse(self, "subscription.refused", connection.uri, text)
 
 
-def _remember(refusals: dict[str, str], who: str, text: str) -> None:
-    refusals[who] = text
-    if len(refusals) > core_limits.LOG_KINDS_MAX:
-        refusals.pop(next(iter(refusals)))
+def _refuse(end: Publisher | Subscriber, name: str, who: str, text: str) -> None:
+    end.refusals[who] = text
+    if len(end.refusals) > core_limits.LOG_KINDS_MAX:
+        end.refusals.pop(next(iter(end.refusals)))
+    end.refusal_log.refuse(asyncio.get_running_loop().time(), name, who, f"{end.topic}: {text}")

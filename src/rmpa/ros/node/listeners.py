@@ -20,7 +20,7 @@ from rmpa.core.counters import Counters, RefusalLog, remedy
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
 from rmpa.ros.http.server import RESET, ResetConnection, XmlRpcServer
-from rmpa.ros.node.accepted_connection import AcceptedConnection
+from rmpa.ros.node.publication import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
 from rmpa.runtime.accept import DESCRIPTORS, Acceptor, Use, is_shortage
 
@@ -277,18 +277,16 @@ class SharedListener:
         self._counters = counters if counters is not None else Counters()
         self._salt = salt
         self._addresses = LoopbackAddresses(salt)
-        self._http = _Port("XML-RPC of the proxies", self._answer_stray)
-        self._tcpros = _Port("TCPROS of the proxies", self._reset_stray)
+        self._nodes: dict[str, tuple[Adopt, Adopt]] = {}
+        """By address: what takes the connections to the XML-RPC port, and those to the TCPROS port."""
+        self._acceptors: list[Acceptor] = []
+        self.ports = (0, 0)
+        """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
         self._strays = XmlRpcServer(_former_node, counters=self._counters, name="addresses of former nodes")
 
     def __len__(self) -> int:
         """Nodes with an address."""
         return len(self._addresses)
-
-    @property
-    def ports(self) -> tuple[int, int]:
-        """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
-        return self._http.number, self._tcpros.number
 
     async def start(self) -> None:
         """Listen, and test whether the addresses work on this machine.
@@ -297,10 +295,9 @@ class SharedListener:
             StartError: The device cannot be bound, or its addresses are not 127.0.0.0/8.
         """
         try:
-            for port in (self._http, self._tcpros):
-                port.listen()
+            self.ports = self._listen(0, "XML-RPC of the proxies"), self._listen(1, "TCPROS of the proxies")
             # Containers, sandboxes and firewalls differ, so one connection is tried.
-            await _test_address(LoopbackAddresses(self._salt).take("", 0.0), self._tcpros)
+            await self._test_address(LoopbackAddresses(self._salt).take("", 0.0))
         except BaseException as error:
             await self.close()
             if isinstance(error, OSError):
@@ -311,8 +308,8 @@ class SharedListener:
 
     async def close(self) -> None:
         """Stop listening; the owner has closed the nodes before."""
-        self._http.close()
-        self._tcpros.close()
+        for acceptor in self._acceptors:
+            acceptor.close()
         await self._strays.close()
 
     def attach(self, name: str, http: Adopt, tcpros: Adopt) -> str:
@@ -327,15 +324,37 @@ class SharedListener:
             The address; the ports are ``ports``.
         """
         address = self._addresses.take(name, asyncio.get_running_loop().time())
-        self._http.nodes[address] = http
-        self._tcpros.nodes[address] = tcpros
+        self._nodes[address] = http, tcpros
         return address
 
     def detach(self, address: str) -> None:
         """Free an address; the node closes its connections itself."""
-        self._http.nodes.pop(address, None)
-        self._tcpros.nodes.pop(address, None)
+        self._nodes.pop(address, None)
         self._addresses.free(address, asyncio.get_running_loop().time())
+
+    def _listen(self, which: int, name: str) -> int:
+        """Bind one of the two sockets and accept; return its port.
+
+        Raises:
+            OSError: This is not allowed, or there is no such device.
+        """
+        stray = (self._answer_stray, self._reset_stray)[which]
+
+        def accepted(sock: socket.socket, client: tuple[str, int]) -> None:
+            node = self._nodes.get(sock.getsockname()[0])
+            (node[which] if node is not None else stray)(sock, client)
+
+        with contextlib.ExitStack() as on_error:
+            sock = on_error.enter_context(DESCRIPTORS.open_socket(Use.DATA))
+            # Before it is bound to all addresses, so that the network can never reach it.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
+            sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
+            sock.listen(limits.SHARED_BACKLOG)
+            on_error.pop_all()
+        acceptor = Acceptor(sock, accepted, name=name)
+        acceptor.start()
+        self._acceptors.append(acceptor)
+        return int(sock.getsockname()[1])
 
     def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
         """Take a call to the address of a closed node: see ``_former_node``."""
@@ -348,75 +367,30 @@ class SharedListener:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
         sock.close()
 
-
-class _Port:
-    """One of the two sockets.
-
-    Args:
-        name: Its purpose, for messages.
-        stray: Gets the connections to addresses without a node.
-    """
-
-    def __init__(self, name: str, stray: Adopt) -> None:
-        self.nodes: dict[str, Adopt] = {}
-        """The takers of accepted connections, by the nodes' addresses."""
-        self.number = 0
-        self._name = name
-        self._stray = stray
-        self._acceptor: Acceptor | None = None
-
-    def listen(self) -> None:
-        """Bind and accept.
+    async def _test_address(self, address: str) -> None:
+        """Connect to an address, and wait until the connection is accepted with it.
 
         Raises:
-            OSError: This is not allowed, or there is no such device.
+            OSError: The connection fails, or is not accepted in ``limits.SHARED_PROBE_TIMEOUT``.
         """
-        sock = DESCRIPTORS.open_socket(Use.DATA)
-        try:
-            # Before it is bound to all addresses, so that the network can never reach it.
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
-            sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
-            sock.listen(limits.SHARED_BACKLOG)
-        except BaseException:
+        loop = asyncio.get_running_loop()
+        arrived: asyncio.Future[None] = loop.create_future()
+
+        def arrive(sock: socket.socket, _client: tuple[str, int]) -> None:
             sock.close()
-            raise
-        self.number = sock.getsockname()[1]
-        self._acceptor = Acceptor(sock, self._accepted, name=self._name)
-        self._acceptor.start()
+            if not arrived.done():
+                arrived.set_result(None)
 
-    def close(self) -> None:
-        """Stop listening."""
-        if self._acceptor is not None:
-            self._acceptor.close()
-
-    def _accepted(self, sock: socket.socket, client: tuple[str, int]) -> None:
-        self.nodes.get(sock.getsockname()[0], self._stray)(sock, client)
-
-
-async def _test_address(address: str, port: _Port) -> None:
-    """Connect to an address, and wait until the connection is accepted with it.
-
-    Raises:
-        OSError: The connection fails, or is not accepted in ``limits.SHARED_PROBE_TIMEOUT``.
-    """
-    loop = asyncio.get_running_loop()
-    arrived: asyncio.Future[None] = loop.create_future()
-
-    def arrive(sock: socket.socket, _client: tuple[str, int]) -> None:
-        sock.close()
-        if not arrived.done():
-            arrived.set_result(None)
-
-    port.nodes[address] = arrive
-    try:
-        with DESCRIPTORS.open_socket(Use.DATA) as probe:
-            async with asyncio.timeout(limits.SHARED_PROBE_TIMEOUT):
-                await loop.sock_connect(probe, (address, port.number))
-                await arrived
-    except TimeoutError as error:
-        raise OSError(f"a connection to {address} on this machine does not arrive") from error
-    finally:
-        del port.nodes[address]
+        self._nodes[address] = arrive, arrive
+        try:
+            with DESCRIPTORS.open_socket(Use.DATA) as probe:
+                async with asyncio.timeout(limits.SHARED_PROBE_TIMEOUT):
+                    await loop.sock_connect(probe, (address, self.ports[1]))
+                    await arrived
+        except TimeoutError as error:
+            raise OSError(f"a connection to {address} on this machine does not arrive") from error
+        finally:
+            del self._nodes[address]
 
 
 def _former_node(method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:

@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import time
@@ -24,8 +23,16 @@ from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
-from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.endpoints import Handler, Publisher, Received, Service, ServiceClient, Subscriber, probe
+from rmpa.ros.node.endpoints import (
+    Handler,
+    MasterClient,
+    Publisher,
+    Received,
+    Service,
+    ServiceClient,
+    Subscriber,
+    probe,
+)
 from rmpa.ros.node.fetch_type import find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.service_client import ServiceConnection
@@ -40,16 +47,15 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
 _log = logging.getLogger(__name__)
-_REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 _NO_DEFAULT: Final = object()
 
 
-class Node:
+class Node(MasterClient):
     """One node, registered at a master as long as the ``async with`` lasts.
 
     A restart of the master is detected within ``limits.NODE_MASTER_CHECK``, and everything is registered again; open
@@ -84,38 +90,26 @@ class Node:
         if anonymous:
             name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
         self.environment = environment
-        self.name = environment.node_name(name)
-        self.master_uri = master_uri or environment.master_uri
         self.stopped = asyncio.Event()
         """Set when the node is closed."""
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
-        self._publishers: dict[str, Publisher] = {}
-        self._subscribers: dict[str, Subscriber] = {}
-        self._services: dict[str, Service] = {}
-        self._param_subscriptions: set[str] = set()
         self._watch: asyncio.Task[None] | None = None
-        self._ending: asyncio.Task[None] | None = None
         self._closing: asyncio.Task[None] | None = None
-        host, self._bind = self._hosts()
-        self._slave = SlaveNode(
-            self.name,
-            self._bind,
-            self.master_uri,
+        master_uri = master_uri or environment.master_uri
+        host = environment.host
+        if not environment.host_given and is_loopback(host_of(master_uri)):
+            # No other machine reaches that master, and the node goes on when the network is lost.
+            host = "127.0.0.1"
+        slave = SlaveNode(
+            environment.node_name(name),
+            "127.0.0.1" if is_loopback(host) else "0.0.0.0",  # noqa: S104 - as every ROS node does
+            master_uri,
             advertised_host=host,
             on_shutdown=self._shutdown_requested,
             on_param_update=self._param_update,
         )
-
-    @property
-    def uri(self) -> str:
-        """The slave API, ``http://host:port/``."""
-        return self._slave.uri
-
-    @property
-    def slave(self) -> SlaveNode:
-        """The servers of the node, for their connections and counters."""
-        return self._slave
+        super().__init__(slave, master_uri)
 
     async def __aenter__(self) -> Self:
         """Listen, and call the master once.
@@ -123,11 +117,11 @@ class Node:
         Raises:
             UnreachableError: The master does not answer.
         """
-        await self._slave.start()
+        await self.slave.start()
         try:
             await self.call_master("getPid")
         except BaseException:
-            await self._slave.close()
+            await self.slave.close()
             raise
         self._watch = asyncio.get_running_loop().create_task(self._watch_master(), name=f"watch master {self.name}")
         return self
@@ -139,9 +133,7 @@ class Node:
 
     async def close(self) -> None:
         """Unregister everything and close; may be called twice."""
-        if self._closing is None:
-            self._closing = asyncio.get_running_loop().create_task(self._close(), name=f"close {self.name}")
-        await asyncio.shield(self._closing)
+        await asyncio.shield(self._begin_close())
 
     # --- topics -----------------------------------------------------------------------------------------------
 
@@ -171,22 +163,9 @@ class Node:
         if isinstance(kind, str):
             kind = await find_or_fetch(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
-        publisher = Publisher(
-            resolved,
-            self.name,
-            description,
-            kind if isinstance(kind, MessageType) else None,
-            queue_messages,
-            self._unadvertise,
-        )
-        self._slave.add_publication(publisher.publication)
-        self._publishers[resolved] = publisher
-        try:
-            await self._register_publisher(publisher)
-        except BaseException:
-            self._publishers.pop(resolved, None)
-            self._slave.remove_publication(resolved)
-            raise
+        known = kind if isinstance(kind, MessageType) else None
+        publisher = Publisher(self, resolved, description, known, queue_messages)
+        await self._add(publisher)
         return publisher
 
     async def subscribe(
@@ -223,11 +202,11 @@ class Node:
         type_name = kind if isinstance(kind, str) else ANY
         if isinstance(kind, str):
             kind = await self._find_type(kind) if kind != ANY else None
-        if resolved in self._subscribers:
+        if ("Subscriber", resolved) in self._entries:
             raise ValueError(f"{self.name} subscribes to {resolved} already")
         subscriber = Subscriber(
+            self,
             resolved,
-            self.name,
             kind,
             callback,
             on_bytes=on_bytes,
@@ -235,17 +214,8 @@ class Node:
             own_uri="" if own else self.uri,
             nodelay=nodelay,
             queue_messages=queue_messages,
-            number=self._slave.next_number,
-            on_close=self._unsubscribe,
         )
-        self._slave.add_subscription(subscriber.subscription)
-        self._subscribers[resolved] = subscriber
-        try:
-            await self._register_subscriber(subscriber)
-        except BaseException:
-            self._subscribers.pop(resolved, None)
-            self._slave.remove_subscription(resolved)
-            raise
+        await self._add(subscriber)
         return subscriber
 
     # --- services ---------------------------------------------------------------------------------------------
@@ -277,15 +247,8 @@ class Node:
         """
         resolved = self._resolve(name)
         kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
-        service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service, raw=raw)
-        self._slave.add_service(service.endpoint)
-        self._services[resolved] = service
-        try:
-            await self._register_service(service)
-        except BaseException:
-            self._services.pop(resolved, None)
-            self._slave.remove_service(resolved)
-            raise
+        service = Service(self, resolved, kind, handler, timeout, raw=raw)
+        await self._add(service)
         return service
 
     async def lookup_service(self, name: str) -> str:
@@ -345,24 +308,6 @@ class Node:
 
     # --- the master -------------------------------------------------------------------------------------------
 
-    async def call_master(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
-        """Call the Master or Parameter API; the caller id is put in front.
-
-        Raises:
-            UnreachableError: The master does not answer.
-            PeerRefused: The master answers with a code other than 1.
-        """
-        reply = await self._call(method, *params)
-        if reply.code != 1:
-            raise PeerRefused(f"the ROS master at {self.master_uri}", f"{method}: {reply.status}")
-        return reply.value
-
-    async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
-        try:
-            return await call_api(self.master_uri, method, self.name, *params)
-        except UnreachableError as error:
-            raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
-
     async def get_published_topics(self, subgraph: str = "") -> list[tuple[str, str]]:
         """Topics that have a publisher, with their types."""
         value = await self.call_master("getPublishedTopics", subgraph)
@@ -408,21 +353,10 @@ class Node:
     async def follow_param(self, key: str) -> XmlRpcValue:
         """Subscribe to a parameter: ``on_param_update`` gets its changes; return its value, ``{}`` for none."""
         resolved = self._resolve(key)
-        self._param_subscriptions.add(resolved)
+        self._followed.add(resolved)
         return await self.call_master("subscribeParam", self.uri, resolved)
 
     # --- inside -----------------------------------------------------------------------------------------------
-
-    def _hosts(self) -> tuple[str, str]:
-        """The host to register, and the address to listen at.
-
-        Both are loopback where no address is configured and the master is at a loopback address: no other machine
-        reaches that master, and the node goes on when the network is lost.
-        """
-        host = self.environment.host
-        if not self.environment.host_given and is_loopback(host_of(self.master_uri)):
-            host = "127.0.0.1"
-        return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
 
     async def _find_type(self, name: str) -> MessageType | None:
         """Find a message type on this machine; ``None`` if only a publisher can supply it.
@@ -450,69 +384,25 @@ class Node:
     def _resolve(self, name: str) -> str:
         return self.environment.resolve(name, self.name)
 
-    async def _register_publisher(self, publisher: Publisher) -> None:
-        await self.call_master("registerPublisher", publisher.topic, publisher.description.type, self.uri)
-
-    async def _register_subscriber(self, subscriber: Subscriber, *, keep: bool = False) -> None:
-        uris = await self.call_master("registerSubscriber", subscriber.topic, subscriber.type_name, self.uri)
-        if isinstance(uris, list):
-            subscriber.subscription.update([str(uri) for uri in uris], keep=keep)
-
-    async def _register_service(self, service: Service) -> None:
-        await self.call_master("registerService", service.name, self._slave.service_uri, self.uri)
-
-    async def _unadvertise_service(self, name: str) -> None:
-        if self._services.pop(name, None) is not None:
-            with contextlib.suppress(RmpaError):
-                await self.call_master("unregisterService", name, self._slave.service_uri)
-            self._slave.remove_service(name)
-
-    async def _unadvertise(self, topic: str) -> None:
-        if self._publishers.pop(topic, None) is not None:
-            with contextlib.suppress(RmpaError):
-                await self.call_master("unregisterPublisher", topic, self.uri)
-            self._slave.remove_publication(topic)
-
-    async def _unsubscribe(self, topic: str) -> None:
-        if self._subscribers.pop(topic, None) is not None:
-            with contextlib.suppress(RmpaError):
-                await self.call_master("unregisterSubscriber", topic, self.uri)
-            self._slave.remove_subscription(topic)
-
     async def _watch_master(self) -> None:
         while True:
             await asyncio.sleep(limits.NODE_MASTER_CHECK)
-            if not (self._publishers or self._subscribers or self._services or self._param_subscriptions):
+            if not (self._entries or self._followed):
                 continue
             try:
-                if await self._is_unknown_to_master():
+                if (await self._call("lookupNode", self.name)).code != 1:
                     _log.info(
                         "= %s: the master at %s was started anew; registering again", self.name, self.master_uri
                     )
-                    await self._register_all()
+                    await self._register_again()
             except RmpaError as error:
                 _log.debug("! %s: %s", self.name, error)
-
-    async def _is_unknown_to_master(self) -> bool:
-        """Whether the master has no registration of this node: it was restarted."""
-        reply = await self._call("lookupNode", self.name)
-        return reply.code != 1
-
-    async def _register_all(self) -> None:
-        for publisher in tuple(self._publishers.values()):
-            await self._register_publisher(publisher)
-        for subscriber in tuple(self._subscribers.values()):
-            await self._register_subscriber(subscriber, keep=True)
-        for service in tuple(self._services.values()):
-            await self._register_service(service)
-        for key in tuple(self._param_subscriptions):
-            await self.call_master("subscribeParam", self.uri, key)
 
     def _param_update(self, key: str, value: XmlRpcValue) -> bool:
         # An update of a namespace concerns subscriptions below it, and the other way round.
         if not any(
             key == f or key.startswith(f.rstrip("/") + "/") or f.startswith(key.rstrip("/") + "/")
-            for f in self._param_subscriptions
+            for f in self._followed
         ):
             return False
         if self._on_param_update is not None:
@@ -520,11 +410,15 @@ class Node:
         return True
 
     def _shutdown_requested(self, reason: str) -> None:
-        if self._ending is None and self._closing is None:
+        if self._closing is None:
             if self._on_shutdown is not None:
                 self._on_shutdown(reason)
-            # In a task of its own, so that the answer to this call is sent first.
-            self._ending = asyncio.get_running_loop().create_task(self.close(), name=f"shut down {self.name}")
+            self._begin_close()  # in a task of its own, so that the answer to this call is sent first
+
+    def _begin_close(self) -> asyncio.Task[None]:
+        if self._closing is None:
+            self._closing = asyncio.get_running_loop().create_task(self._close(), name=f"close {self.name}")
+        return self._closing
 
     async def _close(self) -> None:
         if self._watch is not None:
@@ -532,32 +426,9 @@ class Node:
             await asyncio.wait([self._watch])
         self.stopped.set()
         await self._unregister_all()
-        for publisher in self._publishers.values():
-            await publisher.drained()
-        for subscriber in self._subscribers.values():
-            subscriber.ended()
-        await self._slave.close()
-
-    async def _unregister_all(self) -> None:
-        """Unregister everything, concurrently and with one deadline for a slow master."""
-        at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
-
-        async def unregister(method: str, *params: XmlRpcValue) -> None:
-            try:
-                async with at_once:
-                    await self.call_master(method, *params)
-            except RmpaError as error:
-                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
-
-        calls = [
-            *(unregister("unregisterPublisher", topic, self.uri) for topic in self._publishers),
-            *(unregister("unregisterSubscriber", topic, self.uri) for topic in self._subscribers),
-            *(unregister("unregisterService", service, self._slave.service_uri) for service in self._services),
-            *(unregister("unsubscribeParam", self.uri, key) for key in self._param_subscriptions),
-        ]
-        try:
-            async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
-                for one in calls:
-                    group.create_task(one, name=f"unregister {self.name}")
-        except TimeoutError:
-            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
+        for entry in self._entries.values():
+            if isinstance(entry, Publisher):
+                await entry.drained()
+            elif isinstance(entry, Subscriber):
+                entry.ended()
+        await self.slave.close()

@@ -20,8 +20,7 @@ from rmpa.core.errors import (
 )
 from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import connect
-from rmpa.ros.node.accepted_connection import keep_alive
+from rmpa.ros.http.rpc import connect, keep_alive
 from rmpa.ros.node.service_server import BODIES, INLINE, send_large
 from rmpa.ros.wire.tcpros import (
     ANY,

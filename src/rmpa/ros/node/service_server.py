@@ -30,7 +30,7 @@ from rmpa.runtime.loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.ros.node.accepted_connection import AcceptedConnection
+    from rmpa.ros.node.publication import AcceptedConnection
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.stream import Stream
 
@@ -88,7 +88,7 @@ class ServiceCall:
         self.caller_id = caller_id
         self.request = request
         self.deadline = deadline
-        self.on_gone: Callable[[], None] | None = None
+        self.on_gone: Callable[[], object] | None = None
 
     @property
     def answered(self) -> bool:

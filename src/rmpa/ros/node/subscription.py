@@ -12,8 +12,7 @@ from rmpa.core.counters import Backoff
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import call_api, connect
-from rmpa.ros.node.accepted_connection import keep_alive, tcpros_info
+from rmpa.ros.http.rpc import call_api, connect, keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import INBOUND, TCPROS, BusConnection
 from rmpa.ros.wire.tcpros import (
     ANY,

@@ -270,8 +270,11 @@ class ResponseParser:
 
     def __init__(self, uri: str) -> None:
         self._uri = uri
-        self._events = _ResponseEvents()
-        self._parser = HttpResponseParser(self._events)
+        self._parser: HttpResponseParser | None = HttpResponseParser(self)
+        self._body = bytearray()
+        self._complete = self._has_length = False
+        self._until_close = False
+        """Whether the body ends with the connection: it has neither a length nor chunks."""
 
     def feed(self, data: bytes) -> bytes | None:
         """Take the next bytes, or empty ones at the end of the connection; return the body once it is complete.
@@ -280,49 +283,45 @@ class ResponseParser:
             RemoteProtocolError: The bytes are not HTTP, the connection ended too early, or the body is larger than
                 ``limits.HTTP_BODY_MAX``.
         """
-        events = self._events
-        if not data and not events.until_close:
+        if self._parser is None or not (data or self._until_close):
             raise RemoteProtocolError("the connection was closed before the response")
         try:
             self._parser.feed_data(data)
         except HttpParserError as error:
-            if not events.complete:  # else the error is in bytes after the response
+            if not self._complete:  # else the error is in bytes after the response
                 raise RemoteProtocolError(f"{self._uri} does not speak HTTP: {error}") from error
-        if len(events.body) > limits.HTTP_BODY_MAX:
-            raise LimitExceeded("XML-RPC response", len(events.body), limits.HTTP_BODY_MAX)
-        if not events.complete and data:
-            return None
+        if len(self._body) > limits.HTTP_BODY_MAX:
+            raise LimitExceeded("XML-RPC response", len(self._body), limits.HTTP_BODY_MAX)
         # A response with status 1xx precedes the response itself.
-        return bytes(events.body) if self._parser.get_status_code() >= 200 else None
+        if (data and not self._complete) or self._parser.get_status_code() < 200:
+            return None
+        return bytes(self._body)
 
+    def close(self) -> None:
+        """Parse no more; this breaks a reference cycle, which would wait for the garbage collector."""
+        self._parser = None
 
-class _ResponseEvents:
-    """Takes the parser's callbacks. It has no reference to the parser, which avoids a reference cycle.
-
-    Attributes:
-        body: The received part of the body.
-        complete: Whether the last byte has arrived.
-        until_close: Whether the body ends with the connection: it has neither a length nor chunks.
-    """
-
-    def __init__(self) -> None:
-        self.body = bytearray()
-        self.complete = self.until_close = self._has_length = False
+    # --- called by the parser ---------------------------------------------------------------------------------
 
     def on_message_begin(self) -> None:
-        self.complete = self._has_length = False
+        """Begin a response, or the one after a status of 1xx."""
+        self._complete = self._has_length = False
 
     def on_header(self, name: bytes, value: bytes) -> None:  # noqa: ARG002 - httptools' interface
+        """Note whether the end of the body is told."""
         self._has_length |= name.lower() in {b"content-length", b"transfer-encoding"}
 
     def on_headers_complete(self) -> None:
-        self.until_close = not self._has_length
+        """Judge where the body ends."""
+        self._until_close = not self._has_length
 
     def on_body(self, data: bytes) -> None:
-        self.body += data
+        """Add a part of the body."""
+        self._body += data
 
     def on_message_complete(self) -> None:
-        self.complete = True
+        """Complete the response at its last byte."""
+        self._complete = True
 
 
 def response_head(status: int, size: int, *, close: bool) -> bytes:

@@ -47,14 +47,6 @@ ANY: Final = "*"
 _SHOWN: Final = 200
 
 
-class MalformedHeader(RemoteProtocolError):  # noqa: N818 - the name says what happened
-    """The bytes are not a connection header."""
-
-
-class MalformedStream(RemoteProtocolError):  # noqa: N818 - the name says what happened
-    """The length of a message is impossible: the stream is out of step."""
-
-
 @dataclass(frozen=True, slots=True)
 class TopicDescription:
     """A publisher's description of its messages.
@@ -112,25 +104,25 @@ def decode_header(body: Buffer) -> Header:
     name the last one counts.
 
     Raises:
-        MalformedHeader: A field is empty, has no ``=``, or is longer than the rest of the header.
+        RemoteProtocolError: A field is empty, has no ``=``, or is longer than the rest of the header.
     """
     fields: Header = {}
     view = memoryview(body)
     start = 0
     while start < len(view):
         if len(view) - start < LENGTH.size:
-            raise MalformedHeader(f"connection header ends within a length, {len(view) - start} bytes left over")
+            raise RemoteProtocolError(f"connection header ends within a length, {len(view) - start} bytes left over")
         (size,) = LENGTH.unpack_from(view, start)
         start += LENGTH.size
         if size == 0:
-            raise MalformedHeader("connection header has a field of length 0")
+            raise RemoteProtocolError("connection header has a field of length 0")
         if size > len(view) - start:
-            raise MalformedHeader(f"connection header field of {size} bytes where {len(view) - start} are left")
+            raise RemoteProtocolError(f"connection header field of {size} bytes where {len(view) - start} are left")
         field = str(view[start : start + size], "utf-8", "surrogateescape")
         start += size
         key, separator, value = field.partition("=")
         if not separator:
-            raise MalformedHeader(f"connection header field without '=': {printable(field)!r}")
+            raise RemoteProtocolError(f"connection header field without '=': {printable(field)!r}")
         fields[key.strip()] = value
     return fields
 
@@ -144,7 +136,7 @@ def parse_header(data: Buffer) -> tuple[Header | None, int, int]:
 
     Raises:
         LimitExceeded: The header claims more than ``limits.TCPROS_HEADER_MAX``.
-        MalformedHeader: See ``decode_header``.
+        RemoteProtocolError: See ``decode_header``.
     """
     if len(data) < LENGTH.size:
         return None, 0, LENGTH.size
@@ -181,7 +173,7 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
     Raises:
         LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. If whole messages precede
             such a message, they are returned, and the next call raises.
-        MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``.
+        RemoteProtocolError: The first message claims more than ``limits.TCPROS_LENGTH_MAX``.
     """
     messages: list[memoryview] = []
     start = 0
@@ -193,7 +185,7 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
                 break
             if size > limits.TCPROS_LENGTH_MAX:
                 text = f"a message's length of {size} bytes cannot be (the most is {limits.TCPROS_LENGTH_MAX}): "
-                raise MalformedStream(text + "the publisher's stream is corrupt")
+                raise RemoteProtocolError(text + "the publisher's stream is corrupt")
             raise LimitExceeded("message", size, limits.TCPROS_MESSAGE_MAX)
         end = start + LENGTH.size + size
         if end > filled:
