@@ -338,12 +338,6 @@ class ImportFlow(DataHandler):
             self._held = None
             self._count("stale")
 
-    def _was_held_up(self, stamp_ns: int, now_ns: int) -> bool:
-        """Whether an outage has delayed a message, not a slow link or this process."""
-        age_ns = now_ns - stamp_ns + self._link_time.ahead_ns
-        held_up = self._link_time.resumed_at() - (self._loop.time() - age_ns / 1e9)
-        return held_up * 1e9 > self._stale_ns + (self._link_time.error_ns or 0)
-
     def _deliver_held(self) -> None:
         """Delivers the held message: no newer one has come."""
         if self._held is not None:

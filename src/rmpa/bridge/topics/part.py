@@ -67,7 +67,7 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
         """The topics of each peer in the local graph, by the number of its session."""
         self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
         """By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``."""
-        self.losses = LossReports(shared, self.exports, self.peers, self.refusals)
+        self.losses = LossReports(shared, self.exports, self.peers, self)
         """Reports messages that do not reach their listeners."""
         self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
         """The subscriptions to local publishers, and the routes to the peers."""

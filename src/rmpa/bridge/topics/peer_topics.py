@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.export import ExportFlow
     from rmpa.bridge.data.quality import QosEvent, QosWatch
     from rmpa.bridge.messages import RouteOpened
+    from rmpa.bridge.offers import Effects
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.core.counters import RefusalLog
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -185,10 +185,11 @@ class PeerTopic(PublicationEvents):
             gone: Whether the source leaves the graph or its route has ended: lost liveliness does not wait for its
                 lease.
         """
-        if (flow := self.flow) is None:
+        flow, self.flow, pasts = self.flow, None, self._peer.pasts
+        if flow is None:
+            if not missed and self.source in pasts:
+                pasts[self.source] = pasts[self.source][0], ""
             return
-        self.flow = None
-        pasts = self._peer.pasts
         if flow.contract.reliability is Reliability.RELIABLE and (missed or flow.watch.counts):
             pasts[self.source] = flow.watch, self.topic if missed else ""
             if len(pasts) > mesh_limits.LOSSES_REMEMBERED:
@@ -269,11 +270,7 @@ class PeerTopics:
             return
         if flow is not None and last is not None:
             flow.skip(serial_add(last, 1))
-        missed = missed and last is None
-        if topic.flow is not None:
-            topic.end(missed=missed)
-        elif not missed and (past := self.pasts.get(source)) is not None:
-            self.pasts[source] = past[0], ""
+        topic.end(missed=missed and last is None)
         topic.publication.forget_latched()
 
     def link_down(self) -> int:
@@ -314,16 +311,11 @@ class LossReports:
         shared: What the parts share.
         exports: Finds the peers that a source goes to.
         peers: The peers' topics in the local graph, by the numbers of their sessions.
-        refusals: Logs and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
+        out: Warns of losses.
     """
 
-    def __init__(
-        self, shared: Shared, exports: Exports, peers: Mapping[int, PeerTopics], refusals: RefusalLog
-    ) -> None:
-        self._shared = shared
-        self._exports = exports
-        self._peers = peers
-        self._refusals = refusals
+    def __init__(self, shared: Shared, exports: Exports, peers: Mapping[int, PeerTopics], out: Effects) -> None:
+        self._shared, self._exports, self._peers, self._out = shared, exports, peers, out
         needs = Needs((), "the peer's own topics; a text for the log")
         shared.rpc.on_notification(OVERSIZED, self._oversized_there, needs)
 
@@ -350,20 +342,20 @@ class LossReports:
         text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
         self._shared.counters.add("message.given_up", count)
         self._shared.counters.add("route.given_up", len(counts) - 1)
-        self._say("route.given_up", name, text)
+        self._out.warn("route.given_up", name, text)
 
     def missed(self, source: Source, peer: int, count: int) -> None:
         """Report how many messages of a reliable source a peer that is back has missed."""
         name = self._peers[peer].session.link.name
         self._shared.counters.add("message.given_up", count)
         text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
-        self._say("route.missed", f"{name} {source}", text)
+        self._out.warn("route.missed", f"{name} {source}", text)
 
     def oversized(self, source: Source, flow: ExportFlow) -> None:
         """Report a message that is too long, in the log and to the peers to which its source flows."""
         bound = ros_limits.TCPROS_MESSAGE_MAX
         text = f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {bound} cross"
-        self._say("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
+        self._out.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
         for peer in self._exports.flowing(source):
             self.tell_oversized(source, flow, peer)
 
@@ -380,10 +372,10 @@ class LossReports:
         Raises:
             RemoteProtocolError: The report names no source, or no numbers above 0.
         """
-        names = (args.get("topic"), args.get("node"))
-        numbers = (args.get("count"), args.get("size"))
-        match names, numbers:
-            case (str(topic), str(node)), (int(count), int(size)) if count > 0 and size > 0:
+        match args:
+            case {"topic": str(topic), "node": str(node), "count": int(count), "size": int(size)} if (
+                min(count, size) > 0
+            ):
                 source = Source(topic, node)
             case _:
                 raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
@@ -392,7 +384,4 @@ class LossReports:
             flow.oversized, flow.oversized_bytes = count, size
             who = f"{session.link.name}: {source}"
             text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
-            self._say("message.oversized_there", who, text)
-
-    def _say(self, kind: str, who: str, text: str) -> None:
-        self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)
+            self._out.warn("message.oversized_there", who, text)
