@@ -1,6 +1,6 @@
 """Modules that negotiate direct transport in made-up time: the real drivers of both sides, and models of their nodes.
 
-What the drivers ask of nodes and of the kernel (``bridge.direct.nodes``) is answered by ``Network``.
+What the drivers ask of nodes and of the kernel (``bridge.topics.direct``) is answered by ``Network``.
 """
 
 from __future__ import annotations

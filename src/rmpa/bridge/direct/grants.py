@@ -26,17 +26,20 @@ from rmpa.bridge.direct.conditions import (
     reply_of,
     unmet_by_rules,
 )
-from rmpa.bridge.direct.nodes import NodePorts, end_all, grant_at
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Contract, Transport, combine
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.core.identity import is_own
+from rmpa.core.identity import OWN_NODE, is_own
+from rmpa.ros.environment import is_loopback
+from rmpa.ros.http.rpc import call_api
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.tcpros import ANY, parse_service_uri
-from rmpa.runtime.kernel_tcp import connections
+from rmpa.ros.wire.xmlrpc import RosFault
+from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -47,8 +50,11 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports
     from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.runtime.kernel_tcp import TcpSocket
 
 _log = logging.getLogger(__name__)
+_EVERY_ADDRESS: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104 - recognised, not bound
+_REMEDY: Final = "start it without ROS_IP and ROS_HOSTNAME, or with an address of the network"
 _GIVEN_UP: Final = Unmet(Condition.AGENT, "it was given up meanwhile")
 _Entry = tuple["PeerSession", DirectAsk, Grant | Unmet | None]
 _RELEASED: Final = Needs((), "what was granted to the peer itself")
@@ -236,6 +242,87 @@ class Grants:
         if problem := end_all(connections(local_port=port, remote=(session.address, None))):
             text = "! %s: connections of local nodes to it may hang: they cannot be ended (%s)"
             _log.info(text, session.link.name, problem)
+
+
+# --- where this module's nodes listen -----------------------------------------------------------------------------
+
+
+class NodePorts:
+    """The TCPROS ports of local publishers, by their slave API: asked once at a time, and known for a while."""
+
+    def __init__(self) -> None:
+        self._ports: dict[str, asyncio.Task[int | Unmet]] = {}
+
+    async def find(self, node: str, uri: str, topic: str) -> int | Unmet:
+        """The port at which a publisher serves a topic, or why there is none.
+
+        Args:
+            node: The publishing node.
+            uri: Its slave API.
+            topic: The topic.
+        """
+        task = self._ports.get(uri)
+        if task is None:
+            if len(self._ports) >= limits.DIRECT_MAX:
+                del self._ports[next(iter(self._ports))]
+            task = self._ports[uri] = asyncio.create_task(_ask_port(node, uri, topic), name=f"port of {node}")
+            asyncio.get_running_loop().call_later(limits.DIRECT_PORT_KNOWN, self.forget, uri, task)
+        found = await asyncio.shield(task)
+        if isinstance(found, Unmet):
+            self.forget(uri, task)
+        return found
+
+    def forget(self, uri: str, task: asyncio.Task[int | Unmet] | None = None) -> None:
+        """Forget a node's port: the node has ended or broken a connection. ``task``: only if this has found it."""
+        if task is None or self._ports.get(uri) is task:
+            self._ports.pop(uri, None)
+
+    async def close(self) -> None:
+        """Cancel the questions to nodes."""
+        for task in self._ports.values():
+            task.cancel()
+        await asyncio.gather(*self._ports.values(), return_exceptions=True)
+
+
+async def _ask_port(node: str, uri: str, topic: str) -> int | Unmet:
+    try:
+        params = (OWN_NODE, topic, [[TCPROS]])
+        code, status, value = await call_api(uri, "requestTopic", *params, timeout=limits.DIRECT_NODE_TIMEOUT)
+    except (RmpaError, RosFault) as error:
+        return Unmet(Condition.NODE, f"{node} does not answer its agent: {error}")
+    port = value[2] if isinstance(value, list) and len(value) == 3 and value[0] == TCPROS else None
+    if code != 1 or not isinstance(port, int) or isinstance(port, bool) or not 0 < port < 1 << 16:
+        return Unmet(Condition.NODE, f"{node} offers no TCPROS for {topic}: {str(status)[:200]}")
+    return port
+
+
+def grant_at(session: PeerSession, node: str, port: int, probe: str) -> Grant | Unmet:
+    """Grant a peer a node's port, if by the kernel's table its listening socket can be reached from the peer."""
+    addresses = listening_addresses(port)
+    if addresses is None:
+        return Unmet(Condition.LISTENING, "the kernel does not say where its node listens")
+    if not addresses:
+        return Unmet(Condition.LISTENING, f"{node} does not listen on this module's machine (port {port})")
+    if addresses & _EVERY_ADDRESS or session.own_address in addresses:
+        return Grant(port, node, probe)
+    if all(is_loopback(address) for address in addresses):
+        return Unmet(Condition.LISTENING, f"{node} listens on loopback only: {_REMEDY}")
+    text = f"{node} listens at {', '.join(sorted(addresses))}, not at {session.own_address}"
+    return Unmet(Condition.LISTENING, text)
+
+
+def end_all(found: list[TcpSocket] | None) -> str:
+    """End connections; return why it failed, or empty. ``None``: the kernel did not list them."""
+    if found is None:
+        return "the kernel does not say which connections there are"
+    try:
+        end_connections(found)
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+# --- topics and services -------------------------------------------------------------------------------------------
 
 
 class TopicGrants(Grants):

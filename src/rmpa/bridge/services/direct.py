@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want, unmet_by_contract, unmet_by_rules
-from rmpa.bridge.direct.nodes import end_all
+from rmpa.bridge.direct.grants import end_all
 from rmpa.bridge.direct.paths import Path, Paths
 from rmpa.bridge.policy import Needs
 from rmpa.core.contract import Contract, Transport

@@ -21,22 +21,24 @@ from rmpa.bridge.direct.conditions import (
     interrupted,
     unmet_by_rules,
 )
-from rmpa.bridge.direct.nodes import bus_links, end_links, forgotten, kernel_tells, publisher_update, standing
+from rmpa.bridge.direct.grants import end_all
 from rmpa.bridge.direct.paths import AGENTS, LOST, Path, Paths
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.topics.subscribers import compares_names
 from rmpa.core.contract import Contract, Transport
-from rmpa.core.identity import is_own
+from rmpa.core.errors import RmpaError
+from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.environment import host_of, is_loopback
-from rmpa.ros.http.rpc import is_own_name
+from rmpa.ros.http.rpc import call, call_api, is_own_name
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.service_client import probe
-from rmpa.ros.wire.slave_api import TCPROS
-from rmpa.ros.wire.xmlrpc import RosReply
+from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply
+from rmpa.runtime.kernel_tcp import connections
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
@@ -44,14 +46,114 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.imports import Imports, RemoteTopic
     from rmpa.bridge.topics.peer_topics import PeerTopics
     from rmpa.ros.node.publication import Publication
+    from rmpa.ros.wire.slave_api import BusLink
 
     TopicPath = Path[RemoteTopic]
 
+MASTER: Final = "/master"
+"""The caller id of ``publisherUpdate``, as rosmaster has it."""
+_STANDING: Final = frozenset({"ESTABLISHED", "SYN_SENT", "CLOSE_WAIT"})
 MEASURING: Final = "/rmpa_topic_"
 """Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
 _TWICE: Final = Unmet(
     Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
 )
+
+
+# --- what subscribers and the kernel are asked ---------------------------------------------------------------------
+
+
+async def publisher_update(uri: str, topic: str, publishers: Sequence[str]) -> bool:
+    """Tell one node the publishers of a topic, as its master does; return whether it took them.
+
+    roscpp hangs up on publishers that are not in the list. Both libraries connect to new ones.
+
+    Args:
+        uri: The node's slave API.
+        topic: The topic.
+        publishers: The slave APIs of the publishers.
+    """
+    params = (MASTER, topic, list(publishers))
+    try:
+        reply = await call_api(uri, "publisherUpdate", *params, timeout=limits.DIRECT_NODE_TIMEOUT)
+    except (RmpaError, RosFault):
+        return False
+    return reply.code == 1
+
+
+async def bus_links(uri: str, topic: str) -> list[BusLink] | None:
+    """The connections of a subscriber for one topic; ``None`` if it does not answer."""
+    try:
+        value = await call(uri, "getBusInfo", OWN_NODE, timeout=limits.DIRECT_NODE_TIMEOUT)
+    except (RmpaError, RosFault):
+        return None
+    return [one for one in read_bus_info(value) if one.inbound and one.topic == topic]
+
+
+async def forgotten(uri: str, topic: str, publisher: str) -> None:
+    """Wait until a subscriber has no connection to a publisher any more, by its own word.
+
+    rospy ignores a publisher in a list while the connection that has just ended is not removed yet, which takes a
+    moment, and longer on a busy machine. At most ``limits.DIRECT_MOVE_WAIT``.
+
+    Args:
+        uri: The subscriber's slave API.
+        topic: The topic.
+        publisher: The publisher's slave API.
+    """
+    deadline = asyncio.get_running_loop().time() + limits.DIRECT_MOVE_WAIT
+    while links := await bus_links(uri, topic):
+        if all(one.other != publisher for one in links) or asyncio.get_running_loop().time() >= deadline:
+            return
+        await asyncio.sleep(limits.DIRECT_LOOK)
+
+
+def kernel_tells() -> bool:
+    """Whether the kernel lists the connections of this machine; without that, two paths cannot be ruled out."""
+    return connections(remote=("127.0.0.1", 1)) is not None
+
+
+def standing(address: str, port: int | None = None) -> dict[int, set[int]]:
+    """The connections from this machine to one address: their local ports, by the remote port.
+
+    One question to the kernel, whatever the number of connections.
+    """
+    found: dict[int, set[int]] = {}
+    for one in connections(remote=(address, port)) or ():
+        if one.state in _STANDING:
+            found.setdefault(one.remote[1], set()).add(one.local[1])
+    return found
+
+
+async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
+    """End connections of a subscriber to a publisher's address, if they still stand; wait until they are gone.
+
+    Args:
+        endpoint: The address and port; other programs may be connected there too.
+        links: The connections, as the subscriber tells them.
+
+    Returns:
+        Empty if none is left, else why they could not be ended.
+    """
+    ports = {link.local_port for link in links if link.local_port is not None}
+
+    def left() -> set[int]:
+        return ports & standing(*endpoint).get(endpoint[1], set())
+
+    if not left():
+        return ""
+    found = connections(remote=endpoint)
+    problem = end_all(found and [one for one in found if one.local[1] in ports])
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + limits.DIRECT_MOVE_WAIT
+    while left():
+        if loop.time() >= deadline:
+            return problem or "the kernel does not end it"
+        await asyncio.sleep(limits.DIRECT_LOOK)
+    return ""
+
+
+# --- the paths -----------------------------------------------------------------------------------------------------
 
 
 class TopicPaths(Paths["RemoteTopic"]):

@@ -10,8 +10,7 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want
-from rmpa.bridge.direct.grants import ServiceGrants
-from rmpa.bridge.direct.nodes import NodePorts, grant_at
+from rmpa.bridge.direct.grants import NodePorts, ServiceGrants, grant_at
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.xmlrpc import RosReply

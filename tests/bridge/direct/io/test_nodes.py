@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.direct.nodes import bus_links, end_all, end_links, publisher_update, standing
+from rmpa.bridge.direct.grants import end_all
+from rmpa.bridge.topics.direct import bus_links, end_links, publisher_update, standing
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription

@@ -12,8 +12,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct import grants
 from rmpa.bridge.direct.conditions import Condition, DirectAsk, Grant, Unmet, Want
-from rmpa.bridge.direct.grants import TopicGrants
-from rmpa.bridge.direct.nodes import NodePorts
+from rmpa.bridge.direct.grants import NodePorts, TopicGrants
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import PermissionGate
 from rmpa.config.settings import TrustSettings
