@@ -20,7 +20,6 @@ from cryptography.x509.oid import NameOID
 from rmpa.trust import limits
 from rmpa.trust.certificates import (
     URN,
-    CertificateError,
     DenyList,
     ca_public_key,
     check_ca,
@@ -29,7 +28,7 @@ from rmpa.trust.certificates import (
     read_request,
     verify,
 )
-from rmpa.trust.permissions import TrustReason
+from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.tokens import fingerprint_of
 from tests.fuzz import target_certificate
 from tests.trust.authority import WALL, Authority, new_key
@@ -41,7 +40,7 @@ DAY = 86_400.0
 
 
 def _refused(data: bytes, wall: float = WALL, *, ca: bytes = LAB.certificate, **kwargs: object) -> TrustReason:
-    with pytest.raises(CertificateError) as caught:
+    with pytest.raises(TrustError) as caught:
         verify(data, ca, wall, **kwargs)  # type: ignore[arg-type] # the test's own words
     assert str(caught.value)
     return caught.value.reason
@@ -155,7 +154,7 @@ def _outcome(data: bytes) -> object:
     """What a certificate says, or why it is refused."""
     try:
         return verify(data, LAB.certificate, WALL)
-    except CertificateError as error:
+    except TrustError as error:
         return error.reason
 
 
@@ -189,7 +188,7 @@ def test_a_request_proves_its_key() -> None:
         changed = request[:offset] + bytes([request[offset] ^ 1]) + request[offset + 1 :]
         try:
             assert read_request(changed) == found, offset
-        except CertificateError:
+        except TrustError:
             continue
         accepted += 1
     assert accepted <= 1  # a spare bit behind the signature
@@ -200,7 +199,7 @@ def test_the_key_of_another_module_is_refused_without_its_signature() -> None:
     body = x509.load_der_x509_csr(own)
     # What the arm's request says, signed by another key: both signatures have 70 to 72 bytes.
     forged = stolen.public_bytes(serialization.Encoding.DER).replace(stolen.signature, body.signature)
-    with pytest.raises(CertificateError):
+    with pytest.raises(TrustError):
         read_request(forged)
 
 
@@ -216,13 +215,13 @@ def test_the_key_of_another_module_is_refused_without_its_signature() -> None:
     ],
 )
 def test_a_request_has_one_valid_name(common: str, uris: list[str]) -> None:
-    with pytest.raises(CertificateError):
+    with pytest.raises(TrustError):
         read_request(_request(new_key(), common, uris))
 
 
 def test_other_keys_are_refused() -> None:
     for key in (ec.generate_private_key(ec.SECP384R1()), ed25519.Ed25519PrivateKey.generate()):
-        with pytest.raises(CertificateError, match="key is not of secp256r1"):
+        with pytest.raises(TrustError, match="key is not of secp256r1"):
             read_request(_request(key, "arm", [URN + "arm"]))
 
 
@@ -251,20 +250,20 @@ def test_a_module_needs_a_valid_name() -> None:
 
 def test_a_ca_is_pinned_by_its_fingerprint() -> None:
     check_ca(LAB.certificate, fingerprint_of(LAB.certificate))
-    with pytest.raises(CertificateError, match="does not have the fingerprint"):
+    with pytest.raises(TrustError, match="does not have the fingerprint"):
         check_ca(LAB.certificate, fingerprint_of(OTHER.certificate))
     for other in (ARM, b"", b"nonsense"):
-        with pytest.raises(CertificateError):
+        with pytest.raises(TrustError):
             check_ca(other, fingerprint_of(other))
     assert ca_public_key(LAB.certificate) == LAB.key.public_key()
-    with pytest.raises(CertificateError):
+    with pytest.raises(TrustError):
         ca_public_key(b"nonsense")
 
 
 @given(st.binary(max_size=200))
 def test_anything_at_all_is_refused(data: bytes) -> None:
     _refused(data)
-    with pytest.raises(CertificateError):
+    with pytest.raises(TrustError):
         read_request(data)
 
 

@@ -12,9 +12,9 @@ pytest.importorskip("cryptography")
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from rmpa.core.errors import LimitExceeded
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.trust import limits
-from rmpa.trust.certificates import DenyEntry, DenyList, DocumentError, KeyList, read_document, sign
+from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, read_document, sign
 from rmpa.trust.packets import GroupKey
 from tests.trust.authority import WALL, Authority, new_key
 
@@ -60,17 +60,17 @@ def test_every_changed_byte_is_refused() -> None:
         changed = document[:offset] + bytes([document[offset] ^ 1]) + document[offset + 1 :]
         try:
             found = read_document(changed, PUBLIC, DenyList)
-        except DocumentError:
+        except RemoteProtocolError:
             continue
         assert found == DENY, offset  # a spare bit of the signature's base64
 
 
 def test_other_signers_and_other_kinds_are_refused() -> None:
-    with pytest.raises(DocumentError, match="not signed by our authority"):
+    with pytest.raises(RemoteProtocolError, match="not signed by our authority"):
         read_document(sign(DENY, new_key()), PUBLIC, DenyList)
-    with pytest.raises(DocumentError, match="not signed by our authority"):
+    with pytest.raises(RemoteProtocolError, match="not signed by our authority"):
         read_document(sign(KEYS, LAB.key), PUBLIC, DenyList)
-    with pytest.raises(DocumentError, match="not signed by our authority"):
+    with pytest.raises(RemoteProtocolError, match="not signed by our authority"):
         read_document(sign(DENY, LAB.key), PUBLIC, KeyList)
 
 
@@ -87,7 +87,7 @@ def test_other_signers_and_other_kinds_are_refused() -> None:
     ],
 )
 def test_signed_nonsense_is_refused(text: str) -> None:
-    with pytest.raises(DocumentError):
+    with pytest.raises(RemoteProtocolError):
         read_document(_signed(text), PUBLIC, DenyList)
 
 
@@ -102,12 +102,12 @@ def test_signed_nonsense_is_refused(text: str) -> None:
     ],
 )
 def test_key_lists_that_cannot_be_are_refused(keys: str) -> None:
-    with pytest.raises(DocumentError):
+    with pytest.raises(RemoteProtocolError):
         read_document(_signed('{"number":1,"keys":' + keys + "}", b"rmpa keys 1"), PUBLIC, KeyList)
 
 
 def test_an_authority_with_a_name_that_cannot_be_is_refused() -> None:
-    with pytest.raises(DocumentError, match="authority"):
+    with pytest.raises(RemoteProtocolError, match="authority"):
         read_document(sign(KeyList(3, KEYS.keys, "my base"), LAB.key), PUBLIC, KeyList)
 
 
@@ -147,5 +147,5 @@ def test_secrets_are_never_shown() -> None:
 def test_anything_at_all_is_refused(data: bytes) -> None:
     form: type[DenyList | KeyList]
     for form in (DenyList, KeyList):
-        with pytest.raises(DocumentError):
+        with pytest.raises(RemoteProtocolError):
             read_document(data, PUBLIC, form)

@@ -27,7 +27,7 @@ from rmpa.cli.trust import (
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
-from rmpa.trust.permissions import InviteReply, JoinStep, TrustReply
+from rmpa.trust.permissions import InviteReply, JoinStep, TrustError, TrustReply
 
 if TYPE_CHECKING:
     from rmpa.cli.trust import TrustPlace
@@ -159,7 +159,7 @@ def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool
         wanted = certificates.read_request(data)
     except OSError as error:
         raise ConfigError(str(request), f"cannot be read: {error.strerror}") from None
-    except (ValueError, certificates.CertificateError) as error:
+    except (ValueError, TrustError) as error:
         remedy = "make it by rmpa trust join --request FILE"
         raise ConfigError(str(request), f"is no request: {error}", remedy) from None
     if module and module != wanted.name:
@@ -371,7 +371,7 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
         raise ConfigError(str(path), f"cannot be read: {error.strerror}") from None
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise ConfigError(str(path), f"is no answer of rmpa trust invite --sign: {error!s:.100}") from None
-    except certificates.CertificateError as error:
+    except TrustError as error:
         text = str(error).replace("of the token", "of --ca")
         raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
     return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)

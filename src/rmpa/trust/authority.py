@@ -14,10 +14,10 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CertificateError, DenyList, KeyList, sign
+from rmpa.trust.certificates import DenyList, KeyList, sign
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.packets import GroupKey
-from rmpa.trust.permissions import Document, TrustReason, server_names
+from rmpa.trust.permissions import Document, TrustError, TrustReason, server_names
 from rmpa.trust.store import Issued, MemberFiles
 from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
 
@@ -141,16 +141,16 @@ class MeshAuthority:
             name: The member that renews its certificate; empty for a module that joins.
 
         Raises:
-            CertificateError: The request is malformed or of another module, or a module with another key has joined
+            TrustError: The request is malformed or of another module, or a module with another key has joined
                 under this name since.
             StartError: The clock is not set, or a file cannot be written.
         """
         asked = certificates.read_request(request)
         if name and asked.name != name:
-            raise CertificateError(TrustReason.NAME, f"{name} asks for a certificate of {asked.name}")
+            raise TrustError(TrustReason.NAME, f"{name} asks for a certificate of {asked.name}")
         last = self._issued.get(asked.name)
         if name and last is not None and last.key not in (b"", asked.public_key):
-            raise CertificateError(TrustReason.REVOKED, f"another module has joined as {name} since")
+            raise TrustError(TrustReason.REVOKED, f"another module has joined as {name} since")
         ca = self.membership.files.ca
         hosts, wall = self._granted(asked), self._wall_for(asked.name)
         certificate = certificates.issue(asked, ca, self._ca_key, _serial(), wall, hosts=hosts)
@@ -181,7 +181,7 @@ class MeshAuthority:
         """The certificate (DER) of a module that was away, if it may be renewed.
 
         Raises:
-            CertificateError: It is of another CA, ended too long ago, or was revoked.
+            TrustError: It is of another CA, ended too long ago, or was revoked.
         """
         member = self.membership
         return certificates.verify(

@@ -5,11 +5,6 @@ Certificates: the CA of a mesh, requests, and certificates that prove a module's
 Keys are P-256. A module's certificate has its name as CN and as SAN ``urn:rmpa:<name>``; the SAN decides. This module
 needs the library ``cryptography`` (extra ``rmpa[trust]``); links do without it, as OpenSSL checks the chain there.
 For browsers, which ``rmpa web`` serves with it, it has names and addresses of its host too (``page_names``).
-
-Errors::
-
-    TrustError
-    └── CertificateError    a certificate or a request is refused; ``reason`` is the word for it
 """
 
 from __future__ import annotations
@@ -52,10 +47,6 @@ _ALGORITHM: Final = ec.ECDSA(hashes.SHA256())
 _Number = Annotated[int, msgspec.Meta(ge=0, le=UINT32_MAX)]
 _ModuleName = Annotated[str, msgspec.Meta(pattern=rf"\A{BASE_NAME}\Z", max_length=PEER_NAME_MAX)]
 _NameOrNone = Annotated[str, msgspec.Meta(pattern=rf"\A({BASE_NAME})?\Z", max_length=PEER_NAME_MAX)]
-
-
-class DocumentError(RemoteProtocolError):
-    """A document is malformed, or not signed by the authority."""
 
 
 class _Signed(msgspec.Struct, frozen=True):
@@ -157,7 +148,7 @@ def read_document(data: bytes, key: ec.EllipticCurvePublicKey, form: type[_T]) -
 
     Raises:
         LimitExceeded: It is too long.
-        DocumentError: It is malformed, or not signed with that key.
+        RemoteProtocolError: It is malformed, or not signed with that key.
     """
     if len(data) > limits.DOCUMENT_MAX:
         raise LimitExceeded("a signed document", len(data), limits.DOCUMENT_MAX)
@@ -166,9 +157,9 @@ def read_document(data: bytes, key: ec.EllipticCurvePublicKey, form: type[_T]) -
         key.verify(envelope.signature, _under_signature(form, envelope.signed), _ALGORITHM)
         return msgspec.json.decode(envelope.signed, type=form)
     except InvalidSignature:
-        raise DocumentError("the document is not signed by our authority") from None
+        raise RemoteProtocolError("the document is not signed by our authority") from None
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-        raise DocumentError(f"the document cannot be read: {error!s:.200}") from None
+        raise RemoteProtocolError(f"the document cannot be read: {error!s:.200}") from None
 
 
 def _under_signature(form: type[msgspec.Struct], text: str) -> bytes:
@@ -190,10 +181,6 @@ _UNREADABLE: Final = (
     x509.UnsupportedGeneralNameType,
 )
 """What ``cryptography`` raises about malformed input."""
-
-
-class CertificateError(TrustError):
-    """A certificate or a request is refused; a request that is malformed is ``foreign``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,14 +233,14 @@ class ModuleCertificate:
         begin = self.issued - limits.CERTIFICATE_BACKDATE
         if wall is not None and wall < begin:
             text = f"the certificate of {self.name} begins in {begin - wall:.0f} s: one of the clocks is off"
-            raise CertificateError(TrustReason.CLOCK, text)
+            raise TrustError(TrustReason.CLOCK, text)
         if wall is not None and wall > self.expires + grace:
             text = f"the certificate of {self.name} ended {wall - self.expires:.0f} s ago"
-            raise CertificateError(TrustReason.EXPIRED, text)
+            raise TrustError(TrustReason.EXPIRED, text)
         if name and self.name != name:
-            raise CertificateError(TrustReason.NAME, f"the certificate is of {self.name}, not of {name}")
+            raise TrustError(TrustReason.NAME, f"the certificate is of {self.name}, not of {name}")
         if deny is not None and deny.denies(self.name, self.issued):
-            raise CertificateError(TrustReason.REVOKED, f"{self.name} was revoked (deny list {deny.number})")
+            raise TrustError(TrustReason.REVOKED, f"{self.name} was revoked (deny list {deny.number})")
 
     def __str__(self) -> str:
         """``arm (certificate 1f0a…)``."""
@@ -367,21 +354,21 @@ def read_request(data: bytes) -> CertificateRequest:
     """Read a request (DER), and check that its sender has the key.
 
     Raises:
-        CertificateError: It is too long, malformed, or wrongly signed; or key or name are not allowed.
+        TrustError: It is too long, malformed, or wrongly signed; or key or name are not allowed.
     """
     if len(data) > limits.CSR_MAX:
-        raise CertificateError(TrustReason.FOREIGN, f"a request of {len(data)} bytes")
+        raise TrustError(TrustReason.FOREIGN, f"a request of {len(data)} bytes")
     try:
         request = x509.load_der_x509_csr(data)
         key = request.public_key()
         valid = isinstance(key, ec.EllipticCurvePublicKey) and request.is_signature_valid
         name, hosts = _module_name(request), page_hosts(sorted(_hosts_in(request)))
     except _UNREADABLE as error:
-        raise CertificateError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
+        raise TrustError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
     if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != CURVE.name:
-        raise CertificateError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
+        raise TrustError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
     if not valid:
-        raise CertificateError(TrustReason.FOREIGN, "the request is not signed with its own key")
+        raise TrustError(TrustReason.FOREIGN, "the request is not signed with its own key")
     return CertificateRequest(name, _public_bytes(key), hosts)
 
 
@@ -399,7 +386,7 @@ def verify(
         grace: Seconds for which an expired certificate is still accepted, to be renewed.
 
     Raises:
-        CertificateError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of
+        TrustError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of
             these.
     """
     found = _read(data, ca)
@@ -410,7 +397,7 @@ def verify(
 def _read(data: bytes, ca: bytes) -> ModuleCertificate:
     """What a certificate says, if the CA has signed it for a module."""
     if len(data) > limits.CERTIFICATE_MAX:
-        raise CertificateError(TrustReason.FOREIGN, f"a certificate of {len(data)} bytes")
+        raise TrustError(TrustReason.FOREIGN, f"a certificate of {len(data)} bytes")
     authority = x509.load_der_x509_certificate(ca)
     try:
         certificate = x509.load_der_x509_certificate(data)
@@ -419,12 +406,12 @@ def _read(data: bytes, ca: bytes) -> ModuleCertificate:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
         key = certificate.public_key()
     except InvalidSignature:
-        raise CertificateError(TrustReason.FOREIGN, "the certificate is of another CA") from None
+        raise TrustError(TrustReason.FOREIGN, "the certificate is of another CA") from None
     except (*_UNREADABLE, x509.ExtensionNotFound) as error:
         text = f"the certificate is of another CA, or cannot be read: {error!s:.200}"
-        raise CertificateError(TrustReason.FOREIGN, text) from None
+        raise TrustError(TrustReason.FOREIGN, text) from None
     if constraints.ca or not isinstance(key, ec.EllipticCurvePublicKey):
-        raise CertificateError(TrustReason.FOREIGN, "the certificate is not one of a module")
+        raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a module")
     issued = certificate.not_valid_before_utc.timestamp() + limits.CERTIFICATE_BACKDATE
     expires = certificate.not_valid_after_utc.timestamp()
     return ModuleCertificate(name, certificate.serial_number, issued, expires, _public_bytes(key), hosts)
@@ -434,30 +421,30 @@ def check_ca(data: bytes, fingerprint: bytes) -> None:
     """Check that a CA's certificate (DER) has a fingerprint, and that it is signed by itself.
 
     Raises:
-        CertificateError: It has another fingerprint, or is not a CA.
+        TrustError: It has another fingerprint, or is not a CA.
     """
     if len(data) > limits.CERTIFICATE_MAX or hashlib.sha256(data).digest()[: len(fingerprint)] != fingerprint:
-        raise CertificateError(TrustReason.FOREIGN, "the CA does not have the fingerprint of the token")
+        raise TrustError(TrustReason.FOREIGN, "the CA does not have the fingerprint of the token")
     try:
         certificate = x509.load_der_x509_certificate(data)
         certificate.verify_directly_issued_by(certificate)
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except (*_UNREADABLE, InvalidSignature, x509.ExtensionNotFound) as error:
-        raise CertificateError(TrustReason.FOREIGN, f"the CA's certificate cannot be used: {error!s:.200}") from None
+        raise TrustError(TrustReason.FOREIGN, f"the CA's certificate cannot be used: {error!s:.200}") from None
     if not constraints.ca:
-        raise CertificateError(TrustReason.FOREIGN, "the certificate is not one of a CA")
+        raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a CA")
 
 
 def ca_public_key(ca: bytes) -> ec.EllipticCurvePublicKey:
     """The key of a CA's certificate (DER), which documents are verified with.
 
     Raises:
-        CertificateError: It cannot be read, or has no such key.
+        TrustError: It cannot be read, or has no such key.
     """
     try:
         return _authority_key(x509.load_der_x509_certificate(ca))
     except _UNREADABLE as error:
-        raise CertificateError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
+        raise TrustError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
 
 
 def _authority_key(authority: x509.Certificate) -> ec.EllipticCurvePublicKey:

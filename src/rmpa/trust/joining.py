@@ -16,9 +16,9 @@ from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
 from rmpa.trust import certificates, limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import CertificateError, DenyList, KeyList, read_document
+from rmpa.trust.certificates import DenyList, KeyList, read_document
 from rmpa.trust.membership import new_key, private_key
-from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustReason, TrustStatus
+from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, join_context, member_context
 from rmpa.trust.tokens import (
     LENGTH,
@@ -120,7 +120,7 @@ class JoinServer:
             before = self._authority.judge_renewal(presented)
             grant = self._authority.grant(asked.request, before.name)
             _log.info("= %s at %s has a new certificate; it was away", before.name, host)
-        except CertificateError as error:
+        except TrustError as error:
             refused = JoinRefused(error.reason.label, str(error))
         except StartError as error:
             refused = JoinRefused("clock" if self._authority.membership.wall() is None else "authority", str(error))
@@ -269,7 +269,7 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
         certificates.check_ca(grant.ca, token.fingerprint)
         certificates.verify(server, grant.ca, None)
         check_grant(grant, name, request)
-    except certificates.CertificateError as error:
+    except TrustError as error:
         raise _refused(error.reason.label, str(error)) from None
     return MemberFiles(pem, grant.certificate, grant.ca, grant.keys, grant.deny)
 
@@ -278,12 +278,12 @@ def check_grant(grant: CertificateGrant, name: str, request: bytes) -> None:
     """Check that a grant, whose CA is the right one, is for this module and its request (DER).
 
     Raises:
-        CertificateError: The certificate is of another CA, module or key.
-        DocumentError: A document is malformed, or not signed by the CA.
+        TrustError: The certificate is of another CA, module or key.
+        RemoteProtocolError: A document is malformed, or not signed by the CA.
     """
     found = certificates.verify(grant.certificate, grant.ca, None, name=name)
     if found.public_key != certificates.read_request(request).public_key:
-        raise certificates.CertificateError(TrustReason.FOREIGN, "the certificate is of another key")
+        raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
     key = certificates.ca_public_key(grant.ca)
     read_document(grant.keys, key, KeyList)
     if grant.deny:

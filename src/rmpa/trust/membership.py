@@ -166,7 +166,7 @@ class Membership:
 
         Raises:
             LimitExceeded: It is too long.
-            DocumentError: It is malformed, or not signed by this mesh's authority.
+            RemoteProtocolError: It is malformed, or not signed by this mesh's authority.
         """
         if kind is Document.DENY:
             deny = read_document(data, self._ca_key, DenyList)
@@ -198,12 +198,12 @@ class Membership:
         """Take a newer certificate (DER) of this module and its key: links that come up from now on have it.
 
         Raises:
-            CertificateError: It is of another CA, another module, another key, or not valid now.
+            TrustError: It is of another CA, another module, another key, or not valid now.
             StartError: It cannot be written; the one before goes on.
         """
         found = certificates.verify(certificate, self.files.ca, self.wall(), name=self.name)
         if found.public_key != self.certificate.public_key:
-            raise certificates.CertificateError(TrustReason.FOREIGN, "the certificate is of another key")
+            raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
         self.store.write(files_of.CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
         self.certificate, self.files = found, replace(self.files, certificate=certificate)
         self._make_contexts()

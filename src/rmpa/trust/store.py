@@ -301,7 +301,7 @@ def modules_with_keys(state: Path) -> list[str]:
     if not is_folder(state):
         return []
     try:
-        names = sorted(entry.name for entry in os.scandir(state) if entry.is_symlink() or entry.is_dir())
+        names = _modules_in(state)
     except OSError as error:
         raise StartError(str(state), f"cannot be read: {error.strerror}", _USER) from None
     return [name for name in names if TrustStore(state, name).exists]
@@ -484,17 +484,17 @@ def _refused(module: str, others: str, start: list[str]) -> StartError:
 def _keys_in(place: Path) -> list[str]:
     """The modules with keys in a state directory that is not in use; none if it is another user's."""
     try:
-        return modules_with_keys(place)
-    except StartError:
-        # A folder of ours that is broken there says that there may be keys; one that we may not even see, that it is
-        # another user's.
-        try:
-            return [entry.name for entry in place.iterdir() if _may_have_keys(place, entry.name)]
-        except OSError:
-            return []
+        return [name for name in _modules_in(place) if _may_have_keys(place, name)]
+    except OSError:
+        return []
+
+
+def _modules_in(state: Path) -> list[str]:
+    return sorted(entry.name for entry in os.scandir(state) if entry.is_symlink() or entry.is_dir())
 
 
 def _may_have_keys(place: Path, name: str) -> bool:
+    """Whether a module has keys, or a folder of its own that is broken says that it may have."""
     try:
         return TrustStore(place, name).exists
     except StartError:

@@ -29,9 +29,10 @@ from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import store as files_of
 from rmpa.trust.authority import MeshAuthority, found_mesh, request_der, request_pem
-from rmpa.trust.certificates import CertificateError, make_request
+from rmpa.trust.certificates import make_request
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
 from rmpa.trust.membership import Membership, new_key, private_key
+from rmpa.trust.permissions import TrustError
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, TrustStore, join_context, member_context
 from rmpa.trust.tokens import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
 from tests.trust.authority import WALL
@@ -269,7 +270,7 @@ async def test_a_revoked_name_can_be_invited_again_at_once(lab: Lab) -> None:
     async with running(lab):
         before = lab.member(await lab.join(lab.invite()))
         lab.authority.revoke("arm")
-        with pytest.raises(CertificateError, match="arm was revoked"):
+        with pytest.raises(TrustError, match="arm was revoked"):
             lab.base.judge_member(before.files.certificate, "arm")
         again = lab.member(await lab.join(lab.invite()))
         lab.base.judge_member(again.files.certificate, "arm")
@@ -286,7 +287,7 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
         lab.clock.wall_seconds -= DAY / 2
         lab.authority.revoke("arm")
         lab.clock.wall_seconds += DAY / 2
-        with pytest.raises(CertificateError, match="arm was revoked"):
+        with pytest.raises(TrustError, match="arm was revoked"):
             lab.base.judge_member(arm.files.certificate, "arm")
 
 
@@ -337,7 +338,7 @@ async def test_a_module_whose_name_another_one_has_by_now_renews_no_certificate(
                 await renew_at_authority(old, "127.0.0.1", lab.port)
         assert sum("refused a renewal by" in text for text in caplog.messages) == 1, "it does not fill the log"
         again = MeshAuthority(lab.base)
-        with pytest.raises(CertificateError, match="another module has joined as arm"):
+        with pytest.raises(TrustError, match="another module has joined as arm"):
             again.issue(old.request(), "arm")
         await renew_at_authority(new, "127.0.0.1", lab.port)
 

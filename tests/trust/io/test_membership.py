@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from rmpa.core.errors import StartError
+from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import DenyList, DocumentError, KeyList, sign
+from rmpa.trust.certificates import DenyList, KeyList, sign
 from rmpa.trust.membership import Membership
 from rmpa.trust.packets import GroupKey, Verdict
 from rmpa.trust.permissions import Document, TrustError, TrustReason
@@ -123,9 +123,9 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
 
 def test_a_document_of_another_authority_changes_nothing(mesh: SecuredMesh, tmp_path: Path) -> None:
     base, other = mesh.member("base"), SecuredMesh(tmp_path).authority
-    with pytest.raises(DocumentError):
+    with pytest.raises(RemoteProtocolError):
         base.accept_document(Document.DENY, sign(DenyList().with_name("arm", WALL), other.key))
-    with pytest.raises(DocumentError):
+    with pytest.raises(RemoteProtocolError):
         base.accept_document(Document.KEYS, sign(KEYS, other.key))
     assert (base.deny.number, base.keys.number) == (0, 1)
 
@@ -183,7 +183,7 @@ def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart
 
 
 def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:
-    from rmpa.trust.certificates import CertificateError, CertificateRequest, issue
+    from rmpa.trust.certificates import CertificateRequest, issue
 
     base = mesh.member("base")
     before = base.server_context
@@ -194,9 +194,9 @@ def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:
     assert base.certificate.expires == WALL + 11 * DAY
     assert base.server_context is not before
     assert Membership.load(base.store, mesh.clock, mesh.clock.wall).certificate.serial == 77
-    with pytest.raises(CertificateError, match="of another key"):
+    with pytest.raises(TrustError, match="of another key"):
         base.renewed(mesh.authority.module("base", WALL + 4 * DAY))
-    with pytest.raises(CertificateError, match="of arm, not of base"):
+    with pytest.raises(TrustError, match="of arm, not of base"):
         base.renewed(mesh.authority.module("arm", WALL + 4 * DAY))
 
 
