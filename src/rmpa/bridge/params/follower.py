@@ -42,6 +42,7 @@ class Followed:
         known: Whether the owner's value, or its absence, is known.
         had: Whether this run of the owner has had a value. Before that, an absent value does not delete the one here.
         due: Whether the local core is to be compared with the owner's value, and set.
+        told: Whether the owner's value has come since the last comparison; else what differs was changed here.
         doubted: Whether the local core has reported a change of it since the last comparison.
         problem: Why it is not followed, or empty.
     """
@@ -53,6 +54,7 @@ class Followed:
     known: bool = False
     had: bool = False
     due: bool = False
+    told: bool = False
     doubted: bool = False
     problem: str = ""
 
@@ -227,7 +229,7 @@ class Params(Part):
                 continue
             entry.problem, entry.text, entry.known = "", text, True
             entry.had = entry.had or text is not None
-            entry.due = entry.had
+            entry.due = entry.told = entry.had
         self._work_soon()
 
     # --- the local core ------------------------------------------------------------------------------------------
@@ -242,14 +244,16 @@ class Params(Part):
             await self._reset_time(self._time_before.pop())
         for entry in list(self.followed):
             if restarted:
+                entry.due = entry.told = entry.known and entry.had
+            elif entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL:
                 entry.due = entry.known and entry.had
-            elif entry.known and not entry.due and (entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL):
-                await self._compare(entry)
         refused = {entry.peer for entry in self.followed if not entry.known}
         for session in self._shared.sessions.linked():
             if session.peer in refused:
                 self._ask(session)
         self._work_soon()
+        if self._working is not None:
+            await asyncio.wait([self._working])
 
     async def _reset_time(self, text: str | None) -> None:
         """Set ``/use_sim_time`` as it was: with it and no clock a node that starts stands at time 0."""
@@ -282,8 +286,8 @@ class Params(Part):
 
     async def _apply(self, entry: Followed) -> None:
         """Set a value here, unless it is there already; a malformed text changes nothing."""
-        text, key = entry.text, entry.rule.to
-        entry.due = False
+        text, key, told = entry.text, entry.rule.to, entry.told
+        entry.due = entry.told = entry.doubted = False
         if sum(len(each.text or "") for each in self.followed) > limits.FOLLOWED_BYTES_MAX:
             entry.text, entry.known = None, False
             raise RemoteProtocolError(f"more than {limits.FOLLOWED_BYTES_MAX >> 20} MiB of parameters are followed")
@@ -291,12 +295,14 @@ class Params(Part):
             value = await read_text(text) if text is not None else None
             if key not in self._core.subscribed:
                 await self._core.follow(key)
-            await self._bring(entry, value)
+            if await self._bring(entry, value) and not told:
+                text = f"{key} was changed here, and is put back: it belongs to {entry.rule.owner} ([[param]])"
+                self._refuse("param.put_back", key, text)
         except RemoteProtocolError:
             entry.text, entry.known = None, False
             raise
         except RmpaError:
-            entry.due = True
+            entry.due, entry.told = True, told
             raise
         entry.problem = ""
 
@@ -314,22 +320,6 @@ class Params(Part):
             await self._core.set(key, value)
         _log.info("= %s: %s", entry.rule, f"{len(text)} characters" if text is not None else "deleted over there")
         return True
-
-    async def _compare(self, entry: Followed) -> None:
-        """Put back, and log, a followed parameter that a local node has changed."""
-        if entry.text is None and not entry.had:
-            return
-        entry.doubted = False
-        try:
-            value = await read_text(entry.text) if entry.text is not None else None
-            if await self._bring(entry, value):
-                text = (
-                    f"{entry.rule.to} was changed here, and is put back: it belongs to {entry.rule.owner} ([[param]])"
-                )
-                self._refuse("param.put_back", entry.rule.to, text)
-        except RmpaError as error:
-            entry.doubted = True
-            self._refuse("param.failed", str(entry.rule), f"{entry.rule} cannot be put back: {error}")
 
     def _refuse(self, kind: str, who: str, text: str) -> None:
         self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)

@@ -484,6 +484,21 @@ async def test_a_core_that_is_started_anew_gets_all_of_it_again(sides: Any) -> N
     await until(lambda: pad.core.get("/arm") == 2)
 
 
+async def test_what_the_core_did_not_take_at_once_is_not_taken_for_a_change_of_a_node_here(
+    sides: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    base, pad = Side("base"), Side("pad", follows(ARM))
+    sides(base, pad)
+    base.core.set("/arm", 1)
+    pad.core.down = True
+    join(base, pad)
+    await until(lambda: pad.states() == {"/arm": "refused"})
+    pad.core.down = False
+    await pad.look()
+    assert pad.core.get("/arm") == 1
+    assert "put back" not in caplog.text
+
+
 async def test_a_lost_notification_is_noticed(sides: Any) -> None:
     base, pad = Side("base"), Side("pad", follows(ARM))
     sides(base, pad)
