@@ -88,7 +88,7 @@ async def settled(world: World) -> None:
     """Let all come that is kept: a few messages for each acknowledgement."""
     await world.rest(5.0)
     for side in world.sides:
-        while any(leg.reliable and leg.sender.pending for leg in side.bridge.topics.outbound._senders.values()):  # type: ignore[attr-defined] # reliable
+        while any(leg.reliable and leg.sender.pending for leg in side.bridge.topics.outbound.senders.values()):  # type: ignore[attr-defined] # reliable
             await world.rest(1.0)
 
 

@@ -137,7 +137,7 @@ async def an_owed_acknowledgement(world: World) -> None:
     for _ in range(20):
         await asyncio.sleep(0.001)
         world.carry(1, "express", 1 << 20)
-        if not a.bridge.topics.outbound._senders:  # the answer to what it asked for takes its time
+        if not a.bridge.topics.outbound.senders:  # the answer to what it asked for takes its time
             world.carry(0, "express", 1 << 20)
     await world.rest(1.0)
     for speaker in (first, second):

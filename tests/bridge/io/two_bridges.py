@@ -295,7 +295,7 @@ class World:
             bridge = side.bridge
             assert not bridge.topics.exports._flows
             assert not bridge.topics.outbound.flows
-            assert not bridge.topics.outbound._senders
+            assert not bridge.topics.outbound.senders
             assert not bridge.topics.outbound._parked
             for attached in side.attached:
                 topics = bridge.topics.of(attached)

@@ -328,11 +328,6 @@ class ExportFlow:
         self.oversized = self.oversized_bytes = 0
         """Messages that were left out because they are too long; size of the last one, in bytes."""
 
-    def left_out(self, size: int) -> None:
-        """Count a message of ``size`` bytes that was too long."""
-        self.oversized += 1
-        self.oversized_bytes = size
-
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""
         self.latching = True

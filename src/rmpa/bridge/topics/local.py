@@ -116,7 +116,8 @@ class LocalSubscriptions:
         self._find = find
         self.flows: dict[Source, ExportFlow] = {}
         """The flow of each source that the agent is connected to, for snapshots."""
-        self._senders: dict[tuple[int, int], RouteSender] = {}
+        self.senders: dict[tuple[int, int], RouteSender] = {}
+        """The sender of each open route, by its peer and its id."""
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))
@@ -147,7 +148,7 @@ class LocalSubscriptions:
             on_header=lambda fields: self._header(source, fields),
             on_refused=lambda text: self._gone(source, flow, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, flow, reason),
-            on_oversized=lambda size: self._left_out(source, flow, size),
+            on_oversized=lambda size: self._losses.oversized(source, flow, size),
             number=self._node.next_number(),
             find=find,
         )
@@ -185,7 +186,7 @@ class LocalSubscriptions:
         else:
             self.remove_route(source, peer)
             sender = flow.add(peer, link, route.number, route.contract, route.epoch)
-        self._senders[peer, route.number] = sender
+        self.senders[peer, route.number] = sender
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
         """Keep a reliable source's messages for an absent peer, for a time in seconds; best effort keeps none."""
@@ -239,20 +240,16 @@ class LocalSubscriptions:
             for source in counts:
                 self._exports.given_up(source, peer)
 
-    def sender(self, peer: int, route: int) -> RouteSender | None:
-        """The sender of a peer's route; ``None`` if the route is not open."""
-        return self._senders.get((peer, route))
-
     def lane_lost(self, peer: int) -> None:
         """Report the loss of a peer's bulk lane to its routes."""
-        for (owner, _), route_sender in list(self._senders.items()):
+        for (owner, _), route_sender in list(self.senders.items()):
             if owner == peer:
                 route_sender.lane_lost()
 
     def _forget(self, peer: int, sender: RouteSender | None) -> None:
         """Takes no marks of a route any more; of a suspended one another route may have the id since."""
-        if sender is not None and self._senders.get((peer, sender.route)) is sender:
-            del self._senders[peer, sender.route]
+        if sender is not None and self.senders.get((peer, sender.route)) is sender:
+            del self.senders[peer, sender.route]
 
     def close(self) -> None:
         """Disconnect all publishers."""
@@ -270,10 +267,6 @@ class LocalSubscriptions:
         if description.latching:
             self.flows[source].latch()
         self._exports.described(source, description)
-
-    def _left_out(self, source: Source, flow: ExportFlow, size: int) -> None:
-        flow.left_out(size)
-        self._losses.oversized(source, flow)
 
     def _gone(self, source: Source, flow: ExportFlow, reason: str) -> None:
         if self.flows.get(source) is not flow:

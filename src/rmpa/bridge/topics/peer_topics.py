@@ -351,10 +351,11 @@ class LossReports:
         text = f"{source}: {name} has missed {count} messages: it was away for longer than they were kept"
         self._out.warn("route.missed", f"{name} {source}", text)
 
-    def oversized(self, source: Source, flow: ExportFlow) -> None:
-        """Report a message that is too long, in the log and to the peers to which its source flows."""
-        bound = ros_limits.TCPROS_MESSAGE_MAX
-        text = f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {bound} cross"
+    def oversized(self, source: Source, flow: ExportFlow, size: int) -> None:
+        """Count a message that is too long, and report it in the log and to the peers to which its source flows."""
+        flow.oversized += 1
+        flow.oversized_bytes = size
+        text = f"{source}: a message of {size} bytes is left out, at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
         self._out.warn("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
         for peer in self._exports.flowing(source):
             self.tell_oversized(source, flow, peer)

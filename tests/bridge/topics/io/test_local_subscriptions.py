@@ -42,5 +42,5 @@ async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_
     publications[0].withdraw()
     await until(lambda: len(described) == 2)
     assert subscriptions.flows[SOURCE].by_peer[1].route == 7
-    assert subscriptions.sender(1, 7) is subscriptions.flows[SOURCE].by_peer[1]
+    assert subscriptions.senders[1, 7] is subscriptions.flows[SOURCE].by_peer[1]
     subscriptions.close()
