@@ -141,9 +141,7 @@ class Nodes(Part):
             self._soon = asyncio.get_running_loop().call_later(limits.NODES_PAUSE, self._tell)
 
     def _tell(self) -> None:
-        if self._soon is not None:
-            self._soon.cancel()
-            self._soon = None
+        self._soon = None
         crossing = {source.node for source in self._topics.exports.offered}
         crossing |= {server.node for server in self._services.exports.offered.values()}
         nodes = [

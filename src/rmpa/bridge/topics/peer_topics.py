@@ -72,6 +72,8 @@ class PeerTopic(PublicationEvents):
         entry: The source.
     """
 
+    __slots__ = ("_peer", "flow", "node", "publication", "source", "topic", "type")
+
     def __init__(self, peer: PeerTopics, entry: RemoteTopic) -> None:
         self._peer = peer
         self.source, self.type = entry.wire, entry.type
