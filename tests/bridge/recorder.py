@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
+from rmpa.bridge.offers import Effects
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import exports as service_exports
 from rmpa.bridge.services import imports as service_imports
@@ -156,12 +157,7 @@ class ForgetAbout(NamedTuple):
     service: str
 
 
-class Out(
-    topic_exports.ExportEffects,
-    topic_imports.ImportEffects,
-    service_exports.ServiceExportEffects,
-    service_imports.ServiceImportEffects,
-):
+class Out(Effects):
     """What a part of the bridge does for its exports and imports."""
 
     def __init__(
@@ -174,6 +170,7 @@ class Out(
         self.rules = context
         self.rng = rng
         self._numbering = numbering
+        self.outbound = self.serving = self
         self.done: list[Any] = []
         self._position = position
 

@@ -26,7 +26,6 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 from tests.bridge.recorder import (
@@ -286,7 +285,7 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
     assert changed(imports, new) == []
     entry = imports.get(1, Source("/a", "/n"))
     assert entry is not None
-    assert (entry.state, entry.route) == (RouteState.OPEN, 1)
+    assert (entry.state, entry.route) == ("open", 1)
     assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
 
 

@@ -85,7 +85,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     Keys are local names; a subclass says what an entry is, whether it may cross, and what its peers are told.
 
     Args:
-        out: Has the rules (``context``); sends messages and warns.
+        out: Has the rules, sends messages and warns; the part itself, which also does what the kind of entry needs.
     """
 
     kind: ClassVar[str]
@@ -101,6 +101,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     def __init__(self, out: Effects) -> None:
         self._out = out
+        self._do: Any = out
         self.seen: dict[KeyT, LocalT] = {}
         """What the local graph has, whether it crosses or not."""
         self.offered: dict[KeyT, LocalT] = {}
@@ -475,7 +476,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     """What peers offer, and what of it is in the local graph.
 
     Args:
-        out: Has the rules (``context``); sends messages, warns, and changes the local graph.
+        out: Has the rules, sends messages and warns; the part itself, which also changes the local graph.
     """
 
     kind: ClassVar[str]
@@ -483,6 +484,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     def __init__(self, out: Effects) -> None:
         self._out = out
+        self._do: Any = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(out.context.gate.may_relay)
         """Selects the path to each module that relays offer."""

@@ -146,7 +146,7 @@ class ServicesSection:
             node=remote.node,
             direction="in",
             peer=self._services.imports.peer_name(peer),
-            state=remote.state.name.lower() if remote.shown else "hidden",
+            state=remote.state if remote.shown else "hidden",
             wire=remote.wire if remote.wire != remote.name else "",
             type=remote.about.type if remote.about else "",
             md5=remote.about.md5sum if remote.about else "",

@@ -19,7 +19,6 @@ from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
 from rmpa.bridge.offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
-from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Transport
@@ -297,7 +296,7 @@ class TopicsSection:
         idle: set[str] = set()
         first, problems = set(state.subscribers), set()
         for _, source, entry in yielding_to_data(list(bridge.imports)):
-            if entry.state is not RouteState.IDLE or entry.direct:
+            if entry.state != "idle" or entry.direct:
                 first.add(entry.topic)
             elif not entry.shown or entry.problem or bridge.mismatches(source):
                 problems.add(entry.topic)
@@ -344,14 +343,14 @@ class TopicsSection:
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
         problem = at.proxies.problems.get(source.node, "")
-        if not problem and entry.state is not RouteState.OPEN:
+        if not problem and entry.state != "open":
             problem = entry.problem
         info = RouteInfo(
             peer=at.link.name,
             node=source.node,
             direction="in",
             wire=source.topic if source.topic != entry.topic else "",
-            state="hidden" if not entry.shown else entry.state.name.lower(),
+            state="hidden" if not entry.shown else entry.state,
             type=entry.type,
             md5=about.md5 if about is not None else "",
             dropped=publication.dropped if publication is not None else 0,

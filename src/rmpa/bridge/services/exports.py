@@ -50,31 +50,14 @@ class ServiceRoute:
     requests: int = 0
 
 
-class ServiceExportEffects(Effects):
-    """What is done for services of this module that peers call; for subclasses."""
-
-    def probe(self, service: str, server: LocalService) -> None:
-        """Ask a server for its types; ``described`` or ``refused`` follows."""
-
-    def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
-        """Serve a peer's calls: requests come in on ``route.requests``, replies go out on the route ``number``."""
-
-    def end_route(self, peer: int, requests: int) -> None:
-        """End an open route: no more requests come, and replies of calls under way are dropped."""
-
-    def server_gone(self, service: str) -> None:
-        """Close the connections to a server that left or was replaced."""
-
-
 class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
     """The outbound half: services of this module, called by peers."""
 
     kind, warning, access, owner = "services", "services.too_many", Access.CALL, "its server"
     renews = True  # behind another server what peers know of a service may not be true any more
 
-    def __init__(self, out: ServiceExportEffects) -> None:
+    def __init__(self, out: Effects) -> None:
         super().__init__(out)
-        self._out: ServiceExportEffects = out
         self.about: dict[str, ServiceDescription] = {}
         """What the servers of services have said of them."""
         self._routes: dict[int, dict[int, ServiceRoute]] = {}
@@ -139,7 +122,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         super().link_down(peer)
         for route in self._routes.pop(peer, {}).values():
             if route.requests:
-                self._out.end_route(peer, route.requests)
+                self._do.serving.end_route(peer, route.requests)
 
     def opened(self, peer: int, message: OpenService) -> None:
         """Open a service for a peer, or answer with ``ServiceClosed`` and the reason.
@@ -162,7 +145,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             if service in self.about:
                 self._start(service)
             elif not probing:
-                self._out.probe(service, self.offered[service])
+                self._do.serving.probe(service, self.offered[service])
             return
         self._out.send(peer, ServiceClosed(number, why))
 
@@ -173,7 +156,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """
         route = self._routes[peer].pop(message.route, None)
         if route is not None and route.requests:
-            self._out.end_route(peer, route.requests)
+            self._do.serving.end_route(peer, route.requests)
 
     def described(self, service: str, server: LocalService, about: ServiceDescription) -> None:
         """Store what a server said of its service, and open the routes that waited for it.
@@ -197,7 +180,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
             if not route.requests:
                 self._serial += 2
                 route.requests = limits.SERVICE_ROUTES + self._serial
-                self._out.serve(peer, number, route, self.offered[service])
+                self._do.serving.serve(peer, number, route, self.offered[service])
                 types = (about.type, about.md5sum, about.request_type, about.response_type)
                 self._out.send(peer, ServiceOpened(number, route.requests, *types))
 
@@ -205,10 +188,10 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         self.about.pop(key, None)
         for peer, number, _ in self._of(key):
             self._close(peer, number, f"{key}: {reason}")
-        self._out.server_gone(key)
+        self._do.serving.server_gone(key)
 
     def _close(self, peer: int, number: int, reason: str) -> None:
         route = self._routes[peer].pop(number)
         if route.requests:
-            self._out.end_route(peer, route.requests)
+            self._do.serving.end_route(peer, route.requests)
         self._out.send(peer, ServiceClosed(number, reason[: limits.CONTROL_TEXT_MAX]))

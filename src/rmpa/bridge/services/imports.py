@@ -16,7 +16,6 @@ Until then a client's probe is answered without a message to the peer.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum, auto
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
@@ -38,17 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
 
-class ServiceRouteState(Enum):
-    """Whether a service of a peer can be called now."""
-
-    IDLE = auto()
-    """No route is open or asked for."""
-    OPENING = auto()
-    """The route is asked for, and the peer has not answered."""
-    OPEN = auto()
-    """The service can be called."""
-
-
 @dataclass(slots=True, eq=False, kw_only=True)
 class RemoteService(Remote[str]):
     """One service of one peer.
@@ -66,30 +54,11 @@ class RemoteService(Remote[str]):
     about: ServiceDescription | None = None
 
     @property
-    def state(self) -> ServiceRouteState:
-        """Whether it can be called now."""
+    def state(self) -> str:
+        """Whether it can be called now, as in the figure above."""
         if not self.route:
-            return ServiceRouteState.IDLE
-        return ServiceRouteState.OPEN if self.requests else ServiceRouteState.OPENING
-
-
-class ServiceImportEffects(Effects):
-    """What is done for services of peers; for subclasses."""
-
-    def provide(self, remote: RemoteService) -> None:
-        """Register a service in the local graph, at the proxy of the node that provides it."""
-
-    def withdraw(self, remote: RemoteService, reason: str) -> None:
-        """Remove a service from the local graph; its waiting calls fail with the reason."""
-
-    def opened(self, remote: RemoteService) -> None:
-        """A service can be called: requests go out on ``remote.requests``, replies come in on ``remote.route``."""
-
-    def ended(self, remote: RemoteService, route: int, reason: str) -> None:
-        """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of replies."""
-
-    def forget_about(self, remote: RemoteService) -> None:
-        """What is known of a shown service may no longer be true."""
+            return "idle"
+        return "open" if self.requests else "opening"
 
 
 class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
@@ -97,9 +66,8 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     kind = "services"
 
-    def __init__(self, out: ServiceImportEffects) -> None:
+    def __init__(self, out: Effects) -> None:
         super().__init__(out)
-        self._out: ServiceImportEffects = out
         self._local: dict[str, str] = {}
         """The node of this module that provides a service."""
         self._claims: dict[str, dict[RemoteService, None]] = {}
@@ -174,7 +142,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """The server was replaced, or the link is a new one: the type may have changed."""
         entry.about = None
         if entry.shown:
-            self._out.forget_about(entry)
+            self._do.forget_about(entry)
 
     def _came(self, entry: RemoteService) -> None:
         """Choose after one more claim to a name; a thousand modules may have it, so only if it may be chosen."""
@@ -254,7 +222,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if chosen is not None and not chosen.shown:
             self._peers[chosen.peer].show(chosen)
             self._shown[service] = chosen
-            self._out.provide(chosen)
+            self._do.provide(chosen)
         if shown is not None and left:
             # Only now: the services that this chooses could take the place that was found free above.
             self._next_in(shown.peer)
@@ -262,7 +230,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     def _hide(self, remote: RemoteService, reason: str) -> None:
         del self._shown[remote.name]
         self._peers[remote.peer].hide(remote)
-        self._out.withdraw(remote, reason)
+        self._do.withdraw(remote, reason)
 
     def _next_in(self, peer: int) -> None:
         """Choose again among the services that wait for a place of their node, as far as places are free."""
@@ -355,7 +323,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del self._opening[remote]
         remote.requests, remote.problem = message.requests, ""
         remote.about = ServiceDescription(message.type, message.md5, message.request_type, message.response_type)
-        self._out.opened(remote)
+        self._do.opened(remote)
 
     def closed(self, peer: int, message: ServiceClosed) -> None:
         """Handle a peer's message that a service cannot be called, or no longer; unknown routes are ignored."""
@@ -388,4 +356,4 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         del self._peers[remote.peer].routes[route]
         self._opening.pop(remote, None)
         remote.route, remote.requests, remote.problem = 0, 0, reason
-        self._out.ended(remote, route, reason)
+        self._do.ended(remote, route, reason)

@@ -22,8 +22,8 @@ from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
 from rmpa.bridge.services.direct import ServicePaths
-from rmpa.bridge.services.exports import ServiceExportEffects, ServiceExports
-from rmpa.bridge.services.imports import ServiceImportEffects, ServiceImports, ServiceRouteState
+from rmpa.bridge.services.exports import ServiceExports
+from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.sessions import PeerState
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.services.exports import ServiceRoute
     from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
@@ -83,7 +82,7 @@ class ShownService:
         return f"service [{self.service}] of {self.peer_name}"
 
 
-class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
+class Services(GraphPart):
     """Both directions of services, for all peers.
 
     Args:
@@ -254,26 +253,10 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
                 return LocalService(node, uri, origin)
         return None
 
-    def probe(self, service: str, server: LocalService) -> None:
-        """As of ``ServiceExportEffects``."""
-        self.serving.probe(service, server)
-
-    def serve(self, peer: int, number: int, route: ServiceRoute, server: LocalService) -> None:
-        """As of ``ServiceExportEffects``."""
-        self.serving.serve(peer, number, route, server)
-
-    def end_route(self, peer: int, requests: int) -> None:
-        """As of ``ServiceExportEffects``."""
-        self.serving.end_route(peer, requests)
-
-    def server_gone(self, service: str) -> None:
-        """As of ``ServiceExportEffects``."""
-        self.serving.server_gone(service)
-
     # --- peers' services here ----------------------------------------------------------------------------------
 
     def provide(self, remote: RemoteService) -> None:
-        """As of ``ServiceImportEffects``."""
+        """Register a peer's service in the local graph, at the proxy of the node that provides it."""
         peer, service, node = remote.peer, remote.name, remote.node
         session = self._shared.sessions.get(peer)
         if session is None:
@@ -319,7 +302,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         return any(node != proxy.name for node in self._core.state().services.get(shown.service, {}))
 
     def withdraw(self, remote: RemoteService, reason: str) -> None:
-        """As of ``ServiceImportEffects``."""
+        """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
         self._shared.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
         shown = self._shown.pop((remote.peer, remote.name), None)
         if shown is None:
@@ -335,7 +318,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
             session.proxies.release(remote.node, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
-        """As of ``ServiceImportEffects``."""
+        """What is known of a shown service may no longer be true."""
         shown = self._shown.get((remote.peer, remote.name))
         if shown is not None:
             if shown.endpoint is not None:
@@ -372,11 +355,11 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
         elif session is not None and session.state is PeerState.AWAY:
             text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
-        elif remote.state is ServiceRouteState.IDLE and not self.imports.is_away(shown.peer):
+        elif remote.state == "idle" and not self.imports.is_away(shown.peer):
             self.imports.want(shown.peer, shown.service, self.now())
 
     def opened(self, remote: RemoteService) -> None:
-        """As of ``ServiceImportEffects``."""
+        """A service can be called: requests go out on ``remote.requests``, replies come in on ``remote.route``."""
         shown = self._shown.get((remote.peer, remote.name))
         session = self._shared.sessions.get(remote.peer)
         if shown is None or session is None or not session.linked or remote.about is None:
@@ -394,7 +377,7 @@ class Services(GraphPart, ServiceExportEffects, ServiceImportEffects):
             caller.call(call)
 
     def ended(self, remote: RemoteService, route: int, reason: str) -> None:
-        """As of ``ServiceImportEffects``."""
+        """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of replies."""
         session = self._shared.sessions.get(remote.peer)
         if session is not None:
             session.link.routes.pop(route, None)

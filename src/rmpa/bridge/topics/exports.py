@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.mesh.reliable import ReliableSender
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,37 +91,13 @@ class _Flow:
     description: Description | None = None
 
 
-class ExportEffects(Effects):
-    """What is done for sources of this module that peers want; for subclasses."""
-
-    def connect(self, source: Source, uri: str) -> None:
-        """Subscribe to a local publisher, at its slave API; ``described`` or ``lost`` follows."""
-
-    def disconnect(self, source: Source) -> None:
-        """Disconnect from a local publisher, and drop its routes."""
-
-    def numbering(self, source: Source, peer: int) -> ReliableSender | None:  # noqa: ARG002 - for subclasses
-        """The sender of a reliable route, suspended or not; ``None`` if there is none."""
-        return None
-
-    def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
-        """Begin to send a source's messages to a peer; first those that its contract or publisher keeps."""
-
-    def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        """Keep the unacknowledged and all further messages of a route for an absent peer, for a time in seconds."""
-
-    def remove_route(self, source: Source, peer: int, number: int) -> None:
-        """End a source's route to a peer, and drop its waiting messages; a suspended one has the number 0."""
-
-
 class Exports(OfferBook[Source, LocalSource, TopicOffer]):
     """The outbound half of topics."""
 
     kind, warning, access, owner = "topics", "sources.too_many", Access.SUBSCRIBE, "the node"
 
-    def __init__(self, out: ExportEffects) -> None:
+    def __init__(self, out: Effects) -> None:
         super().__init__(out)
-        self._out: ExportEffects = out
         self._nodes: dict[str, tuple[str, ...]] = {}
         self._routes: dict[int, dict[int, Source]] = {}
         """The open source of each route id, for each linked peer."""
@@ -236,7 +211,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                 continue
             if route.live and route.epoch:
                 route.number = 0
-                self._out.suspend_route(source, peer, route.contract.outage)
+                self._do.suspend_route(source, peer, route.contract.outage)
             else:
                 self._remove(source, peer, flow)
             yield
@@ -289,7 +264,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             local = self.offered[source]
             if flow is None:
                 flow = self._flows[source] = _Flow(local.uri)
-                self._out.connect(source, local.uri)
+                self._do.outbound.connect(source, local.uri)
             flow.routes[peer] = self._route(peer, source, message, before)
             self._start(source, flow)
             return
@@ -351,13 +326,13 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             opened = RouteOpened(route.number, told, route.contract, route.epoch)
             if route.after is None:
                 opened = msgspec.structs.replace(opened, unknown=route.unknown or msgspec.UNSET)
-            elif (numbering := self._out.numbering(source, peer)) is not None:
+            elif (numbering := self._do.outbound.numbering(source, peer)) is not None:
                 # The peer may have kept messages whose acknowledgement was lost; these are not sent again.
                 following, after = numbering.following, route.after
                 following = following if is_later(following, after) else serial_add(after, 1)
                 opened = msgspec.structs.replace(opened, following=following)
             self._out.send(peer, opened)
-            self._out.add_route(source, peer, route)
+            self._do.add_route(source, peer, route)
 
     def _remove(self, source: Source, peer: int, flow: _Flow) -> None:
         """End a route to one peer; a source without any is disconnected."""
@@ -365,7 +340,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         self._forget(source, peer, route)
         if not flow.routes:
             del self._flows[source]
-            self._out.disconnect(source)
+            self._do.outbound.disconnect(source)
 
     def _forget(self, source: Source, peer: int, route: ExportRoute) -> None:
         if route.number:
@@ -375,7 +350,7 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             if len(self._cut) > mesh_limits.LOSSES_REMEMBERED:
                 self._cut.popitem(last=False)
         if route.live:
-            self._out.remove_route(source, peer, route.number)
+            self._do.remove_route(source, peer, route.number)
 
     def _ended_for(self, peer: int, key: Source, why: str = "") -> None:
         flow = self._flows.get(key)
@@ -395,10 +370,10 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         flow = self._flows.pop(source, None)
         for peer, route in flow.routes.items() if flow is not None else ():
             last = lasts.get(peer) if lasts is not None else None
-            if lasts is None and (numbering := self._out.numbering(source, peer)) is not None:
+            if lasts is None and (numbering := self._do.outbound.numbering(source, peer)) is not None:
                 last = numbering.last
             self._forget(source, peer, route)
             if route.number:
                 self._out.send(peer, RouteClosed(route.number, reason, msgspec.UNSET if last is None else last))
         if flow is not None and lasts is None:
-            self._out.disconnect(source)
+            self._do.outbound.disconnect(source)

@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 import sys
 from dataclasses import dataclass
-from enum import Enum, auto
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
@@ -47,21 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
-
-
-class RouteState(Enum):
-    """The state of a remote source's route."""
-
-    IDLE = auto()
-    """No route: the source has no local listener."""
-    OPENING = auto()
-    """Requested; the peer has not answered yet."""
-    OPEN = auto()
-    """Data flows."""
-    LINGERING = auto()
-    """Data still flows after the last listener has left; for ``limits.ROUTE_LINGER``."""
-    WAITING = auto()
-    """The route was lost although a node listens; it will be requested again."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -101,13 +85,13 @@ class RemoteTopic(Remote[Source]):
         return self.name
 
     @property
-    def state(self) -> RouteState:
-        """The state of the route."""
+    def state(self) -> str:
+        """The state of the route, as in the figure above."""
         if not self.route:
-            return RouteState.WAITING if self.wanted else RouteState.IDLE
+            return "waiting" if self.wanted else "idle"
         if not self.open:
-            return RouteState.OPENING
-        return RouteState.OPEN if self.wanted else RouteState.LINGERING
+            return "opening"
+        return "open" if self.wanted else "lingering"
 
     @property
     def reliable(self) -> bool:
@@ -133,43 +117,13 @@ class RemoteTopic(Remote[Source]):
         return self.reliable or (silent and latching)
 
 
-class ImportEffects(Effects):
-    """What is done for sources of peers; for subclasses."""
-
-    def publish(self, entry: RemoteTopic) -> None:
-        """Publish a source in the local graph."""
-
-    def retract(self, entry: RemoteTopic) -> None:
-        """Remove a source from the local graph: unregister it and close its sockets."""
-
-    def position(self, entry: RemoteTopic) -> tuple[int, int] | None:  # noqa: ARG002 - for subclasses
-        """Epoch and last message of a reliable route that outlived its link, or ``None``."""
-        return None
-
-    def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
-        """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description."""
-
-    def detach(
-        self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
-    ) -> None:
-        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
-
-        Args:
-            entry: The source and its route.
-            keep: The link is gone, and the next one will continue after the last message that came.
-            missed: Local nodes still listen, so they miss what is published before a route is open again.
-            last: If the publisher has gone: the sequence of its last message.
-        """
-
-
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
     """The inbound half of topics."""
 
     kind = "topics"
 
-    def __init__(self, out: ImportEffects) -> None:
+    def __init__(self, out: Effects) -> None:
         super().__init__(out)
-        self._out: ImportEffects = out
         self._topics: dict[int, dict[str, dict[Source, None]]] = {}
         """The sources of each peer by their local topic (dicts, for their order)."""
         self._local_types: dict[str, str] = {}
@@ -217,7 +171,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             keep = briefly or entry.outlives(silent=known.silent)
             if entry.route:
                 # A lingering route has no listener, so it is not continued.
-                self._out.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
+                self._do.detach(entry, keep=keep and entry.wanted, missed=entry.wanted and not keep)
             entry.route, entry.open, entry.until, entry.problem = 0, False, None, "its peer is away"
             if not keep:
                 self._outlived(entry)
@@ -245,7 +199,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Detach the open routes of a peer for which nothing waits; ``link_down`` is called next."""
         known = self._peers[peer]
         for entry in known.routes.values():
-            self._out.detach(entry, missed=entry.wanted)
+            self._do.detach(entry, missed=entry.wanted)
         known.routes = {}
 
     def link_down(self, peer: int) -> Iterator[None]:
@@ -364,7 +318,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._hide(entry)
         elif not entry.hidden and not entry.shown:
             known.show(entry)
-            self._out.publish(entry)
+            self._do.publish(entry)
         if entry.cause != before and CONFLICT in {entry.cause, before}:
             text = entry.hidden if entry.cause == CONFLICT else ""
             if text:
@@ -446,7 +400,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Take a source out of the local graph, and show those that could not stand beside it."""
         known = self._peers[entry.peer]
         known.hide(entry)
-        self._out.retract(entry)
+        self._do.retract(entry)
         if entry.name == CLOCK:
             behind = [(peer, source) for peer, source in self.at(CLOCK) if (peer, source) != (entry.peer, entry.wire)]
         else:
@@ -463,31 +417,31 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         """Open, keep or close a source's route, by the facts of now; call it again whenever one has changed."""
         known, due = self._peers[entry.peer], entry.until is not None and entry.until <= now
         match entry.state:
-            case RouteState.OPENING if due:
+            case "opening" if due:
                 self._out.send(entry.peer, CloseRoute(entry.route))
                 self._fail(entry, "the peer has not answered", now)
-            case RouteState.OPENING if not entry.wanted:
+            case "opening" if not entry.wanted:
                 self._close(entry)
-            case RouteState.LINGERING if due:
+            case "lingering" if due:
                 self._close(entry)
-            case RouteState.LINGERING if entry.until is None:
+            case "lingering" if entry.until is None:
                 self._wait(entry, now + limits.ROUTE_LINGER)
-            case RouteState.WAITING if not known.away and (due or entry.until is None):
+            case "waiting" if not known.away and (due or entry.until is None):
                 known.last_route += 1
                 entry.route, known.routes[known.last_route] = known.last_route, entry
                 self._wait(entry, now + limits.ROUTE_OPEN_TIMEOUT)
                 entry.asked = self._out.context.contracts.of(entry.name, entry.type)
-                epoch, after = self._out.position(entry) or (0, 0)
+                epoch, after = self._do.position(entry) or (0, 0)
                 asked = OpenRoute(entry.route, entry.wire.topic, entry.node, entry.asked, epoch, after)
                 self._out.send(entry.peer, asked)
-            case RouteState.OPEN | RouteState.IDLE:
+            case "open" | "idle":
                 entry.until = None
 
     def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> None:
         """Note the first local listener of a source, or that the last one has gone."""
         if (entry := self.get(peer, source)) is None:
             return
-        if not wanted and entry.state is RouteState.WAITING:
+        if not wanted and entry.state == "waiting":
             self._close(entry)
         entry.wanted = wanted
         self.follow(entry, now)
@@ -508,7 +462,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             return
         entry.open, entry.until, entry.problem, entry.backoff = True, None, "", None
         entry.description, entry.contract = message.description, message.contract
-        self._out.describe(entry, message)
+        self._do.describe(entry, message)
 
     def closed(self, peer: int, message: RouteClosed, now: float) -> None:
         """Handle a route that the peer has refused or closed; ignored if it was closed here meanwhile."""
@@ -541,15 +495,15 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         if entry.route:
             self._peers[entry.peer].routes.pop(entry.route, None)
             self._out.send(entry.peer, CloseRoute(entry.route))
-            self._out.detach(entry, missed=missed)
+            self._do.detach(entry, missed=missed)
         elif entry.wanted and entry.until is None:
-            self._out.detach(entry)  # it waited for a new link
+            self._do.detach(entry)  # it waited for a new link
         entry.route, entry.open, entry.until, entry.backoff = 0, False, None, None
 
     def _fail(self, entry: RemoteTopic, reason: str, now: float, last: int | None = None) -> None:
         """A route is refused or lost: it is opened again after the back-off if a node still listens."""
         self._peers[entry.peer].routes.pop(entry.route, None)
-        self._out.detach(entry, missed=entry.wanted, last=last)
+        self._do.detach(entry, missed=entry.wanted, last=last)
         entry.route, entry.open, entry.until, entry.problem = 0, False, None, reason
         if entry.wanted:
             if entry.backoff is None:

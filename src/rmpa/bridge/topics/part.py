@@ -18,8 +18,8 @@ from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
 from rmpa.bridge.topics.direct import TopicPaths
-from rmpa.bridge.topics.exports import ExportEffects, Exports
-from rmpa.bridge.topics.imports import ImportEffects, Imports
+from rmpa.bridge.topics.exports import Exports
+from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
 from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers
@@ -39,14 +39,13 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import ExportRoute
     from rmpa.bridge.topics.imports import RemoteTopic
-    from rmpa.mesh.reliable import ReliableSender
     from rmpa.ros.node.publication import Publication
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
 
 
-class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
+class Topics(GraphPart, TopicEvents):
     """The topics of all peers, in both directions.
 
     Args:
@@ -255,20 +254,8 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
 
     # --- effects of the exports --------------------------------------------------------------------------------
 
-    def connect(self, source: Source, uri: str) -> None:
-        """As of ``ExportEffects``."""
-        self.outbound.connect(source, uri)
-
-    def disconnect(self, source: Source) -> None:
-        """As of ``ExportEffects``."""
-        self.outbound.disconnect(source)
-
-    def numbering(self, source: Source, peer: int) -> ReliableSender | None:
-        """As of ``ExportEffects``."""
-        return self.outbound.numbering(source, peer)
-
     def add_route(self, source: Source, peer: int, route: ExportRoute) -> None:
-        """As of ``ExportEffects``."""
+        """Begin to send a source's messages to a peer; first those that its contract or publisher keeps."""
         session = self._shared.sessions.get(peer)
         if session is None:
             return
@@ -281,12 +268,12 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
             asyncio.get_running_loop().call_soon(self.exports.broken, source, peer)
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
-        """As of ``ExportEffects``."""
+        """Keep the unacknowledged and all further messages of a route for an absent peer, for a time in seconds."""
         self._subscribers.route_over(peer, source)
         self.outbound.suspend_route(source, peer, outage)
 
     def remove_route(self, source: Source, peer: int, number: int) -> None:
-        """As of ``ExportEffects``."""
+        """End a source's route to a peer, and drop its waiting messages; a suspended one has the number 0."""
         self._subscribers.route_over(peer, source)
         self.outbound.remove_route(source, peer)
         session = self._shared.sessions.get(peer)
@@ -296,11 +283,11 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
     # --- effects of the imports --------------------------------------------------------------------------------
 
     def position(self, entry: RemoteTopic) -> tuple[int, int] | None:
-        """As of ``ImportEffects``."""
+        """Epoch and last message of a reliable route that outlived its link, or ``None``."""
         return topics.position(entry.wire) if (topics := self.peers.get(entry.peer)) is not None else None
 
     def publish(self, entry: RemoteTopic) -> None:
-        """As of ``ImportEffects``."""
+        """Publish a peer's source in the local graph."""
         session, topics, source = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer), entry.wire
         if session is not None and topics is not None:
             name = self._shared.sessions.proxy_name(session, source.node, entry.origin)
@@ -310,14 +297,14 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
             self.direct_imports.shown(entry)
 
     def retract(self, entry: RemoteTopic) -> None:
-        """As of ``ImportEffects``."""
+        """Remove a peer's source from the local graph: unregister it and close its sockets."""
         if (topics := self.peers.get(entry.peer)) is not None:
             self._shared.relay.gone(entry.peer, entry.wire)
             self.direct_imports.hidden(entry)
             topics.retract(entry.wire)
 
     def describe(self, entry: RemoteTopic, opened: RouteOpened) -> None:
-        """As of ``ImportEffects``."""
+        """Prepare for data on a newly opened route, and answer the waiting local subscribers with its description."""
         if (topics := self.peers.get(entry.peer)) is not None:
             if self._ticker is None:
                 self._tick_later()
@@ -327,7 +314,14 @@ class Topics(GraphPart, ExportEffects, ImportEffects, TopicEvents):
     def detach(
         self, entry: RemoteTopic, *, keep: bool = False, missed: bool = False, last: int | None = None
     ) -> None:
-        """As of ``ImportEffects``."""
+        """End a route's data; unless ``keep``, the latched message is forgotten (a new route brings it again).
+
+        Args:
+            entry: The source and its route.
+            keep: The link is gone, and the next one will continue after the last message that came.
+            missed: Local nodes still listen, so they miss what is published before a route is open again.
+            last: If the publisher has gone: the sequence of its last message.
+        """
         if (topics := self.peers.get(entry.peer)) is not None:
             topics.detach(entry.wire, entry.route, keep=keep, missed=missed, last=last)
 

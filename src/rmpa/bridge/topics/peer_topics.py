@@ -264,7 +264,7 @@ class PeerTopics:
     def detach(
         self, source: Source, route: int, *, keep: bool = False, missed: bool = False, last: int | None = None
     ) -> None:
-        """End a route's data; with ``keep`` its flow waits for the peer's next link; see ``ImportEffects.detach``."""
+        """End a route's data; with ``keep`` its flow waits for the peer's next link; see ``Topics.detach``."""
         flow = self.flows.pop(route, None)
         self.session.link.routes.pop(route, None)
         topic = self.topics.get(source)

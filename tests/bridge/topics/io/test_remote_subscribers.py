@@ -26,7 +26,6 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import subscribers as module
 from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.imports import RouteState
 from rmpa.bridge.topics.subscribers import RemoteSubscribers
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
@@ -97,7 +96,7 @@ class World:
     def _topic(self, source: Source) -> object:
         """The source at its proxy, with a flow of its own for each route."""
         entry = self.imports.get(1, source)
-        open_states = {RouteState.OPEN, RouteState.LINGERING}
+        open_states = {"open", "lingering"}
         if source not in self.listeners or entry is None or entry.state not in open_states:
             return None
         flow = self.flows.setdefault(entry.route, SimpleNamespace(route=entry.route, told=()))
