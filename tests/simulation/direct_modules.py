@@ -469,7 +469,7 @@ class Network:
 
     def patches(self, patch: Any) -> list[_patch[Any]]:
         """What stands in place of the driver's functions."""
-        names = ("bus_links", "end_links", "publisher_update", "forgotten", "standing")
+        names = ("bus_links", "end_link", "publisher_update", "forgotten", "standing")
         more = {"kernel_tells": lambda: True, "probe": self._probe}
         return [
             patch.object(grants, "grant_at", lambda _, node, port, probe: Grant(port, node, probe)),
@@ -511,12 +511,11 @@ class Network:
             if one is listener and source.topic == topic
         ]
 
-    async def _end_links(self, endpoint: tuple[str, int], links: Any) -> str:
+    async def _end_link(self, link: Any) -> str:
         await self._world.pause(0.01)
-        module = self._module_of(endpoint[0])
-        ports = {link.local_port for link in links}
+        module = self._module_of(link.remote[0])
         for listener, source, port in self._rows(module):
-            if port == endpoint[1] and self._port(listener, source, port) in ports:
+            if port == link.remote[1] and self._port(listener, source, port) == link.local_port:
                 module.paths(source, listener.name).remove(port)
         return ""
 

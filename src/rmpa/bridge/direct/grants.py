@@ -266,16 +266,15 @@ class NodePorts:
             if len(self._ports) >= limits.DIRECT_MAX:
                 del self._ports[next(iter(self._ports))]
             task = self._ports[uri] = asyncio.create_task(_ask_port(node, uri, topic), name=f"port of {node}")
-            asyncio.get_running_loop().call_later(limits.DIRECT_PORT_KNOWN, self.forget, uri, task)
+            asyncio.get_running_loop().call_later(limits.DIRECT_PORT_KNOWN, self.forget, uri)
         found = await asyncio.shield(task)
         if isinstance(found, Unmet):
-            self.forget(uri, task)
+            self.forget(uri)
         return found
 
-    def forget(self, uri: str, task: asyncio.Task[int | Unmet] | None = None) -> None:
-        """Forget a node's port: the node has ended or broken a connection. ``task``: only if this has found it."""
-        if task is None or self._ports.get(uri) is task:
-            self._ports.pop(uri, None)
+    def forget(self, uri: str) -> None:
+        """Forget a node's port: the node has ended or broken a connection, or time has passed."""
+        self._ports.pop(uri, None)
 
     async def close(self) -> None:
         """Cancel the questions to nodes."""

@@ -38,7 +38,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from rmpa.runtime.kernel_tcp import connections
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from rmpa.bridge.messages import Source
     from rmpa.bridge.sessions import PeerSession
@@ -113,43 +113,37 @@ def kernel_tells() -> bool:
     return connections(remote=("127.0.0.1", 1)) is not None
 
 
-def standing(address: str, port: int | None = None) -> dict[int, set[int]]:
+def standing(address: str) -> dict[int, set[int]]:
     """The connections from this machine to one address: their local ports, by the remote port.
 
     One question to the kernel, whatever the number of connections.
     """
     found: dict[int, set[int]] = {}
-    for one in connections(remote=(address, port)) or ():
+    for one in connections(remote=(address, None)) or ():
         if one.state in _STANDING:
             found.setdefault(one.remote[1], set()).add(one.local[1])
     return found
 
 
-async def end_links(endpoint: tuple[str, int], links: Iterable[BusLink]) -> str:
-    """End connections of a subscriber to a publisher's address, if they still stand; wait until they are gone.
+async def end_link(link: BusLink) -> str:
+    """End a connection of a subscriber to a publisher, if it still stands; wait until it is gone.
 
     Args:
-        endpoint: The address and port; other programs may be connected there too.
-        links: The connections, as the subscriber tells them.
+        link: The connection, as the subscriber tells it; other programs may be connected to the publisher too.
 
     Returns:
-        Empty if none is left, else why they could not be ended.
+        Empty if it is gone, else why it could not be ended.
     """
-    ports = {link.local_port for link in links if link.local_port is not None}
-
-    def left() -> set[int]:
-        return ports & standing(*endpoint).get(endpoint[1], set())
-
-    if not left():
-        return ""
-    found = connections(remote=endpoint)
-    problem = end_all(found and [one for one in found if one.local[1] in ports])
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + limits.DIRECT_MOVE_WAIT
-    while left():
-        if loop.time() >= deadline:
+    loop, deadline, problem = asyncio.get_running_loop(), 0.0, ""
+    while found := [one for one in connections(remote=link.remote) or () if one.local[1] == link.local_port]:
+        if not any(one.state in _STANDING for one in found):
+            break
+        if not deadline:
+            deadline, problem = loop.time() + limits.DIRECT_MOVE_WAIT, end_all(found)
+        elif loop.time() >= deadline:
             return problem or "the kernel does not end it"
-        await asyncio.sleep(limits.DIRECT_LOOK)
+        else:
+            await asyncio.sleep(limits.DIRECT_LOOK)
     return ""
 
 
@@ -442,7 +436,7 @@ class TopicPaths(Paths["RemoteTopic"]):
                 continue  # it has ended already, or leads to the proxy, on this machine
             if end == keep:
                 return end
-            if problem := await end_links(end, [link]):
+            if problem := await end_link(link):
                 if end != path.target:  # it may be allowed again meanwhile
                     self._warn_stuck(path, end, problem)
                 return end

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.direct.grants import end_all
-from rmpa.bridge.topics.direct import bus_links, end_links, publisher_update, standing
+from rmpa.bridge.topics.direct import bus_links, end_link, publisher_update, standing
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
@@ -40,7 +40,7 @@ class Pair:
 
     @property
     def ports(self) -> set[int]:
-        return standing(*self.endpoint).get(self.endpoint[1], set())
+        return standing(self.endpoint[0]).get(self.endpoint[1], set())
 
 
 @pytest.fixture
@@ -79,10 +79,10 @@ async def test_the_connection_of_one_subscriber_ends_and_those_of_others_stay(pa
     with socket.create_connection(pair.endpoint) as other:
         links = await bus_links(pair.viewer.uri, "/t")
         (mine,) = {link.local_port for link in links or ()}
-        assert await end_links(pair.endpoint, links or ()) == ""
+        assert [await end_link(link) for link in links or ()] == [""]
         assert mine not in pair.ports
         assert other.getsockname()[1] in pair.ports, "of another program"
-        assert await end_links(pair.endpoint, links or ()) == "", "there is none any more"
+        assert [await end_link(link) for link in links or ()] == [""], "there is none any more"
 
 
 @needs_right

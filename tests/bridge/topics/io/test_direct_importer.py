@@ -83,7 +83,7 @@ class Module:
         monkeypatch.setattr(direct_importer, "probe", self._probe)
         monkeypatch.setattr(direct_importer, "standing", lambda *_: {45225: {40_000}} if self.connected else {})
         monkeypatch.setattr(direct_importer, "bus_links", self._bus_links)
-        monkeypatch.setattr(direct_importer, "end_links", self._end_links)
+        monkeypatch.setattr(direct_importer, "end_link", self._end_link)
         self.imports = Imports(self)
         shared = SimpleNamespace(
             core=SimpleNamespace(
@@ -149,7 +149,7 @@ class Module:
         await asyncio.sleep(0)
         return self.connected
 
-    async def _end_links(self, *_: object) -> str:
+    async def _end_link(self, *_: object) -> str:
         self.connected = []
         return ""
 
