@@ -36,5 +36,5 @@ def fuzz(data: bytes) -> None:
     judge_welcome(hello, _OURS, _THEIRS.guid)
     if verdict is None and hello.identity.guid != hello.guid:
         raise AssertionError("a welcome peer has no identity")
-    if not str(hello).isprintable() or hello.lease <= 0:
+    if not hello.name.isprintable() or hello.lease <= 0:
         raise AssertionError("a hello's text is not safe to log, or its lease is none")

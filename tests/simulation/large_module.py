@@ -274,7 +274,7 @@ class Module:
                 link = self.links[link_id]
                 self._used[link_id] = identity = link.other(self).identity
                 self._linked(link, identity)
-            case ("down", link_id, _, _):
+            case ("down", link_id, _):
                 identity = self._used.pop(link_id)
                 if self.watch:
                     self.lost_at[identity.guid.place] = self.network.now

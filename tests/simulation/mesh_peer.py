@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.frames import FrameKind, Lane
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.peering import LinkDownCause
     from tests.simulation.network import Address, World
 
 
@@ -140,7 +139,7 @@ class MeshPeer(RosterPeer):
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 
-    def link_down(self, link: PeerLink, cause: LinkDownCause, reason: str) -> None:
+    def link_down(self, link: PeerLink, reason: str) -> None:
         """Its link is not used any more."""
         self.note(f"= link {link.id} down {link.identity}: {reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)

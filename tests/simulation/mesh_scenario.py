@@ -128,7 +128,7 @@ class MeshScenario(Scenario):
         assert bulk is not None, f"{peer.name} has no bulk lane to {other.name}"
         assert bulk_twin is not None, f"{other.name} has no bulk lane to {peer.name}"
         assert socket_of(bulk).other is socket_of(bulk_twin), f"{peer.name} and {other.name} mean different lanes"
-        assert link.bulk.connected
+        assert link.bulk._stream is bulk.stream
         if self.calm:
             assert link.dialled is not twin.dialled
             assert bulk.dialled is link.dialled, f"the side that dialled {link.guid} did not dial the bulk lane"

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.export import RouteSender
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.mesh.peering import LinkDownCause
 
 _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
@@ -197,9 +196,9 @@ class TrafficPeer(MeshPeer):
         epoch, after = position or (0, 0)
         self._send_message(link, op="open", epoch=epoch, after=after)
 
-    def link_down(self, link: PeerLink, cause: LinkDownCause, reason: str) -> None:
+    def link_down(self, link: PeerLink, reason: str) -> None:
         """Drop half messages; suspend reliable routes."""
-        super().link_down(link, cause, reason)
+        super().link_down(link, reason)
         self.times.pop(link, None)
         for key in [key for key in self.flows if key[0] is link]:
             link.routes.pop(key[1])

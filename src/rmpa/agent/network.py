@@ -20,7 +20,7 @@ from rmpa.discovery.network import choose, further_addresses, list_interfaces, p
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.peering import LinkDownCause
+from rmpa.mesh.peering import REPLACED
 from rmpa.runtime.accept import open_mesh_port
 from rmpa.runtime.loop import SystemClock
 
@@ -135,9 +135,9 @@ class NetworkEndpoint:
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.sessions.link_up(link)
 
-    def _link_down(self, link: PeerLink, cause: LinkDownCause, _reason: str) -> None:
+    def _link_down(self, link: PeerLink, reason: str) -> None:
         self._bridge.sessions.link_down(link)
-        if cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
+        if reason != REPLACED:  # else its peer stays linked, and keeps its endpoint
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:

@@ -162,14 +162,10 @@ class Frame:
 
     def __str__(self) -> str:
         """``DATA route=7 #12 1048580 bytes``; never the payload."""
-        parts = [self.kind.name]
-        if self.kind is FrameKind.DATA:
-            parts.append(f"route={self.route} #{self.sequence}")
-        if self.flags & WHOLE != WHOLE:
-            parts.append(f"flags={self.flags}")
-        if self.payload:
-            parts.append(f"{len(self.payload)} bytes")
-        return " ".join(parts)
+        where = f" route={self.route} #{self.sequence}" if self.kind is FrameKind.DATA else ""
+        flags = f" flags={self.flags}" if self.flags & WHOLE != WHOLE else ""
+        size = f" {len(self.payload)} bytes" if self.payload else ""
+        return f"{self.kind.name}{where}{flags}{size}"
 
 
 def pong(ping_stamp_ns: int, came_ns: int, stamp_ns: int) -> Frame:
@@ -362,10 +358,6 @@ class Hello:
     def identity(self) -> Identity:
         """The sender's identity; only valid after its domain was checked."""
         return Identity(self.guid, self.instance, self.name, self.domain)
-
-    def __str__(self) -> str:
-        """``base (10.0.0.1:40001#7) domain 0``."""
-        return f"{self.name} ({self.guid}) domain {self.domain}"
 
 
 FULL: Final = Refuse(

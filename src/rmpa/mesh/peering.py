@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
@@ -30,64 +29,29 @@ _log = logging.getLogger(__name__)
 
 SocketAddress = tuple[str, int]
 
-_SELDOM_MENDED: Final = frozenset(
-    {
-        Refusal.VERSION,
-        Refusal.DOMAIN,
-        Refusal.DUPLICATE,
-        Refusal.MALFORMED,
-        Refusal.LANE,
-        Refusal.FULL,
-        TrustReason.PLAIN,
-        TrustReason.FOREIGN,
-        TrustReason.EXPIRED,
-        TrustReason.REVOKED,
-        TrustReason.NAME,
-        TrustReason.DOWNGRADE,
-    }
-)
-"""Refusals for reasons that seldom pass by themselves."""
 _UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.CLOCK})
 """Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause."""
 _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 """Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
-class LinkDownCause(Enum):
-    """Why a link is no longer used; the value is the text for users."""
-
-    REPLACED = "replaced by a newer link"
-    """The same run of the peer has another link from the same moment on."""
-    RESTARTED = "the peer restarted"
-    """Another run of the peer has taken its place."""
-    ENDED = "the connection ended"
-    """The connection of its express lane ended."""
+_PASSING: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.BUSY, Refusal.NO_EXPRESS})
+_SELDOM_MENDED: Final = frozenset({*Refusal, *TrustReason}) - _UNPROVEN - _OTHER_PEER - _PASSING
+"""Refusals for reasons that seldom pass by themselves."""
 
 
+REPLACED: Final = "replaced by a newer link"
+"""Why a link is no longer used: the same run of the peer has another link from the same moment on."""
+RESTARTED: Final = "the peer restarted"
+"""Why a link is no longer used: another run of the peer has taken its place."""
 PeeringOutput = (
     tuple[Literal["dial"], Guid, tuple[SocketAddress, ...], bool]
     | tuple[Literal["close"], int, str]
     | tuple[Literal["up"], int]
-    | tuple[Literal["down"], int, LinkDownCause, str]
+    | tuple[Literal["down"], int, str]
     | tuple[Literal["refused"], Identity, Refuse]
 )
-"""What the driver has to do, or the rooms above have to know:
-
-* ``("dial", guid, endpoints, briefly)``: connect to this peer at the endpoint that answers first, best first. With
-  ``briefly`` each gets one short attempt, because the next dial follows soon.
-* ``("close", link id, reason)``: send a bye on this link and close it.
-* ``("up", link id)``: this link is the one that is used with its peer.
-* ``("down", link id, cause, reason)``: the link that was used with its peer is no longer used.
-* ``("refused", identity, refuse)``: a peer refuses links for a reason that was not reported before.
-"""
-
-
-@dataclass(slots=True)
-class _LinkInfo:
-    id: int
-    identity: Identity
-    dialled: bool
-    since: float
+"""What the driver has to do, or the rooms above have to know; see ``Peering.take``."""
 
 
 @dataclass(slots=True)
@@ -101,12 +65,13 @@ class Peer:
         backoff: The pauses between its dials.
         announced: Whether discovery knows the peer.
         verified: Whether it was linked before.
-        token_taken: Whether the present dial counts against the rate of unverified peers.
         gone: Whether it is forgotten when its link or dial ends.
         source: The source address of its own beacons.
         good: The endpoint where it was reached last.
-        link: The link that is used with it.
-        fell: When its last link ended, monotonic seconds.
+        link: The number of the link that is used with it.
+        linked: The run that this link is with.
+        dialled: Whether this side dialled that link.
+        since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
         dialling: The endpoints of the present dial.
         hello_at: When the present dial sent its hello.
         tried: The endpoints that were dialled since the last pause.
@@ -123,12 +88,13 @@ class Peer:
     backoff: Backoff
     announced: bool = False
     verified: bool = False
-    token_taken: bool = False
     gone: bool = False
     source: str | None = None
     good: SocketAddress | None = None
-    link: _LinkInfo | None = None
-    fell: float | None = None
+    link: int | None = None
+    linked: Identity | None = None
+    dialled: bool = False
+    since: float | None = None
     dialling: tuple[SocketAddress, ...] = ()
     hello_at: float | None = None
     tried: set[SocketAddress] = field(default_factory=set)
@@ -143,7 +109,7 @@ class Peer:
     @property
     def identity(self) -> Identity:
         """The run that is linked, else the newest one."""
-        return self.run if self.link is None else self.link.identity
+        return self.linked or self.run
 
     @property
     def state(self) -> Literal["linked", "dialling", "waiting", "refused"]:
@@ -153,11 +119,6 @@ class Peer:
         if self.dialling:
             return "dialling"
         return "waiting" if self.refused is None else "refused"
-
-    @property
-    def since(self) -> float | None:
-        """When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link."""
-        return self.fell if self.link is None else self.link.since
 
     @property
     def foreign(self) -> TrustReason | None:
@@ -226,7 +187,7 @@ class Peering:
         peer.source = source or peer.source
         peer.run = identity
         if restarted:
-            self._restart(peer)
+            self._restart(peer, now)
         if fresh and peer.link is None and not peer.dialling:
             self._dial_at(peer, now + self._fallback(peer))
         self._dial_due(peer, now)
@@ -247,15 +208,10 @@ class Peering:
         if peer is not None and hello.lane == Lane.EXPRESS and self._crosses(peer, hello, now):
             text = "we dial each other; the link that the lower GUID dials stays"
             return Refuse(Refusal.ALREADY_LINKED, text)
-        link = None if peer is None else peer.link
-        refuse = judge(
-            hello,
-            self._ours,
-            None if link is None else link.identity,
-            dialled=link is not None and link.dialled,
-            alive=link is not None and self._alive(link.id),
-            full=self._full(peer),
-        )
+        if peer is None or peer.link is None:
+            refuse = judge(hello, self._ours, full=self._full(peer))
+        else:
+            refuse = judge(hello, self._ours, peer.linked, dialled=peer.dialled, alive=self._alive(peer.link))
         if refuse is FULL:
             self.link_refused(hello.guid, refuse)
         return refuse
@@ -270,7 +226,7 @@ class Peering:
         return sum(each.has_place for each in self._peers.values()) >= limits.MODULES_MAX - 1
 
     def dial_opened(self, guid: Guid, now: float) -> bool:
-        """Take in that a ``Dial`` has a connection, on which the hello is sent next.
+        """Take in that a dial has a connection, on which the hello is sent next.
 
         Returns:
             Whether the connection is still wanted. If not, because the peer's own dial led to a link meanwhile, the
@@ -282,7 +238,7 @@ class Peering:
         if peer.link is None:
             peer.hello_at = now
             return True
-        peer.dialling, peer.token_taken = (), False
+        peer.dialling = ()
         return False
 
     def link_up(
@@ -298,27 +254,25 @@ class Peering:
             endpoint: The endpoint that this side dialled.
         """
         peer = self._peers.get(identity.guid.place) or self._add(identity)
+        counted = bool(peer.dialling) and not peer.verified
         if dialled:
             peer.dialling, peer.hello_at = (), None
             peer.good = endpoint
-        new = _LinkInfo(link_id, identity, dialled, now)
-        old = peer.link
-        if old is not None and self._keeps(old, new):
+        same_run = peer.linked is not None and peer.linked.instance == identity.instance
+        if same_run and peer.dialled != dialled and peer.dialled == (self._ours.guid < identity.guid):
+            # Of two links the one that the lower GUID dialled stays; if the same side dialled both, the newer one.
             self._outputs.append(("close", link_id, "we are linked already; the lower GUID's link stays"))
             return
-        if old is not None:
-            same_run = old.identity.instance == identity.instance
-            self._replace(peer, old, LinkDownCause.REPLACED if same_run else LinkDownCause.RESTARTED)
+        self._replace(peer, REPLACED if same_run else RESTARTED, now)
         if peer.run.instance != identity.instance:
             peer.run = identity
             peer.backoff.reset()
-        peer.link = new
+        peer.link, peer.linked, peer.dialled, peer.since = link_id, identity, dialled, now
         peer.pursued_until = -math.inf
         peer.forget_at = peer.refused = None
         self._dial_at(peer, None)
         peer.verified = True
-        if peer.token_taken:  # a dial that led to the link does not count against the rate
-            peer.token_taken = False
+        if counted:  # a dial that led to the link does not count against the rate
             self._dial_rate.put_back()
             self._dial_unverified(now)
         peer.attempts = 0
@@ -327,15 +281,7 @@ class Peering:
         peer.reported.clear()
         self._outputs.append(("up", link_id))
 
-    def link_down(
-        self,
-        link_id: int,
-        reason: str,
-        now: float,
-        *,
-        silent: bool = False,
-        needed: bool = False,
-    ) -> None:
+    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False, needed: bool = False) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
@@ -345,15 +291,13 @@ class Peering:
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
             needed: Whether something at either side depended on it, so that the peer is worth many attempts.
         """
-        peer = next((p for p in self._peers.values() if p.link is not None and p.link.id == link_id), None)
-        if peer is None or peer.link is None:
+        peer = next((peer for peer in self._peers.values() if peer.link == link_id), None)
+        if peer is None:
             return
-        since, peer.link = peer.link.since, None
-        self._outputs.append(("down", link_id, LinkDownCause.ENDED, reason))
-        peer.fell = now
-        peer.last_error = reason
-        if silent or now - since >= limits.LINK_STABLE:
+        if silent or now - (peer.since or now) >= limits.LINK_STABLE:
             peer.backoff.reset()
+        peer.link, peer.linked, peer.since, peer.last_error = None, None, now, reason
+        self._outputs.append(("down", link_id, reason))
         if not peer.announced and len(self._peers) > core_limits.PEERS_MAX:
             peer.gone = True  # forged identities must not fill the memory, nor cause dials
         if peer.gone:
@@ -368,7 +312,7 @@ class Peering:
             self._dial_at(peer, now + self._pause(peer, now) + self._fallback(peer))
 
     def dial_failed(self, guid: Guid, error: str, now: float, endpoint: SocketAddress | None = None) -> None:
-        """Handle a ``Dial`` without an answer, or whose connection ended before its handshake was done.
+        """Handle a dial without an answer, or whose connection ended before its handshake was done.
 
         Args:
             guid: The peer that was dialled.
@@ -385,7 +329,7 @@ class Peering:
     def dial_refused(
         self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None, *, proved: bool = True
     ) -> None:
-        """Handle a ``Dial`` that was refused at this endpoint, by either side; without a proof it is only shown."""
+        """Handle a dial that was refused at this endpoint, by either side; without a proof it is only shown."""
         peer = self._dial_ended(guid, endpoint)
         if peer is None:
             return
@@ -441,7 +385,17 @@ class Peering:
         self._dial_unverified(now)
 
     def take(self) -> list[PeeringOutput]:
-        """Return the outputs since the last call, in order."""
+        """Return the outputs since the last call, in order.
+
+        Returns:
+            * ``("dial", guid, endpoints, briefly)``: connect to this peer at the endpoint that answers first, best
+              first. With ``briefly`` each gets one short attempt, because the next dial follows soon.
+            * ``("close", link id, reason)``: send a bye on this link and close it.
+            * ``("up", link id)``: this link is the one that is used with its peer.
+            * ``("down", link id, reason)``: the link that was used with its peer is no longer used; the reason is
+              ``REPLACED``, ``RESTARTED``, or how its connection ended.
+            * ``("refused", identity, refuse)``: a peer refuses links for a reason that was not reported before.
+        """
         outputs, self._outputs = self._outputs, []
         return outputs
 
@@ -472,16 +426,17 @@ class Peering:
         if peer.link is None and not peer.dialling:
             self._peers.pop(peer.run.guid.place, None)
 
-    def _restart(self, peer: Peer) -> None:
+    def _restart(self, peer: Peer, now: float) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
         peer.refused = None
-        link = peer.link
-        ghost = link is not None and link.identity.instance != peer.run.instance
-        if link is not None and ghost and (link.identity.guid < peer.run.guid or not self._alive(link.id)):
-            self._replace(peer, link, LinkDownCause.RESTARTED)
+        link, linked = peer.link, peer.linked
+        if link is None or linked is None or linked.instance == peer.run.instance:
+            return
+        if linked.guid < peer.run.guid or not self._alive(link):
+            self._replace(peer, RESTARTED, now)
 
     def _crosses(self, peer: Peer, hello: Hello, now: float) -> bool:
         """Whether a hello crosses that of this side, whose link stays.
@@ -495,19 +450,11 @@ class Peering:
         same_run = peer.run.instance == hello.instance
         return same_run and now - peer.hello_at < limits.CROSSING_TIME
 
-    def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
-        """Whether the old one of two links with one run of a peer stays.
-
-        The link that the agent with the lower GUID dialled stays; if the same side dialled both, the newer one stays.
-        """
-        if old.identity.instance != new.identity.instance or old.dialled == new.dialled:
-            return False
-        return old.dialled == (self._ours.guid < old.identity.guid)
-
-    def _replace(self, peer: Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
-        """Close a link that is replaced by another link, or whose run of the peer is replaced."""
-        peer.link = None
-        self._outputs += [("close", link.id, cause.value), ("down", link.id, cause, cause.value)]
+    def _replace(self, peer: Peer, reason: str, now: float) -> None:
+        """Close a peer's link, if there is one: another link replaces it, or another run of the peer."""
+        if peer.link is not None:
+            self._outputs += [("close", peer.link, reason), ("down", peer.link, reason)]
+            peer.link, peer.linked, peer.since = None, None, now
 
     def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> Peer | None:
         """End a peer's dial, and mark the endpoint (``None``: all dialled ones) as tried.
@@ -523,7 +470,6 @@ class Peering:
         else:
             peer.tried.add(endpoint)
         peer.dialling, peer.hello_at = (), None
-        peer.token_taken = False
         if peer.gone:
             self._forget_if_idle(peer)
             return None
@@ -593,9 +539,7 @@ class Peering:
             queue = [self._peers[place] for place in self._dial_queue]
             newest = next((p for p in reversed(queue) if not p.attempts), None) if self._newest_next else None
             self._newest_next = not self._newest_next
-            peer = newest or queue[0]
-            peer.token_taken = True
-            self._dial(peer)
+            self._dial(newest or queue[0])
         self._queue_at = self._dial_rate.next(now) if self._dial_queue else None
 
     def _dial(self, peer: Peer, *, briefly: bool = False) -> None:

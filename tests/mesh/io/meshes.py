@@ -74,7 +74,7 @@ class Peer:
             sock,
             LinkHandlers(
                 self.on_link_up,
-                lambda link, _cause, reason: self.downs.append((link, reason)),
+                lambda link, reason: self.downs.append((link, reason)),
                 lambda _link, payload: self.controls.append(payload),
                 self.on_mark,
                 self.clocks.append,

@@ -21,7 +21,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import bound_queue, may_use_bbr, repeats_quickly, tune_bulk, tune_express
+from rmpa.mesh.io.dial import Dialler, bound_queue, may_use_bbr, repeats_quickly
 from rmpa.mesh.io.link import PeerLink
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
@@ -141,15 +141,7 @@ async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
                 await ended.wait()
             return sock
 
-        opened: list[socket.socket] = []
-        open_link = one.mesh._open
-
-        def note(sock: socket.socket, *args: Any, **options: Any) -> None:
-            opened.append(sock)
-            open_link(sock, *args, **options)
-
         monkeypatch.setattr(one.mesh.dialler, "connect", late)
-        monkeypatch.setattr(one.mesh, "_open", note)
         one.mesh.peer_found(other.identity)
         await until(lambda: one.linked(other), "a link")
         one.link(other).bulk._on_wanted()
@@ -158,7 +150,7 @@ async def test_link_that_ends_during_a_bulk_dial_leaks_no_socket(
         await until(lambda: bool(one.downs), "its end")
         ended.set()
         await until(lambda: sockets[0].fileno() < 0, "the late socket is closed")
-        assert sockets[0] not in opened, "nobody waits for it"
+        assert sockets[0] not in [each.sock for each in one.mesh.connections()], "nobody waits for it"
         await until(lambda: one.both_lanes(other) and other.both_lanes(one), "the next link has both lanes")
 
 
@@ -320,7 +312,7 @@ def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
     """Messages in the agent's own queue can be overtaken; a pong behind megabytes of data was 5 s late."""
     counters = Counters()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
-        tune_express(sock, LaneSettings(), counters)
+        Dialler(LaneSettings(), counters).tune(sock, Lane.EXPRESS)
         sock.setblocking(False)
         with server.accept()[0]:  # reads nothing
             with contextlib.suppress(BlockingIOError):
@@ -345,9 +337,10 @@ def _tcp(sock: socket.socket, name: int) -> int | None:
 def test_lost_packets_are_repeated_sooner_on_the_express_lane_alone() -> None:
     counters = Counters()
     with socket.socket() as plain, socket.socket() as express, socket.socket() as bulk:
-        for tune in (tune_express, tune_bulk):  # an accepted connection says late which lane it is
-            tune(bulk, LaneSettings(), counters)
-        tune_express(express, LaneSettings(), counters)
+        dialler = Dialler(LaneSettings(), counters)
+        for lane in (Lane.EXPRESS, Lane.BULK):  # an accepted connection says late which lane it is
+            dialler.tune(bulk, lane)
+        dialler.tune(express, Lane.EXPRESS)
         found = {name: [_tcp(sock, name) for sock in (plain, express, bulk)] for name in _LINUX_TCP.values()}
         bulk_control = bulk.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0")
         usual_control = plain.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0")

@@ -42,30 +42,6 @@ _MIN_RTT: Final = struct.Struct("=148xI")  # microseconds, in struct tcp_info of
 _DELIVERY_RATE: Final = struct.Struct("=160xQ")  # bytes a second, since Linux 4.9
 
 
-def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority.
-
-    Lost packets are repeated sooner where the kernel has options for it: TCP waits 0.2 s before the first repetition,
-    and each time twice as long as before.
-    """
-    _tune(sock, limits.EXPRESS_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
-    for name, quick, _ in _REPETITION:
-        _try(sock, name, quick)
-
-
-def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the bulk lane: the shortest kernel queue, a low priority, congestion control by BBR if it is permitted.
-
-    BBR keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them until packets
-    are lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a connection is made,
-    so this is called again then.
-    """
-    _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
-    for name, _, usual in _REPETITION:  # the lane of an accepted connection is known late
-        _try(sock, name, usual)
-    _try(sock, socket.TCP_CONGESTION, _BBR)
-
-
 def bound_queue(sock: socket.socket) -> None:
     """Bound what a bulk lane without BBR has on the way: two round trips and ``limits.BULK_QUEUE`` at its rate.
 
@@ -107,41 +83,13 @@ def unacknowledged(sock: socket.socket) -> int:
         return 0
 
 
-def limit_segments(sock: socket.socket, counters: Counters) -> None:
-    """Before connecting: let both sides send packets that fit through usual tunnels, whatever the path's MTU is."""
+def _try(sock: socket.socket, name: int, value: int | bytes, level: int = socket.IPPROTO_TCP) -> bool:
+    """Set an option that a kernel may lack or not permit; return whether it did."""
     try:
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, limits.SEGMENT_BYTES + limits.TIME_STAMP_BYTES)
-    except OSError:
-        counters.add("link.option_refused")
-
-
-def _try(sock: socket.socket, name: int, value: int | bytes) -> bool:
-    """Set an option of TCP that many kernels lack or do not permit."""
-    try:
-        sock.setsockopt(socket.IPPROTO_TCP, name, value)
+        sock.setsockopt(level, name, value)
     except OSError:
         return False
     return True
-
-
-def _tune(sock: socket.socket, unsent: int, dscp: int, priority: int, counters: Counters) -> None:
-    """Set the options of a lane's socket.
-
-    IP_TOS comes before SO_PRIORITY because setting it sets the priority too. An option that the system refuses
-    only costs quality of service: it is counted as ``link.option_refused`` and the link runs on.
-    """
-    options = (
-        (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
-        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(limits.LINK_UNACKED * 1000)),
-        (socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, unsent),
-        (socket.IPPROTO_IP, socket.IP_TOS, dscp << 2),
-        (socket.SOL_SOCKET, socket.SO_PRIORITY, priority),
-    )
-    for level, name, value in options:
-        try:
-            sock.setsockopt(level, name, value)
-        except OSError:
-            counters.add("link.option_refused")
 
 
 class Dialler:
@@ -155,7 +103,36 @@ class Dialler:
     def __init__(self, lanes: LaneSettings, counters: Counters) -> None:
         self._lanes = lanes
         self._counters = counters
-        self._attempts: set[asyncio.Task[socket.socket]] = set()
+
+    def tune(self, sock: socket.socket, lane: int) -> None:
+        """Set up the socket of a lane.
+
+        Both have no Nagle, a time-out for dead peers and a short kernel queue. The express lane has a high priority,
+        and repeats lost packets sooner where the kernel has options for it: TCP waits 0.2 s before the first
+        repetition, and each time twice as long as before. The bulk lane has a low priority, and BBR if that is
+        permitted: it keeps the queues short that are behind this host, as in a radio or router; *cubic* fills them
+        until packets are lost, and commands wait there too. A route's own ``congctl`` replaces what is set before a
+        connection is made, and the lane of an accepted one is known late, so this is called again then.
+
+        An option that the system refuses only costs quality of service: it is counted as ``link.option_refused``.
+        """
+        express, lanes = lane != Lane.BULK, self._lanes
+        unsent = limits.EXPRESS_UNSENT_BYTES if express else limits.BULK_UNSENT_BYTES
+        priority = lanes.express_priority if express else lanes.bulk_priority
+        options = (
+            (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+            (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(limits.LINK_UNACKED * 1000)),
+            (socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, unsent),
+            (socket.IPPROTO_IP, socket.IP_TOS, (lanes.express_dscp if express else lanes.bulk_dscp) << 2),
+            (socket.SOL_SOCKET, socket.SO_PRIORITY, priority),  # after IP_TOS, which sets it too
+        )
+        for level, name, value in options:
+            if not _try(sock, name, value, level):
+                self._counters.add("link.option_refused")
+        for name, quick, usual in _REPETITION:
+            _try(sock, name, quick if express else usual)
+        if not express:
+            _try(sock, socket.TCP_CONGESTION, _BBR)
 
     async def connect(
         self, endpoint: SocketAddress, lane: Lane, within: float = limits.DIAL_TIMEOUT
@@ -167,9 +144,11 @@ class Dialler:
         """
         sock = DESCRIPTORS.open_socket(Use.LINK, what=f"a link to {endpoint[0]}:{endpoint[1]}")
         try:
-            (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self._counters)
-            if not endpoint[0].startswith("127."):
-                limit_segments(sock, self._counters)
+            self.tune(sock, lane)
+            # Both sides send packets that fit through usual tunnels, whatever the path's MTU is.
+            segment = limits.SEGMENT_BYTES + limits.TIME_STAMP_BYTES
+            if not endpoint[0].startswith("127.") and not _try(sock, socket.TCP_MAXSEG, segment):
+                self._counters.add("link.option_refused")
             async with asyncio.timeout(within):
                 await asyncio.get_running_loop().sock_connect(sock, endpoint)
         except BaseException:
@@ -202,8 +181,6 @@ class Dialler:
                     endpoint = left.pop(0)
                     task = asyncio.get_running_loop().create_task(self._attempt(endpoint, briefly=briefly))
                     running[task] = endpoint
-                    self._attempts.add(task)
-                    task.add_done_callback(self._attempts.discard)
                 pause = limits.DIAL_STAGGER if left else None
                 done, _ = await asyncio.wait(running, timeout=pause, return_when=asyncio.FIRST_COMPLETED)
                 for task in [task for task in running if task in done]:
@@ -225,12 +202,6 @@ class Dialler:
             with contextlib.suppress(TimeoutError):
                 return await self.connect(endpoint, Lane.EXPRESS, within)
         return await self.connect(endpoint, Lane.EXPRESS, last)
-
-    def close(self) -> list[asyncio.Task[socket.socket]]:
-        """Cancel all attempts; return them, to be awaited."""
-        for task in self._attempts:
-            task.cancel()
-        return list(self._attempts)
 
 
 def _close_late(task: asyncio.Task[socket.socket]) -> None:

@@ -44,11 +44,6 @@ class LaneSender:
         """The messages that ``open`` has begun, by route."""
         self._loop = asyncio.get_running_loop()
 
-    @property
-    def connected(self) -> bool:
-        """Whether the lane has its connection."""
-        return self._stream is not None
-
     def connect(self, stream: Stream) -> None:
         """Use a connection from now on; waiting messages are sent first."""
         self._stream = stream

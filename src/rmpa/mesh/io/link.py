@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.securing import SecuredSocket
-    from rmpa.mesh.peering import LinkDownCause, SocketAddress
+    from rmpa.mesh.peering import SocketAddress
     from rmpa.runtime.loop import SystemClock
 
 
@@ -50,7 +50,8 @@ class LinkHandlers:
 
     Args:
         up: ``(link)``: a peer is linked.
-        down: ``(link, cause, reason)``: a peer's link is no longer used.
+        down: ``(link, reason)``: a peer's link is no longer used; the reason is ``peering.REPLACED``, ``RESTARTED``,
+            or how its connection ended.
         control: ``(link, payload)``: a control frame came.
         mark: ``(link, kind, route, sequence)``: an acknowledgement, or the answer to a fence.
         clock: ``(link)``: the estimate of the peer's clock is new or more exact.
@@ -58,7 +59,7 @@ class LinkHandlers:
     """
 
     up: Callable[[PeerLink], None]
-    down: Callable[[PeerLink, LinkDownCause, str], None]
+    down: Callable[[PeerLink, str], None]
     control: Callable[[PeerLink, bytes], None]
     mark: Callable[[PeerLink, FrameKind, int, int], None]
     clock: Callable[[PeerLink], None]
@@ -98,23 +99,18 @@ class LinkOwner:
 
     def opened(self, connection: Connection) -> None:
         """The handshake succeeded."""
-        raise NotImplementedError
 
     def refused(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """The handshake was refused; ``ended`` follows."""
-        raise NotImplementedError
 
     def ended(self, connection: Connection, reason: str) -> None:
         """The socket is closed; called once."""
-        raise NotImplementedError
 
     def redial(self, link: PeerLink) -> None:
         """Nothing came from a link's peer for ``quiet_after``; called again from time to time in this silence."""
-        raise NotImplementedError
 
     def dial_bulk(self, link: PeerLink) -> None:
         """Dial the bulk lane of a link, if it is wanted, and this side has to."""
-        raise NotImplementedError
 
 
 class Connection(ConnectionProtocol):
@@ -147,7 +143,7 @@ class Connection(ConnectionProtocol):
         self.mesh = mesh
         self.sock = sock
         self.remote_endpoint = endpoint
-        self.certificate: Final = None if secured is None else secured.certificate
+        self.certificate: Final = None if secured is None else secured[1]
         """The remote side's certificate, as ``SSLObject.getpeercert`` returns it; ``None`` without trust."""
         self.link: PeerLink | None = None
         """The link that has this connection for one of its lanes."""
@@ -163,7 +159,7 @@ class Connection(ConnectionProtocol):
             on_close=self._lost,
             # For control frames only: ``LaneSender.connect`` replaces it by the lane's outbox.
             outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
-            secure=None if secured is None else secured.socket,
+            secure=None if secured is None else secured[0],
         )
         super().__init__(
             mesh.identity,

@@ -13,11 +13,11 @@ from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse, judge_welcome
-from rmpa.mesh.io.dial import Dialler, tune_bulk, tune_express, unacknowledged
+from rmpa.mesh.io.dial import Dialler, unacknowledged
 from rmpa.mesh.io.link import Connection, LinkHandlers, LinkOwner, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
 from rmpa.mesh.keepalive import rest_lease
-from rmpa.mesh.peering import LinkDownCause, Peer, Peering, PeeringOutput
+from rmpa.mesh.peering import REPLACED, RESTARTED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -71,9 +71,8 @@ class Mesh(LinkOwner):
     ) -> None:
         super().__init__(identity, handlers, clock if clock is not None else SystemClock(), Counters(), rng)
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
-        self._lanes = lanes if lanes is not None else LaneSettings()
         self._refusals = RefusalLog(_log, self.counters)
-        self.dialler: Final = dialler if dialler is not None else Dialler(self._lanes, self.counters)
+        self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
         self._peering = Peering(identity, rng=rng, alive=self._alive)
         self._timer = MachineTimer(self._peering.next_timer, self._due, now=self.clock.now)
         self._connections: dict[int, Connection] = {}
@@ -116,7 +115,7 @@ class Mesh(LinkOwner):
         tasks = [*(self._securing.close() if self._securing is not None else []), *self._tasks]
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*self.dialler.close(), *tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         for connection in self.connections():
             connection.end(f"{self.identity.name} ends")
         ends = [asyncio.ensure_future(connection.ended()) for connection in self.connections()]
@@ -207,21 +206,20 @@ class Mesh(LinkOwner):
         if of is None:
             connection.end("its express lane is gone")
             return
-        tune_bulk(connection.sock, self._lanes, self.counters)  # the lane of an accepted one is only known now
+        self.dialler.tune(connection.sock, Lane.BULK)  # the lane of an accepted one is only known now
         of.attach(connection)
         _log.debug("= %s: bulk lane (%s)", connection.name, "dialled" if connection.dialled else "accepted")
 
     def refused(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """Count, log and note a refusal, and tell the peering machine if it ends a dial."""
         now, address = self.clock.now(), connection.remote_endpoint[0]
-        if refuse.code in _ORDINARY:
-            self.counters.add(f"link.refused.{refuse.label}")
-            _log.debug("! %s: %s", connection.name, refuse)
-        elif by_us:
+        ordinary, kind = refuse.code in _ORDINARY, f"link.refused.{refuse.label}"
+        if by_us and not ordinary:
             text = f"refused a link with {connection.name} at {address}: {refuse.text}"
-            self._refusals.refuse(now, f"link.refused.{refuse.label}", address, text)
-        elif refuse.code in _TRUST:
-            self.counters.add(f"link.refused.{refuse.label}")
+            self._refusals.refuse(now, kind, address, text)
+        elif ordinary or refuse.code in _TRUST:
+            self.counters.add(kind)
+            _log.debug("! %s: %s", connection.name, refuse)
         if refuse.code in _TRUST and not (connection.dialled and connection.since is None):
             self._distrusted(connection, refuse, by_us=by_us)
         if connection.lane != Lane.BULK and connection.expected is not None:
@@ -255,15 +253,15 @@ class Mesh(LinkOwner):
             return
         if connection.expected is not None:
             self._peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
-        link = self._links.pop(connection.id, None)
-        if link is not None:
-            link.silent = link.silent or connection.silent
-            link.crashed = link.crashed or connection.crashed
+        if (link := self._links.get(connection.id)) is not None:
+            link.silent |= connection.silent
+            link.crashed |= connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             needed = link.lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
             self._peering.link_down(link.id, reason, now, silent=link.silent, needed=needed)
-        self._act(link)
+        self._act()
+        self._links.pop(connection.id, None)
 
     def _bulk_ended(self, bulk: Connection, reason: str) -> None:
         _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
@@ -279,48 +277,42 @@ class Mesh(LinkOwner):
 
     # --- acting on the peering machine ----------------------------------------------------------------------------
 
-    def _act(self, ended: PeerLink | None = None) -> None:
-        """Carry out the outputs of the peering machine; a call from within a callback leaves them to the outer call.
-
-        Args:
-            ended: The link whose end is being reported; it is no longer in the table.
-        """
+    def _act(self) -> None:
+        """Carry out what the peering machine asks for; a call from within a callback leaves it to the outer call."""
         if self._acting:
             return
         self._acting = True
         try:
             while outputs := self._peering.take():
                 for output in outputs:
-                    self._do(output, ended)
+                    self._do(output)
         finally:
             self._acting = False
         if self._running:
             self._timer.arm()
 
-    def _do(self, output: PeeringOutput, ended: PeerLink | None) -> None:
+    def _do(self, output: PeeringOutput) -> None:
         match output:
             case ("dial", guid, endpoints, briefly):
                 if self._running:
                     self._start(self._dial(guid, endpoints, briefly=briefly), f"dial {guid}")
             case ("close", link_id, reason):
-                if (link := self._links.get(link_id)) is not None:
-                    link.close(reason)
+                self._links[link_id].close(reason)
             case ("up", link_id):
                 link = self._links[link_id]
                 link.use(used=True)
                 _log.info("= %s: linked (%s)", link.identity, "dialled" if link.dialled else "accepted")
                 self.handlers.up(link)
                 self.dial_bulk(link)  # the peer may have asked for it before
-            case ("down", link_id, cause, reason):
-                replaced = cause is LinkDownCause.REPLACED
-                self.counters.add("link.replaced" if replaced else "link.down")
-                if (down := self._links.get(link_id, ended)) is not None:
-                    _log.info("= %s: link down: %s", down.identity, reason)
-                    down.silent = down.silent or replaced
-                    # The link of a peer that restarted within its lease: its agent died, the host is there.
-                    down.crashed = down.crashed or replaced or cause is LinkDownCause.RESTARTED
-                    down.use(used=False)
-                    self.handlers.down(down, cause, reason)
+            case ("down", link_id, reason):
+                link = self._links[link_id]
+                self.counters.add("link.replaced" if reason == REPLACED else "link.down")
+                _log.info("= %s: link down: %s", link.identity, reason)
+                link.silent |= reason == REPLACED
+                # The link of a peer that restarted within its lease: its agent died, the host is there.
+                link.crashed |= reason in (REPLACED, RESTARTED)
+                link.use(used=False)
+                self.handlers.down(link, reason)
             case ("refused", identity, refuse):
                 _log.warning("! %s refuses a link: %s", identity, refuse.text)
 
@@ -380,7 +372,7 @@ class Mesh(LinkOwner):
                     _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
                     await asyncio.sleep(limits.REDIAL_PAUSE)
                     continue
-                self._open_for(link, sock, endpoint, Lane.EXPRESS, secured)
+                self._open(sock, endpoint, link=link, secured=secured)
                 return
         finally:
             link.redial = None
@@ -404,7 +396,7 @@ class Mesh(LinkOwner):
                     _log.debug("! %s: no bulk lane: %s", link.name, error)
                     await asyncio.sleep(link.backoff.delay())
                     continue
-                self._open_for(link, sock, link.remote_endpoint, Lane.BULK, secured)
+                self._open(sock, link.remote_endpoint, link=link, lane=Lane.BULK, secured=secured)
                 return
         finally:
             link.bulk_dial = None
@@ -419,28 +411,23 @@ class Mesh(LinkOwner):
             sock.close()
             raise
 
-    def _open_for(
-        self, link: PeerLink, sock: socket.socket, endpoint: SocketAddress, lane: Lane, secured: SecuredSocket | None
-    ) -> None:
-        """Use a socket that was dialled for a link, unless the link has ended meanwhile."""
-        if link.used:
-            self._open(sock, endpoint, expected=link.guid, lane=lane, secured=secured)
-        else:
-            sock.close()
-
     def _open(
         self,
         sock: socket.socket,
         endpoint: SocketAddress,
         *,
         expected: Guid | None = None,
+        link: PeerLink | None = None,
         lane: Lane = Lane.EXPRESS,
         secured: SecuredSocket | None = None,
     ) -> None:
-        """Begin the handshake of a connection: with ``expected`` one that this side dialled, else an accepted one."""
-        number, dialled = next(self._ids), expected is not None
+        """Begin the handshake of a connection that was accepted, or dialled to ``expected`` or for a link."""
+        if link is not None and not link.used:
+            sock.close()  # the link ended meanwhile
+            return
+        number, guid = next(self._ids), expected if link is None else link.guid
         self._connections[number] = Connection(
-            number, self, sock, endpoint, dialled=dialled, expected=expected, lane=lane, secured=secured
+            number, self, sock, endpoint, dialled=guid is not None, expected=guid, lane=lane, secured=secured
         )
 
     def _start(self, work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
@@ -464,7 +451,7 @@ class Mesh(LinkOwner):
         pending = [c.remote_endpoint[0] for c in self.connections() if c.since is None and not c.dialled]
         there = pending.count(host)
         if len(pending) < limits.PENDING_CONNECTIONS_MAX and there < limits.PENDING_PER_ADDRESS:
-            tune_express(sock, self._lanes, self.counters)
+            self.dialler.tune(sock, Lane.EXPRESS)
             self._open(sock, address, secured=secured)
         else:
             sock.close()

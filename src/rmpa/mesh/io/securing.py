@@ -14,7 +14,6 @@ import socket
 import ssl
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.counters import TokenBucket
@@ -37,6 +36,8 @@ _log = logging.getLogger(__name__)
 
 Certificate = Mapping[str, Any]
 """A verified certificate as ``SSLObject.getpeercert`` returns it."""
+SecuredSocket = tuple[SecureSocket, Certificate]
+"""What encrypts a connection behind its TLS handshake, and its certificate, verified but for name and deny list."""
 OnJoin = Callable[[socket.socket, TlsHandshake, str], Awaitable[None]]
 
 _READ: Final = 16 * 1024
@@ -47,19 +48,6 @@ _ALERTS: Final = {
     "PROTOCOL_VERSION": (TrustReason.DOWNGRADE, "it does not use TLS 1.3"),
 }
 """TLS alerts, by the ends of their names."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecuredSocket:
-    """A connection behind its TLS handshake.
-
-    Args:
-        socket: Encrypts and decrypts.
-        certificate: The remote side's, verified but for its name and the deny list.
-    """
-
-    socket: SecureSocket
-    certificate: Certificate
 
 
 class SecuringError(ConnectionError):
@@ -206,7 +194,7 @@ def _secured(sock: socket.socket, handshake: TlsHandshake) -> SecuredSocket:
     if tls.version() != "TLSv1.3" or tls.selected_alpn_protocol() != ALPN_LINK:
         text = f"it speaks {tls.version()} with {tls.selected_alpn_protocol()}, not TLSv1.3 with {ALPN_LINK}"
         raise SecuringError(refusal(TrustReason.DOWNGRADE, text), by_us=True)
-    return SecuredSocket(handshake.secure(sock), tls.getpeercert() or {})
+    return handshake.secure(sock), tls.getpeercert() or {}
 
 
 # --- accepted connections ---------------------------------------------------------------------------------------
@@ -336,9 +324,16 @@ class Securing:
             await self._on_join(sock, handshake, host)
             await _linger(sock)
             return None
-        proved = _secured(sock, handshake)
-        self._judge_certificate(proved)
-        return proved
+        secured = _secured(sock, handshake)
+        try:
+            # Before its hello, which a module without a certificate that holds could hold back.
+            self._security.judge_member(secured[1], None)
+        except TrustError as error:
+            refuse = refusal(error.reason, str(error))
+            with contextlib.suppress(OSError):
+                secured[0].sendmsg([Frame(FrameKind.REFUSE, refuse.serialize()).serialize()])
+            raise SecuringError(refuse, by_us=True) from None
+        return secured
 
     def _refuse_plain(self, sock: socket.socket, host: str) -> None:
         """Count, and answer unless there are many."""
@@ -351,16 +346,6 @@ class Securing:
                 sock.send(Frame(FrameKind.REFUSE, refuse.serialize()).serialize())
                 sock.shutdown(socket.SHUT_WR)
                 sock.recv(_READ)  # unread bytes would make the end a reset, which overtakes the answer
-
-    def _judge_certificate(self, proved: SecuredSocket) -> None:
-        """Refuse a module without a certificate that holds before its hello, which it could hold back."""
-        try:
-            self._security.judge_member(proved.certificate, None)
-        except TrustError as error:
-            refuse = refusal(error.reason, str(error))
-            with contextlib.suppress(OSError):
-                proved.socket.sendmsg([Frame(FrameKind.REFUSE, refuse.serialize()).serialize()])
-            raise SecuringError(refuse, by_us=True) from None
 
 
 async def _linger(sock: socket.socket) -> None:
