@@ -26,6 +26,14 @@ def number_of(data: bytes) -> int:
     return int.from_bytes(data[:4], "big")
 
 
+def taken(sender: ReliableSender, most: int | None = None) -> list[Outgoing]:
+    """What may be sent now, at most so many messages."""
+    messages: list[Outgoing] = []
+    while (most is None or len(messages) < most) and (message := sender.take()) is not None:
+        messages.append(message)
+    return messages
+
+
 @dataclass(frozen=True)
 class Fragment:
     """A piece of a message in flight."""
@@ -114,17 +122,17 @@ class Pair:
 
     def send(self, most: int | None, pieces: int) -> int:
         """What may be sent goes on the link, each message in so many fragments."""
-        taken = self.sender.take(most)
-        for message in taken:
+        sent = taken(self.sender, most)
+        for message in sent:
             assert message.sequence == self.sequence(number_of(message.payload))
             assert message.stamp_ns == number_of(message.payload) * 1000
             for n in range(pieces):
                 self.data.append(Fragment(self.epoch, message, first=n == 0, last=n == pieces - 1))
-        return len(taken)
+        return len(sent)
 
     def hesitate(self) -> None:
         """One is taken, and cannot go now."""
-        if self.sender.take(1):
+        if self.sender.take() is not None:
             self.sender.put_back()
 
     def lose_lane(self) -> None:
@@ -203,7 +211,7 @@ class Pair:
         under_way = [s for _, s in sender._dropped_in_flight] + [len(m.payload) for m in sender._sent]
         assert sender._in_flight_bytes == (sum(under_way) if self.linked else 0)
         assert sum(under_way) <= bounds.window_bytes or len(under_way) == 1 or not self.linked
-        assert self.linked or (sender.in_flight == 0 and sender.take() == [])
+        assert self.linked or (sender.in_flight == 0 and sender.take() is None)
         assert all(a < b for a, b in pairwise(self.delivered))
 
     def drain(self) -> None:

@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.mesh import limits
 from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
-from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
+from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload, taken
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
 """Where the numbering begins: also such that it wraps, or crosses the half, within a test."""
@@ -30,7 +30,7 @@ def fill(machine: ReliableSender, count: int, size: int = 0) -> None:
 
 
 def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
-    return [number_of(message.payload) for message in machine.take(most)]
+    return [number_of(message.payload) for message in taken(machine, most)]
 
 
 # --- the sender -----------------------------------------------------------------------------------------------
@@ -40,8 +40,8 @@ def test_messages_are_numbered_and_sent_in_order() -> None:
     machine = sender()
     machine.offer(b"a", 5)
     machine.offer(b"b", 6)
-    assert machine.take() == [(1, 5, b"a"), (2, 6, b"b")]
-    assert machine.take() == []
+    assert taken(machine) == [(1, 5, b"a"), (2, 6, b"b")]
+    assert taken(machine) == []
     assert (machine.epoch, machine.first, machine.last) == (7, 1, 2)
     assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 2, 2)
 
@@ -66,15 +66,15 @@ def test_one_large_message_passes_the_byte_window() -> None:
     machine.acknowledged(3)
     assert numbers(machine) == [3]
     machine.offer(b"", 0)
-    assert machine.take() == []
+    assert taken(machine) == []
     machine.acknowledged(4)
-    assert len(machine.take()) == 1
+    assert len(taken(machine)) == 1
 
 
 def test_acknowledged_messages_are_dropped() -> None:
     machine = sender()
     fill(machine, 5)
-    machine.take()
+    taken(machine)
     machine.acknowledged(3)
     assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 8, 2)
     machine.acknowledged(3)
@@ -89,7 +89,7 @@ def test_acknowledged_messages_are_dropped() -> None:
 def test_unsent_messages_cannot_be_acknowledged(sequence: int) -> None:
     machine = sender()
     fill(machine, 5)
-    machine.take(2)
+    taken(machine, 2)
     with pytest.raises(RemoteProtocolError, match="sent up to 2"):
         machine.acknowledged(sequence)
     assert machine.pending == 5
@@ -98,11 +98,11 @@ def test_unsent_messages_cannot_be_acknowledged(sequence: int) -> None:
 def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
     machine = sender()
     fill(machine, 3)
-    machine.take(2)
+    taken(machine, 2)
     machine.suspend()
     machine.suspend()
     machine.acknowledged(2)
-    assert machine.take() == []
+    assert taken(machine) == []
     assert (machine.pending, machine.in_flight) == (3, 0)
 
 
@@ -110,7 +110,7 @@ def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
 def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[int]) -> None:
     machine = sender()
     fill(machine, 4)
-    machine.take(3)
+    taken(machine, 3)
     machine.suspend()
     machine.resume(after)
     assert numbers(machine) == again
@@ -120,7 +120,7 @@ def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[
 def test_replacing_link_needs_no_suspend() -> None:
     machine = sender()
     fill(machine, 4)
-    machine.take()
+    taken(machine)
     machine.resume(1)
     assert numbers(machine) == [1, 2, 3]
 
@@ -129,7 +129,7 @@ def test_replacing_link_needs_no_suspend() -> None:
 def test_impossible_position_is_a_remote_error(after: int) -> None:
     machine = sender()
     fill(machine, 5)
-    machine.take(3)
+    taken(machine, 3)
     machine.acknowledged(2)
     machine.suspend()
     with pytest.raises(RemoteProtocolError, match=f"resumes message {after}"):
@@ -145,7 +145,7 @@ def test_depth_drops_the_oldest_and_counts_it() -> None:
     fill(machine, 10)
     assert (machine.pending, machine.overflowed) == (3, 7)
     machine.resume(0)
-    assert [m.sequence for m in machine.take()] == [8, 9, 10]
+    assert [m.sequence for m in taken(machine)] == [8, 9, 10]
 
 
 def test_byte_bound_drops_the_oldest() -> None:
@@ -164,11 +164,11 @@ def test_byte_bound_drops_the_oldest() -> None:
 def test_message_dropped_in_flight_may_have_arrived() -> None:
     machine = sender(depth=2, window=4)
     fill(machine, 2)
-    machine.take()
+    taken(machine)
     machine.offer(payload(2), 0)
     machine.offer(payload(3), 0)
     assert (machine.pending, machine.in_flight, machine.overflowed) == (2, 2, 0)
-    machine.take()
+    taken(machine)
     machine.acknowledged(1)
     machine.suspend()
     assert not machine.idle
@@ -180,7 +180,7 @@ def test_message_dropped_in_flight_may_have_arrived() -> None:
 def test_message_dropped_without_a_link_may_have_arrived() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
-    machine.take(3)
+    taken(machine, 3)
     machine.suspend()
     for number in range(4, 9):
         machine.offer(payload(number), 0)
@@ -195,7 +195,7 @@ def test_messages_dropped_in_flight_fill_the_window(window: int, window_bytes: i
     machine = sender(depth=1, window=window, window_bytes=window_bytes)
     for number in range(10):
         machine.offer(payload(number, 1), 0)
-        machine.take()
+        taken(machine)
     assert machine.in_flight == 2
     assert machine.pending_bytes == 5
     machine.acknowledged(2)
@@ -206,7 +206,7 @@ def test_messages_dropped_in_flight_fill_the_window(window: int, window_bytes: i
 def test_acknowledgement_may_be_ahead_of_the_new_link() -> None:
     machine = sender()
     fill(machine, 5)
-    machine.take()
+    taken(machine)
     machine.resume(1)
     assert numbers(machine, 1) == [1]
     machine.acknowledged(4)  # the old link brought three more behind the position that it was opened with
@@ -229,7 +229,7 @@ def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
 def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     machine = sender(depth=4)
     fill(machine, 4)
-    machine.take()
+    taken(machine)
     machine.acknowledged(1)
     machine.offer(payload(4), 0)
     machine.offer(payload(5), 0)
@@ -240,7 +240,7 @@ def test_lost_lane_is_replayed_from_the_acknowledgement() -> None:
     assert numbers(machine) == [4, 5]
     machine.suspend()
     machine.rewind()
-    assert machine.take() == []
+    assert taken(machine) == []
 
 
 @pytest.mark.parametrize(("depth", "window"), [(0, 1), (1, 0), (-1, 1), (1 << 31, 1), (1, 1 << 31)])
@@ -254,14 +254,14 @@ def cost(waiting: int, *, dropping: bool) -> float:
     depth = waiting + 10 * (not dropping)
     machine = sender(depth=depth, max_bytes=1 << 30, window=depth, window_bytes=1 << 30)
     fill(machine, waiting)
-    machine.take(waiting // 2)
+    taken(machine, waiting // 2)
     gc.disable()  # the tests before have left it much to look at
     try:
         started = time.process_time()
         for number in range(2000):
             machine.offer(b"x", 0)
             if not dropping:
-                machine.take(1)
+                machine.take()
                 machine.acknowledged(number + 1)
         return time.process_time() - started
     finally:
@@ -399,7 +399,7 @@ def parked(
 ) -> tuple[ReliableSender, list[str]]:
     machine = sender()
     fill(machine, count)
-    machine.take()
+    taken(machine)
     return machine, table.park(key, machine, until)
 
 

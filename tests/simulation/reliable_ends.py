@@ -12,6 +12,7 @@ from rmpa.mesh import frames
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
+from tests.mesh.reliable_pair import taken
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -194,7 +195,7 @@ class Exporter:
 
     def _pump(self) -> None:
         if self.sender is not None and self.wire is not None:
-            for message in self.sender.take():
+            for message in taken(self.sender):
                 self.wire.data(message.sequence, message.stamp_ns, message.payload)
 
     def _lost(self, wire: Wire) -> None:

@@ -135,29 +135,19 @@ class ReliableSender:
             self._drop_oldest()
             count -= 1
 
-    def take(self, most: int | None = None) -> list[Outgoing]:
-        """Return the messages that may be sent now, in order, and count them as sent; without a link there are none.
-
-        Args:
-            most: The most messages to return; ``None``: all that the window allows.
-        """
-        taken: list[Outgoing] = []
-        if not self._linked:
-            return taken
-        room = self._window_messages - len(self._dropped_in_flight) - len(self._sent)
-        if most is not None and most < room:
-            room = most
-        while self._unsent and len(taken) < room:
-            message = self._unsent[0]
-            size = len(message.payload)
-            if self._in_flight_bytes + size > self._window_bytes and (self._sent or self._dropped_in_flight):
-                break
-            self._sent.append(self._unsent.popleft())
-            self._in_flight_bytes += size
-            taken.append(message)
-        if taken:
-            self._sent_up_to(taken[-1].sequence)
-        return taken
+    def take(self) -> Outgoing | None:
+        """Return the next message if it may be sent now, and count it as sent; without a link none may."""
+        in_flight = len(self._dropped_in_flight) + len(self._sent)
+        if not self._linked or not self._unsent or in_flight >= self._window_messages:
+            return None
+        size = len(self._unsent[0].payload)
+        if in_flight and self._in_flight_bytes + size > self._window_bytes:
+            return None
+        message = self._unsent.popleft()
+        self._sent.append(message)
+        self._in_flight_bytes += size
+        self._sent_up_to(message.sequence)
+        return message
 
     def put_back(self) -> None:
         """Undo the ``take`` of the last message, which could not be sent: it is the next one again.

@@ -288,8 +288,7 @@ class ReliableRouteSender(RouteSender):
 
     def _go_on(self) -> None:
         """Sends what the window allows."""
-        while self.link is not None and not self._switch.fencing and (taken := self.sender.take(1)):
-            (message,) = taken
+        while self.link is not None and not self._switch.fencing and (message := self.sender.take()):
             if not self._lane_for(len(message.payload)):
                 self.sender.put_back()
                 return

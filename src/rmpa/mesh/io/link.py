@@ -66,6 +66,7 @@ class LinkHandlers:
     lane_lost: Callable[[PeerLink], None]
 
 
+@dataclass(eq=False)
 class LinkOwner:
     """What connections and links have of their mesh, and what they report to it; the base of ``Mesh``.
 
@@ -75,26 +76,18 @@ class LinkOwner:
         clock: The time; its ``now`` must be the loop's own clock.
         counters: Where refusals and failures are counted.
         rng: Uniform numbers in [0, 1), for jitter.
+        rest_lease: What this agent promises on links at rest; see ``mesh.keepalive.rest_lease``.
     """
 
-    def __init__(
-        self,
-        identity: Identity,
-        handlers: LinkHandlers,
-        clock: SystemClock,
-        counters: Counters,
-        rng: Callable[[], float],
-    ) -> None:
-        self.identity = identity
-        self.handlers = handlers
-        self.clock = clock
-        self.counters = counters
-        self.rng = rng
-        self.rest_lease = limits.IDLE_LEASE
-        """What this agent promises on links at rest; see ``mesh.keepalive.rest_lease``."""
+    identity: Identity
+    handlers: LinkHandlers
+    clock: SystemClock
+    counters: Counters
+    rng: Callable[[], float]
+    rest_lease: float = limits.IDLE_LEASE
 
     def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
-        """Decide on the hello or welcome of the remote side; ``None`` accepts it."""
+        """Decide on the hello or welcome of the remote side, beside what its machine checks; ``None`` accepts it."""
         raise NotImplementedError
 
     def opened(self, connection: Connection) -> None:
@@ -152,7 +145,8 @@ class Connection(ConnectionProtocol):
         self.silent = False
         """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
         self._pings: dict[int, asyncio.Future[float]] = {}
-        self._over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Done when the socket is closed."""
         self.stream = Stream(
             sock,
             on_bytes=self._receive,
@@ -174,17 +168,12 @@ class Connection(ConnectionProtocol):
         )
         self.keepalive.rest_lease = mesh.rest_lease
         self._timer = MachineTimer(self.next_timer, self._due, now=mesh.clock.now)
-        self._flush()
+        self.flush()
 
     @property
     def identity(self) -> Identity:
         """The remote side; only once it has said hello."""
         return cast("Hello", self.remote).identity
-
-    @property
-    def heard_at(self) -> float:
-        """Monotonic seconds at which bytes were last received."""
-        return max(self.keepalive.heard, self.stream.last_in)
 
     def send_mark(self, kind: FrameKind, route: int, sequence: int) -> None:
         """Acknowledge messages of a route, or answer a fence, before all waiting data."""
@@ -201,11 +190,6 @@ class Connection(ConnectionProtocol):
             self.stream.send((self.pack_control(payload),), URGENT)
             self._check_urgent()
 
-    def say_need(self, *, needed: bool) -> None:
-        """Say whether something depends on this connection; see ``need``."""
-        self.need(self.mesh.clock.now(), needed=needed)
-        self._flush()
-
     async def measure(self) -> float | None:
         """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
         if not self.up:
@@ -213,7 +197,7 @@ class Connection(ConnectionProtocol):
         stamp = self.ping(self.mesh.clock.now())
         answer: asyncio.Future[float] = asyncio.get_running_loop().create_future()
         self._pings[stamp] = answer
-        self._flush()
+        self.flush()
         try:
             async with asyncio.timeout(limits.PING_TIMEOUT):
                 return await answer
@@ -222,34 +206,20 @@ class Connection(ConnectionProtocol):
         finally:
             self._pings.pop(stamp, None)
 
-    def expel(self, refuse: Refuse) -> None:
-        """Close a connection that is up because its peer was revoked, and say so; as ``end`` otherwise."""
-        self.refuse(refuse, self.mesh.clock.now())
-        self._flush()
-
     def end(self, reason: str) -> None:
         """Send a bye, wait at most ``limits.DRAIN_TIMEOUT`` for the last bytes to be sent, and close."""
         self.close(reason, self.mesh.clock.now())
-        self._flush()
-
-    def sever(self, reason: str) -> None:
-        """Close at once without sending another byte, because the outbox now belongs to another connection."""
-        self.stream.close()
-        self.lost(reason)
-
-    async def ended(self) -> None:
-        """Wait until the socket is closed and the mesh is notified."""
-        await asyncio.shield(self._over)
+        self.flush()
 
     # --- what the machine reports -------------------------------------------------------------------------------
 
     def judge(self, hello: Hello) -> Refuse | None:
         """Decide on the remote side's hello or welcome."""
-        return self.mesh.judge(self, hello)
+        return self.mesh.judge(self, hello) or super().judge(hello)
 
     def opened(self) -> None:
         """The handshake succeeded; the welcome must be sent before anything that the mesh sends now."""
-        self._flush()
+        self.flush()
         self.mesh.opened(self)
 
     def refused(self, refuse: Refuse, *, by_us: bool) -> None:
@@ -301,10 +271,10 @@ class Connection(ConnectionProtocol):
     def _receive(self, view: memoryview) -> tuple[int, int]:
         taken = self.receive(view, self.mesh.clock.now())
         if self.output:
-            self._flush()
+            self.flush()
         return taken
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
         """Send the machine's output; a closing connection then waits for the remote end to close, or its time-out."""
         if self.output:
             self.stream.send((self.take_output(),), URGENT)
@@ -339,8 +309,8 @@ class Connection(ConnectionProtocol):
     def _report_end(self, reason: str) -> None:
         self.stream.close()
         self.routes = {}
-        self._over.set_result(None)
         self.mesh.ended(self, reason)
+        self.over.set_result(None)
         self.link = None  # which holds this connection, with its perhaps large buffers
 
     def _due(self, now: float) -> None:
@@ -353,7 +323,7 @@ class Connection(ConnectionProtocol):
         link = self._express_of()
         if self.up and link is not None and self.dialled and not link.alive:
             self.mesh.redial(link)
-        self._flush()
+        self.flush()
 
 
 class PeerLink:
@@ -450,8 +420,7 @@ class PeerLink:
     @property
     def abandoned(self) -> bool:
         """Whether the peer has given up what it asked over this link; see ``ConnectionProtocol.abandoned``."""
-        bulk = self.bulk_connection
-        return self.connection.abandoned or (bulk is not None and bulk.abandoned)
+        return any(connection.abandoned for connection in self._connections())
 
     @property
     def resumed_at(self) -> float:
@@ -461,14 +430,12 @@ class PeerLink:
     @property
     def bytes_in(self) -> int:
         """Bytes received, headers included, by both lanes."""
-        bulk = self.bulk_connection.stream.bytes_in if self.bulk_connection else 0
-        return self.connection.stream.bytes_in + self._bulk_in + bulk
+        return self._bulk_in + sum(connection.stream.bytes_in for connection in self._connections())
 
     @property
     def bytes_out(self) -> int:
         """Bytes that the kernel took, headers included, on both lanes."""
-        bulk = self.bulk_connection.stream.bytes_out if self.bulk_connection else 0
-        return self.connection.stream.bytes_out + self._bulk_out + bulk
+        return self._bulk_out + sum(connection.stream.bytes_out for connection in self._connections())
 
     @property
     def queue_bytes(self) -> int:
@@ -489,7 +456,7 @@ class PeerLink:
     @property
     def heard_at(self) -> float:
         """Monotonic seconds at which bytes were last received on the express lane."""
-        return self.connection.heard_at
+        return max(self.connection.keepalive.heard, self.connection.stream.last_in)
 
     @property
     def rests(self) -> bool:
@@ -513,7 +480,8 @@ class PeerLink:
         """
         self._needed = needed
         for connection in self._connections():
-            connection.say_need(needed=needed)
+            connection.need(self._mesh.clock.now(), needed=needed)
+            connection.flush()
 
     def touch(self) -> None:
         """A control frame was sent or received: something begins."""
@@ -537,11 +505,12 @@ class PeerLink:
         """Use this connection for the bulk lane from now on; an older one is closed without a bye."""
         if (old := self.bulk_connection) is not None:
             self.detach(old)
-            old.sever("replaced by a newer bulk lane")
+            old.stream.close()  # without another byte: its outbox now belongs to the new connection
+            old.lost("replaced by a newer bulk lane")
         self.bulk_connection, bulk.link = bulk, self
         self.bulk_wanted = True
         self.backoff.reset()
-        bulk.say_need(needed=self._needed)
+        self.need(needed=self._needed)
         self.use(used=self.used)
         self.bulk.connect(bulk.stream)
 

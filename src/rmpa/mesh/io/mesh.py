@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config.settings import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse, judge_welcome
+from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler, unacknowledged
 from rmpa.mesh.io.link import Connection, LinkHandlers, LinkOwner, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
@@ -118,13 +118,11 @@ class Mesh(LinkOwner):
         await asyncio.gather(*tasks, return_exceptions=True)
         for connection in self.connections():
             connection.end(f"{self.identity.name} ends")
-        ends = [asyncio.ensure_future(connection.ended()) for connection in self.connections()]
-        if ends:
-            _, late = await asyncio.wait(ends, timeout=runtime_limits.DRAIN_TIMEOUT)
+        if ends := [connection.over for connection in self.connections()]:
+            await asyncio.wait(ends, timeout=runtime_limits.DRAIN_TIMEOUT)
             for connection in self.connections():
                 connection.lost("the bye was not answered in time")
-            if late:
-                await asyncio.wait(late)
+            await asyncio.wait(ends)
 
     def peer_found(self, identity: Identity, source: str | None = None) -> None:
         """Take in a peer that discovery found, or news of it.
@@ -171,10 +169,9 @@ class Mesh(LinkOwner):
 
     def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello or welcome of the remote side; the peering machine knows the links that are up."""
-        if (refuse := self._prove(connection, hello)) is not None:
+        refuse = self._prove(connection, hello)
+        if refuse is not None or connection.dialled:
             return refuse
-        if connection.dialled:
-            return judge_welcome(hello, self.identity, connection.expected)
         refuse = self._peering.judge(hello, self.clock.now())
         if refuse is not None and refuse.code == Refusal.DUPLICATE:
             for link in self.links():
@@ -353,53 +350,46 @@ class Mesh(LinkOwner):
 
     def redial(self, link: PeerLink) -> None:
         """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
-        if self._running and link.redial is None:
+        if self._running and _is_over(link.redial):
             link.redial = self._start(self._redial(link), f"redial {link.name}")
 
     async def _redial(self, link: PeerLink) -> None:
         """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
-        try:
-            while link.is_silent():
-                known = self._peering.endpoints(link.guid)
-                endpoints = list(dict.fromkeys([link.remote_endpoint, *known]))
-                try:
-                    sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
-                    if not link.is_silent() or not unacknowledged(link.connection.sock):
-                        sock.close()  # it ended meanwhile, or is silent, but not for want of a way to it
-                        return
-                    secured = await self._secure(sock)
-                except OSError as error:
-                    _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
-                    await asyncio.sleep(limits.REDIAL_PAUSE)
-                    continue
+        while link.is_silent():
+            endpoints = list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
+            try:
+                sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
+                if not link.is_silent() or not unacknowledged(link.connection.sock):
+                    sock.close()  # it ended meanwhile, or is silent, but not for want of a way to it
+                    return
+                secured = await self._secure(sock)
+            except OSError as error:
+                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+            else:
                 self._open(sock, endpoint, link=link, secured=secured)
                 return
-        finally:
-            link.redial = None
 
     def dial_bulk(self, link: PeerLink, delay: float = 0.0) -> None:
         """Dial the bulk lane of a link in ``delay`` seconds, if it is wanted and missing, and this side has to."""
-        missing = link.bulk_connection is None and link.bulk_dial is None
+        missing = link.bulk_connection is None and _is_over(link.bulk_dial)
         if self._running and link.used and link.dialled and link.bulk_wanted and missing:
             link.bulk_dial = self._start(self._dial_bulk(link, delay), f"bulk {link.name}")
 
     async def _dial_bulk(self, link: PeerLink, delay: float) -> None:
         """Connect the bulk lane of a link, at the endpoint of the express lane."""
-        try:
-            await asyncio.sleep(delay)
-            while link.used:
-                try:
-                    sock = await self.dialler.connect(link.remote_endpoint, Lane.BULK)
-                    secured = await self._secure(sock)
-                except OSError as error:
-                    self.counters.add("link.bulk_failed")
-                    _log.debug("! %s: no bulk lane: %s", link.name, error)
-                    await asyncio.sleep(link.backoff.delay())
-                    continue
+        await asyncio.sleep(delay)
+        while link.used:
+            try:
+                sock = await self.dialler.connect(link.remote_endpoint, Lane.BULK)
+                secured = await self._secure(sock)
+            except OSError as error:
+                self.counters.add("link.bulk_failed")
+                _log.debug("! %s: no bulk lane: %s", link.name, error)
+                await asyncio.sleep(link.backoff.delay())
+            else:
                 self._open(sock, link.remote_endpoint, link=link, lane=Lane.BULK, secured=secured)
                 return
-        finally:
-            link.bulk_dial = None
 
     async def _secure(self, sock: socket.socket) -> SecuredSocket | None:
         """Do the TLS handshake of a dialled connection in a secured mesh; closes the socket if it fails."""
@@ -463,7 +453,12 @@ class Mesh(LinkOwner):
         for connection in self.connections():
             remote = connection.remote
             if connection.up and remote is not None and (refuse := self._prove(connection, remote)):
-                connection.expel(refuse)
+                connection.refuse(refuse, self.clock.now())
+                connection.flush()
+
+
+def _is_over(task: asyncio.Task[None] | None) -> bool:
+    return task is None or task.done()
 
 
 def _report(task: asyncio.Task[None]) -> None:

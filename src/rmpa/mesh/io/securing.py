@@ -59,13 +59,9 @@ class SecuringError(ConnectionError):
     """
 
     def __init__(self, refuse: Refuse, *, by_us: bool) -> None:
-        super().__init__(refuse.text)
+        super().__init__(str(refuse))
         self.refuse = refuse
         self.by_us = by_us
-
-    def __str__(self) -> str:
-        """``expired: …``."""
-        return str(self.refuse)
 
 
 def refusal(reason: TrustReason, problem: str) -> Refuse:
