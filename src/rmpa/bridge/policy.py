@@ -78,10 +78,6 @@ class Policy:
             return PolicyDecision(False, f'time.follow = "{self._time.follow}": time comes from there alone')
         return PolicyDecision(True, f'time.follow = "{peer}"')
 
-    def has_rules_for(self, peer: str) -> bool:
-        """Whether there are globs for this peer."""
-        return bool(self._rules_for(peer))
-
     def _filled(self, peer: str) -> tuple[tuple[str, PolicySettings], ...]:
         """The rules for a peer: the place of each in the file, as text, and its globs with the name filled in."""
         return tuple(
