@@ -92,7 +92,7 @@ def with_byte(data: bytes, offset: int, value: int) -> bytes:
     ("offset", "value", "code"),
     [
         (0, 0x58, Refusal.MALFORMED),
-        (4, 3, Refusal.VERSION),
+        (4, 2, Refusal.VERSION),
         (44, 60, Refusal.MALFORMED),
         (45, 0x2F, Refusal.MALFORMED),
     ],

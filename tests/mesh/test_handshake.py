@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2))
 WIRE = bytes.fromhex(
-    "524d5041 02 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 0462617365"
+    "524d5041 03 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 0462617365"
 )
 
 
@@ -46,7 +46,7 @@ def test_every_shorter_hello_is_malformed(cut: int) -> None:
 
 
 def test_other_version_is_distinguished_from_garbage() -> None:
-    refuse = problem(b"RMPA\x03\x01\x00\x00")
+    refuse = problem(b"RMPA\x04\x01\x00\x00")
     assert refuse.code == Refusal.VERSION
     assert "same release" in refuse.text
 

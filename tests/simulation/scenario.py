@@ -160,7 +160,7 @@ class Scenario:
         """Send bytes that are no beacon, from an unknown address."""
         rng = self.world.rng
         for _ in range(5):
-            data = rng.choice([b"", b"RMPA", b"RMPA\x03\x01\x00\x00", b"RMPA\x02\x01\x00\x07"])
+            data = rng.choice([b"", b"RMPA", b"RMPA\x04\x01\x00\x00", b"RMPA\x03\x01\x00\x07"])
             self.network.unicast((peer.host, 6666), peer.address, data + rng.randbytes(rng.randint(0, 80)))
 
     def _forge(self, peer: RosterPeer) -> None:

@@ -206,7 +206,7 @@ def parse_text(payload: Buffer) -> str:
 
 
 MAGIC: Final = b"RMPA"
-VERSION: Final = 2
+VERSION: Final = 3
 
 _PREFIX: Final = struct.Struct(">4sBBH")
 _HELLO: Final = struct.Struct(">4sBBHQ16sIQB")
