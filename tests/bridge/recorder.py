@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
@@ -171,6 +172,7 @@ class Out(Effects):
         self.rng = rng
         self._numbering = numbering
         self.outbound = self.serving = self
+        self.direct_exports = SimpleNamespace(server_gone=lambda _: None)
         self.done: list[Any] = []
         self._position = position
 

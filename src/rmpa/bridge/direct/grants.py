@@ -44,7 +44,6 @@ from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addr
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.exports import ServiceExports
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
@@ -451,14 +450,10 @@ class ServiceGrants(Grants):
         rpc.on_notification("direct.service_release", self._released, _RELEASED)
         self._exports = exports
         self._on_warning = on_warning
-        self._servers: dict[str, LocalService] = {}
-        """The servers of services that were asked for, as they were last seen."""
 
-    def server(self, service: str, server: LocalService | None) -> None:
-        """Have peers ask again for a service that has another server now."""
-        if self._servers.get(service, server) != server:
-            del self._servers[service]
-            self._again(lambda want: want.name == service)
+    def server_gone(self, service: str) -> None:
+        """Have peers ask again for a service whose server has left, or is another one now."""
+        self._again(lambda want: want.name == service)
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         reply = await super()._ask(session, args)
@@ -479,8 +474,6 @@ class ServiceGrants(Grants):
     def _unmet(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
         service = asked.name
         local, server = self._exports.local(session.peer, service), self._exports.offered.get(service)
-        if server is not None:
-            self._servers[service] = server
         if local is None or server is None:
             return Unmet(Condition.OFFERED, f"{service} is not offered")
         if server.node != asked.node:

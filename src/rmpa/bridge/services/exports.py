@@ -189,6 +189,7 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         for peer, number, _ in self._of(key):
             self._close(peer, number, f"{key}: {reason}")
         self._do.serving.server_gone(key)
+        self._do.direct_exports.server_gone(key)
 
     def _close(self, peer: int, number: int, reason: str) -> None:
         route = self._routes[peer].pop(number)

@@ -239,7 +239,6 @@ class Services(GraphPart):
         if local is None or self._withdrawn(name, local.node):
             local = self._to_relay(name, providers)
         self.exports.put(name, local)
-        self.direct_exports.server(name, self.exports.offered.get(name))
 
     def _withdrawn(self, service: str, node: str) -> bool:
         """Whether the core found a server unreachable and withdrew it, and no peer has its service open."""

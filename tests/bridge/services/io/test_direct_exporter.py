@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -15,9 +15,6 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Transport
 from rmpa.core.counters import Counters
 from rmpa.trust.permissions import Permissions
-
-if TYPE_CHECKING:
-    from rmpa.bridge.services.bodies import LocalService
 
 AGAIN = "direct.service_again"
 URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"
@@ -66,7 +63,7 @@ class Module:
 
     def restart(self) -> None:
         """The server is registered again, at another port."""
-        self.sut.server("/add", cast("LocalService", SimpleNamespace(node="/adder", uri=RESTARTED)))
+        self.sut.server_gone("/add")
 
 
 @pytest.mark.parametrize("secured", [True, False])
