@@ -195,7 +195,7 @@ class BeaconSender:
         guids: list[Guid] = []
         for number, peer in enumerate((*known[start:], *known[:start]), start + 1):
             guid = peer.identity.guid
-            lately = peer.linked or now - peer.heard <= limits.MULTICAST_SILENCE
+            lately = peer.linked or now - peer.last_seen <= limits.MULTICAST_SILENCE
             if peer is not to and lately and (loopback or not guid.is_loopback):
                 guids.append(guid)
                 if len(guids) == limits.BEACON_GOSSIP_MAX:

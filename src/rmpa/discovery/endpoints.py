@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 HeardBy: TypeAlias = Literal["multicast", "unicast", "gossip", "link"]
 """How a peer was heard first; ``gossip``: it answered an announcement to an address that another's gossip had."""
-_NEVER: Final = float("-inf")
+NEVER: Final = float("-inf")
+LINKED: Final = float("inf")
+"""The end of a link that has not ended."""
 
 
 @dataclass(slots=True)
@@ -33,14 +35,13 @@ class PeerInstance:
     Args:
         identity: As its last beacon or handshake said.
         since: When it began to claim its endpoint, or became the live run there, or a member.
-        heard: When it was last heard, or had a link.
+        heard: When its last beacon or handshake came.
         found_by: How it was first heard.
         lease: Seconds of silence after which it counts as gone.
         source: The source address of its last packet; ``None`` if only a link has shown it.
         sequence: The number of its last beacon that was no goodbye.
         multicast_at: When it was last heard by multicast.
-        linked: Whether there is a link with it.
-        verified: Whether it had a link: it is no forgery.
+        linked_until: When its link ended; ``LINKED`` while there is one, ``NEVER`` if there was none.
         goodbye: The number of its goodbye, behind which nothing came. It may be forged.
         doubted: Whether the silence of its beacons, while it is linked, was reported.
     """
@@ -52,16 +53,30 @@ class PeerInstance:
     lease: float = core_limits.PEER_LEASE
     source: Address | None = None
     sequence: int | None = None
-    multicast_at: float = _NEVER
-    linked: bool = False
-    verified: bool = False
+    multicast_at: float = NEVER
+    linked_until: float = NEVER
     goodbye: int | None = None
     doubted: bool = False
 
     @property
+    def linked(self) -> bool:
+        """Whether there is a link with it."""
+        return self.linked_until == LINKED
+
+    @property
+    def verified(self) -> bool:
+        """Whether it has or had a link: it is no forgery."""
+        return self.linked_until != NEVER
+
+    @property
+    def last_seen(self) -> float:
+        """When it was last heard, or its link ended."""
+        return self.heard if self.linked else max(self.heard, self.linked_until)
+
+    @property
     def deadline(self) -> float:
         """When its lease is over, if it stays silent."""
-        return self.heard + self.lease
+        return self.last_seen + self.lease
 
     @property
     def addresses(self) -> tuple[Address, ...]:
@@ -135,7 +150,7 @@ class Endpoint:
             elif rivals:
                 rival = max(rivals, key=lambda run: run.heard)
                 # If the live run missed its heartbeat, its packets, and not the rival's, were the late ones.
-                if current is None or rival.heard - current.heard > limits.HEARTBEAT_LATE:
+                if current is None or rival.heard - current.last_seen > limits.HEARTBEAT_LATE:
                     current = rival
         if current is not self.current:
             rivals = []
@@ -144,7 +159,7 @@ class Endpoint:
         self.current, self.claimant = current, claimant if claimant is not current else None
         # A linked run that was not heard since the rival appeared may be without power; its link is checked.
         self.conflict = current is not None and any(
-            self.own or not current.linked or current.heard > rival.since for rival in rivals
+            self.own or current.heard > rival.since or current.since >= rival.since for rival in rivals
         )
 
     def hear(self, beacon: Beacon, source: Address, now: float, *, multicast: bool) -> PeerInstance | None:
@@ -170,11 +185,10 @@ class Endpoint:
         run = self.runs.get(identity.instance) or self._add(PeerInstance(identity, now, now, "link"))
         # A handshake carries no further addresses; those of the beacons stay.
         run.identity = identity if identity.addresses else replace(identity, addresses=run.identity.addresses)
-        run.linked = run.verified = True
-        run.goodbye, run.doubted, run.heard = None, False, now
+        run.goodbye, run.doubted, run.heard, run.linked_until = None, False, now, LINKED
         if run is not self.current:
             if self.current is not None:
-                self.current.linked = False
+                self.current.linked_until = min(self.current.linked_until, now)
             self.current, self.claimant, run.since = run, None, now
         return run
 
@@ -266,7 +280,7 @@ class EndpointTable(dict[int, Endpoint]):
             if mine is None or peer is None or other is endpoint or not (other.member is not None or other.own):
                 continue
             newer, older = (mine, peer) if (mine.since, other.own) >= (peer.since, endpoint.own) else (peer, mine)
-            if older.linked or older.heard >= newer.since:  # this agent itself counts as linked
+            if older.linked or older.last_seen >= newer.since:  # this agent itself counts as linked
                 pairs.append((newer, older))
         return pairs
 

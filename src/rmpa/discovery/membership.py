@@ -18,7 +18,7 @@ from rmpa.core.counters import Counters, earliest
 from rmpa.discovery import limits
 from rmpa.discovery.announcing import BeaconSender, GossipCandidates
 from rmpa.discovery.beacon import BeaconKind
-from rmpa.discovery.endpoints import Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
+from rmpa.discovery.endpoints import LINKED, NEVER, Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -34,7 +34,6 @@ GOODBYE: Final = "said goodbye"
 RESTARTED: Final = "started anew"
 MOVED: Final = "started anew at another port"
 CONFLICT: Final = "another live peer has its GUID address"
-_NEVER: Final = float("-inf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +91,13 @@ class MembershipProtocol:
         self._burst: list[float] = []
         self._heartbeat_at: float | None = None
         self._disseminate_at: float | None = None
-        self._disseminated_at = _NEVER
+        self._disseminated_at = NEVER
         self._unicasts: dict[int, PeerInstance] = {}
         """The peers that get a heartbeat by unicast now, by place."""
-        self._unicast_at = _NEVER
+        self._unicast_at = NEVER
         self._late_answers: dict[int, None] = {}
         """The places of newcomers of a large mesh that wait for an answer, oldest first."""
-        self._late_answers_at = _NEVER
+        self._late_answers_at = NEVER
         self._events: list[PeerEvent] = []
 
     # --- inputs -----------------------------------------------------------------------------------------------
@@ -106,7 +105,7 @@ class MembershipProtocol:
     def start(self, now: float) -> None:
         """Announce this agent: a burst of beacons, then only heartbeats."""
         identity = self._sender.identity
-        own = PeerInstance(identity, now, now, "link", linked=True, verified=True)
+        own = PeerInstance(identity, now, now, "link", linked_until=LINKED)
         self._endpoints[identity.guid.place] = Endpoint({identity.instance: own}, own, own=True)
         self._endpoints.index(identity.guid.place)
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
@@ -205,7 +204,7 @@ class MembershipProtocol:
         run = endpoint.current if endpoint is not None and not endpoint.own else None
         if run is None or not run.linked or (instance is not None and run.identity.instance != instance):
             return
-        run.linked, run.heard = False, now
+        run.linked_until = now
         self._settle(guid.place, now, answer=True)
 
     def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...]) -> None:
@@ -373,7 +372,7 @@ class MembershipProtocol:
                 former is not None
                 and other is not endpoint
                 and not former.linked
-                and former.heard < peer.since
+                and former.last_seen < peer.since
                 and former.identity.guid.address == peer.identity.guid.address
             ):
                 self._remove(former.identity.guid.place, MOVED)
@@ -415,12 +414,12 @@ class MembershipProtocol:
         if not linked and strangers < limits.STRANGERS_MAX and len(runs) < core_limits.PEERS_MAX:
             return True
         unlinked = [
-            (run is not None and run.verified, run.heard if run is not None else _NEVER, place)
+            (run is not None and run.verified, run.last_seen if run is not None else NEVER, place)
             for place, run in runs
             if run is None or not run.linked
         ]
-        had_link, heard, place = min(unlinked, default=(True, now, 0))
-        if not unlinked or (not linked and (had_link or heard > now - limits.HEARTBEAT_LATE)):
+        had_link, seen, place = min(unlinked, default=(True, now, 0))
+        if not unlinked or (not linked and (had_link or seen > now - limits.HEARTBEAT_LATE)):
             return False
         self._remove(place, SILENCE)
         return True
