@@ -7,7 +7,6 @@ import contextlib
 import logging
 import random
 import time
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
 from ipaddress import AddressValueError, IPv4Address
@@ -53,7 +52,7 @@ _REFUSED: Final = {
     Verdict.UNKNOWN_KEY: TrustReason.KEY,
     Verdict.FORGED: TrustReason.FOREIGN,
 }
-"""What is told of the senders of packets that are refused; repeats are only counted."""
+"""What is told of the senders of packets that are refused; others are only counted."""
 
 
 @dataclass(slots=True)
@@ -76,11 +75,12 @@ class Stranger:
 class PacketFilter:
     """Parses the packets of the discovery sockets; those that are dropped are counted.
 
-    Dropped are repeats, floods, and in a secured mesh packets without a valid proof.
+    Dropped are floods, and in a secured mesh packets without a valid proof. A packet that comes by two interfaces is
+    parsed twice; its number shows the membership protocol that it is a repeat.
 
     Args:
         domain: This agent's domain id.
-        counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
+        counters: ``beacon.in``, ``beacon.flood``, ``beacon.unlinked_limited``,
             ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
         is_verified: Whether a run of a peer has or had a link: beacons of such peers, and echoes of this agent's
             own, are not limited in rate.
@@ -104,7 +104,6 @@ class PacketFilter:
         # The limits, one for each kind of packet and each kind of sender: they are more than twelve fields together.
         self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
-        self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: AddressLimit[str] = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
         self._old_key_sources: AddressLimit[str] = AddressLimit(
             trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX
@@ -149,8 +148,6 @@ class PacketFilter:
             text = f"{host} sends too many packets to the discovery port; the rest is ignored"
             self._refusals.refuse(now, "beacon.flood", host, text)
             return None
-        if self._trust is None and not self._is_new(data):
-            return None
         beacon = self._read(data, host, now, multicast=multicast, interface=interface)
         return None if beacon is None else (beacon, None)
 
@@ -183,17 +180,6 @@ class PacketFilter:
             return None
         self._counters.add("beacon.in")
         return packet
-
-    def _is_new(self, data: bytes) -> bool:
-        """Whether a packet did not come before, by another interface."""
-        if data in self._recent:
-            self._counters.add("beacon.repeated")
-            return False
-        if len(data) <= limits.BEACON_MAX_BYTES:
-            self._recent[data] = None
-            if len(self._recent) > limits.BEACON_REPEATS:
-                self._recent.popitem(last=False)
-        return True
 
     def _verify(self, trust: PacketTrust, data: bytes, host: str, now: float) -> Verification | None:
         """The proof of a packet that a member of the secured mesh sent just now, or a module that was one.
@@ -322,7 +308,8 @@ class Discovery:
         self._seed_hosts: dict[str, list[str]] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._receivers: list[socket.socket] = []
-        self._joined: network.GroupMembership | None = None
+        self._group_socket: socket.socket | None = None
+        self._joined: set[int] = set()
         self._warned: set[str] = set()
         self._timer = MachineTimer(self._membership.next_timer, self._timer_due)
         self._started = False
@@ -339,9 +326,7 @@ class Discovery:
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
         if self._settings.multicast.enabled:
             group, _ = self._group
-            sock = self._open_receiver(group, multicast=True, lost="no multicast is heard; use --seed")
-            if sock is not None:
-                self._joined = network.GroupMembership(sock, group)
+            self._group_socket = self._open_receiver(group, multicast=True, lost="no multicast is heard; use --seed")
         self._everything = self._look()
         self._use_interfaces()
         now = time.monotonic()
@@ -373,7 +358,7 @@ class Discovery:
             loop.remove_reader(sock.fileno())
             sock.close()
         self._receivers.clear()
-        self._joined = None
+        self._group_socket = None
 
     # --- links and views --------------------------------------------------------------------------------------
 
@@ -501,8 +486,9 @@ class Discovery:
             self._warned.discard(_ALONE)
         else:
             self._warn(_ALONE)
-        if self._joined is not None:
-            for name, error in self._joined.update(self.interfaces).items():
+        if self._group_socket is not None:
+            refused = network.join_group(self._group_socket, self._group[0], self.interfaces, self._joined)
+            for name, error in refused.items():
                 self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
 
     def _seed_is(self, host: str, addresses: list[str]) -> None:

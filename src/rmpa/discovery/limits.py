@@ -115,8 +115,6 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 so that the announcements of a thousand agents that start at once wait until they are read."""
 BEACON_SOURCES_MAX: Final = 4096
 """Source addresses whose packets are counted; the oldest is forgotten first."""
-BEACON_REPEATS: Final = 128
-"""Packets remembered, so that one that arrives over two interfaces is read once."""
 SEED_RESOLVE_INTERVAL: Final = 60.0
 """A seed's host name is looked up again this often: addresses change."""
 SEED_RETRY_FIRST: Final = 1.0

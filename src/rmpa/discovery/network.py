@@ -256,39 +256,33 @@ def receive(sock: socket.socket) -> tuple[bytes, Address, int]:
     return data, (source[0], source[1]), index
 
 
-class GroupMembership:
-    """The interfaces on which a receiving socket has joined the group.
+def join_group(
+    sock: socket.socket, group: str, interfaces: Iterable[Interface], joined: set[int]
+) -> dict[str, OSError]:
+    """Join a group on these interfaces, and leave it on all others.
 
     Args:
         sock: From ``open_receiver``.
         group: The group's address.
+        interfaces: Where to join.
+        joined: The indices of the interfaces on which ``sock`` has joined; changed here.
+
+    Returns:
+        The errors by the name of the interface.
     """
-
-    def __init__(self, sock: socket.socket, group: str) -> None:
-        self._sock = sock
-        self._group = socket.inet_aton(group)
-        self._joined: set[int] = set()
-
-    def update(self, interfaces: Iterable[Interface]) -> dict[str, OSError]:
-        """Join on these interfaces and leave all others; return the errors by the name of the interface."""
-        refused = {}
-        wanted = {i.index: i.name for i in interfaces}
-        for index in self._joined - wanted.keys():
-            with contextlib.suppress(OSError):  # the kernel has left it already
-                self._change(socket.IP_DROP_MEMBERSHIP, index)
-        self._joined &= wanted.keys()
-        for index in sorted(wanted.keys() - self._joined):
-            try:
-                self._change(socket.IP_ADD_MEMBERSHIP, index)
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:  # joined already
-                    refused[wanted[index]] = error
-                    continue
-            self._joined.add(index)
-        return refused
-
-    def _change(self, option: int, index: int) -> None:
-        self._sock.setsockopt(socket.IPPROTO_IP, option, _MREQN.pack(self._group, _ANY, index))
+    refused = {}
+    wanted = {i.index: i.name for i in interfaces}
+    for index in joined ^ wanted.keys():
+        option = socket.IP_ADD_MEMBERSHIP if index in wanted else socket.IP_DROP_MEMBERSHIP
+        joined ^= {index}
+        try:
+            sock.setsockopt(socket.IPPROTO_IP, option, _MREQN.pack(socket.inet_aton(group), _ANY, index))
+        except OSError as error:
+            # EADDRINUSE: joined already. An interface that is gone was left by the kernel.
+            if index in wanted and error.errno != errno.EADDRINUSE:
+                joined.discard(index)
+                refused[wanted[index]] = error
+    return refused
 
 
 class Sender:

@@ -28,7 +28,7 @@ from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.network import GroupMembership, choose, list_interfaces, open_receiver, receive
+from rmpa.discovery.network import choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.control_client import ControlClient, find_agents
@@ -101,7 +101,7 @@ def hear(interfaces: Iterable[Interface], group: str, port: int, listen: float =
     found: dict[str, MulticastEcho] = {}
     with receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
-        refused = GroupMembership(receiver, group).update(wanted.values())
+        refused = join_group(receiver, group, wanted.values(), set())
         sent: dict[bytes, tuple[str, float]] = {}
         for interface in wanted.values():
             token = struct.pack(">4sBBH", MAGIC, VERSION, BeaconKind.HEARTBEAT, _NO_DOMAIN) + secrets.token_bytes(16)
