@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 from msgspec import Meta
@@ -229,20 +230,15 @@ class Contracts:
     ) -> None:
         self._rules = rules
         self._default = replace(_DEFAULT, transport=default_transport)
-        self._known: dict[tuple[str, str], Contract] = {}
+        self._find = lru_cache(limits.CONTRACTS_REMEMBERED)(self._combined)
 
     def of(self, topic: str, type_name: str) -> Contract:
         """The contract of a topic. ``type_name`` may be empty or ``*`` while it is not known."""
-        if not self._rules:
-            return self._default
-        found = self._known.get((topic, type_name))
-        if found is None:
-            values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
-            found = Contract(**values)  # type: ignore[arg-type] # as ContractRule.values promises
-            if len(self._known) >= limits.CONTRACTS_REMEMBERED:
-                del self._known[next(iter(self._known))]
-            self._known[topic, type_name] = found
-        return found
+        return self._find(topic, type_name) if self._rules else self._default
+
+    def _combined(self, topic: str, type_name: str) -> Contract:
+        values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
+        return Contract(**values)  # type: ignore[arg-type] # as ContractRule.values promises
 
     def explain(self, topic: str, type_name: str) -> dict[str, tuple[object, str]]:
         """Each key's value and where it comes from.

@@ -53,10 +53,8 @@ class Guid:
         Raises:
             ValueError: A part is out of its range.
         """
-        if not 0 <= port < 1 << 16:
-            raise ValueError(f"a port has 16 bits, not {port}")
-        if not 0 <= incarnation < 1 << 16:
-            raise ValueError(f"an incarnation has 16 bits, not {incarnation}")
+        if not (0 <= port < 1 << 16 and 0 <= incarnation < 1 << 16):
+            raise ValueError(f"a port and an incarnation have 16 bits each, not {port} and {incarnation}")
         return cls(int(IPv4Address(address)) << 32 | port << 16 | incarnation)
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 from rmpa.core.counters import Backoff, TimerQueue, TokenBucket
 from rmpa.core.identity import serial_add
@@ -11,17 +11,15 @@ from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Hashable, Iterable
 
     from rmpa.core.counters import Counters
     from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoints import EndpointTable, PeerInstance
 
-_K = TypeVar("_K")
 
-
-class AddressLimit(Generic[_K]):
+class AddressLimit:
     """Allows each address so many packets in a while, and forgets the address that was silent for longest.
 
     Args:
@@ -34,9 +32,9 @@ class AddressLimit(Generic[_K]):
         self._most = count
         self._addresses = addresses
         self._interval = interval
-        self._counts: OrderedDict[_K, tuple[float, int]] = OrderedDict()
+        self._counts: OrderedDict[Hashable, tuple[float, int]] = OrderedDict()
 
-    def take(self, address: _K, now: float) -> bool:
+    def take(self, address: Hashable, now: float) -> bool:
         """Count a packet; return whether it is allowed."""
         since, count = self._counts.get(address, (now, 0))
         if now - since >= self._interval:
@@ -139,7 +137,7 @@ class BeaconSender:
         self._sequence = 0
         self._turn = 0
         self._answers = TokenBucket(limits.ANSWERS_PER_SECOND, limits.ANSWERS_PER_SECOND)
-        self._answered: AddressLimit[Address] = AddressLimit(1, limits.ANSWER_ADDRESSES_MAX, limits.ANSWER_INTERVAL)
+        self._answered = AddressLimit(1, limits.ANSWER_ADDRESSES_MAX, limits.ANSWER_INTERVAL)
         self._outputs: list[OutgoingBeacon] = []
 
     def take(self) -> list[OutgoingBeacon]:

@@ -104,10 +104,8 @@ class PacketFilter:
         # The limits, one for each kind of packet and each kind of sender: they are more than twelve fields together.
         self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
-        self._sources: AddressLimit[str] = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
-        self._old_key_sources: AddressLimit[str] = AddressLimit(
-            trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX
-        )
+        self._sources = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
+        self._old_key_sources = AddressLimit(trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX)
         self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
         self._strangers: dict[tuple[str, int], Stranger] = {}
         self._stranger_beacons = TokenBucket(limits.STRANGER_BEACONS_PER_SECOND, limits.STRANGER_BEACONS_PER_SECOND)
@@ -321,7 +319,7 @@ class Discovery:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
         loop = asyncio.get_running_loop()
-        loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
+        self._listen(self._udp, multicast=False)
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
         if self._settings.multicast.enabled:
@@ -409,7 +407,7 @@ class Discovery:
             )
             return None
         self._receivers.append(sock)
-        asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
+        self._listen(sock, multicast=multicast)
         return sock
 
     def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
@@ -420,10 +418,10 @@ class Discovery:
             self._filter.overrun = False
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock.fileno())
-            loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._resume, sock, multicast=multicast))
+            loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._listen, sock, multicast=multicast))
         self._flush()
 
-    def _resume(self, sock: socket.socket, *, multicast: bool) -> None:
+    def _listen(self, sock: socket.socket, *, multicast: bool) -> None:
         if self._started:
             asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
 

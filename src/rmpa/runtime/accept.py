@@ -81,8 +81,7 @@ def _refused(port: int, error: OSError) -> StartError:
 # The file descriptors of this process: which uses may take the last ones, and what is said when they run out.
 #
 # A process without a free descriptor can neither accept nor dial. Connections for data are refused early, so that
-# the
-# ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.
+# the ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.
 #
 # No count is kept. The kernel gives each new descriptor the lowest free number (POSIX, open(2)): a number near the
 # limit means that all lower ones are taken.
@@ -134,7 +133,7 @@ class Descriptors:
     @property
     def reserve(self) -> int:
         """The number of descriptors that are kept for the core and the links."""
-        return _reserve(self.limit)
+        return min(limits.DESCRIPTORS_RESERVED, self.limit // limits.DESCRIPTORS_RESERVED_PART)
 
     @property
     def open(self) -> int:
@@ -148,8 +147,7 @@ class Descriptors:
 
     def has_room(self, use: Use, fd: int) -> bool:
         """Whether ``use`` may keep the descriptor ``fd``, whose number was the lowest free one."""
-        soft = self.limit
-        return fd < soft - int(_reserve(soft) * use.value)
+        return fd < self.limit - int(self.reserve * use.value)
 
     @property
     def problem(self) -> str:
@@ -228,10 +226,6 @@ def _file_limits() -> tuple[int, int]:
         for limit in resource.getrlimit(resource.RLIMIT_NOFILE)
     )
     return soft, hard
-
-
-def _reserve(soft: int) -> int:
-    return min(limits.DESCRIPTORS_RESERVED, soft // limits.DESCRIPTORS_RESERVED_PART)
 
 
 def raise_file_limit() -> int:

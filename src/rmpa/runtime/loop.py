@@ -223,20 +223,14 @@ def _check(result: int) -> int:
 # The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
 #
 # asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in
-# its
-# context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector
-# itself
-# calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and writers),
-# and
-# returns all other events to asyncio as usual.
+# its context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector
+# itself calls the readers and writers of the data path as soon as ``epoll`` reports them (*direct* readers and
+# writers), and returns all other events to asyncio as usual.
 #
 # Data also interrupts control work: the loop polls the data path's sockets before each ordinary callback, and long
-# work
-# calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond. Therefore a direct reader,
-# and
-# the code that it calls, may run in the middle of any code that yields, whose data must be consistent at each
-# yield.
-# docs/design/isolation.md has the measurements.
+# work calls ``yield_to_data()`` between its slices. A poll costs a quarter of a microsecond. Therefore a direct
+# reader, and the code that it calls, may run in the middle of any code that yields, whose data must be consistent
+# at each yield. docs/design/isolation.md has the measurements.
 
 
 _log = logging.getLogger(__name__)

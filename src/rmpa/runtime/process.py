@@ -114,11 +114,9 @@ class LogWriter:
 # agent.
 #
 # The loop's thread gets SCHED_FIFO, and worker threads get it with one priority less. With default scheduling a
-# busy
-# process could keep a worker thread that holds the interpreter's lock from the CPU, and the loop would wait for
-# that
-# lock (measured with two busy processes: 4 ms late at p99; with a real-time priority 0.2 ms). SCHED_RESET_ON_FORK
-# leaves all other threads and every child process at default scheduling.
+# busy process could keep a worker thread that holds the interpreter's lock from the CPU, and the loop would wait
+# for that lock (measured with two busy processes: 4 ms late at p99; with a real-time priority 0.2 ms).
+# SCHED_RESET_ON_FORK leaves all other threads and every child process at default scheduling.
 
 
 REMEDY: Final = "systemd: LimitRTPRIO=50, LimitMEMLOCK=infinity; else /etc/security/limits.d (docs/realtime.md)"

@@ -74,12 +74,10 @@ def after_read(call: Callable[[], None]) -> None:
 # BIOs.
 #
 # asyncio's own TLS copies each message several times and takes 100 µs more a round trip, and ``ssl.SSLSocket`` has
-# no
-# ``sendmsg``. Here a small message is one record, one ``send`` and one ``recv``, as without TLS.
+# no ``sendmsg``. Here a small message is one record, one ``send`` and one ``recv``, as without TLS.
 #
 # Ciphertext belongs to one connection, so it never comes into an outbox: what the socket does not take waits here,
-# and
-# while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
+# and while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
 
 
 INCOMPLETE: Final = -1
