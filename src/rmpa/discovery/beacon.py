@@ -184,7 +184,8 @@ def sender_of(data: bytes, domain: int) -> tuple[Guid, bytes]:
     if magic != MAGIC:
         raise _malformed("does not begin with RMPA")
     if its_domain != domain:
-        raise BeaconRefused(OTHER_DOMAIN, f"is of domain {its_domain}")
+        remedy = f"we are of domain {domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+        raise BeaconRefused(OTHER_DOMAIN, f"is of domain {its_domain}, {remedy}")
     if version != VERSION:
         text = f"speaks version {version} of the protocol, we speak {VERSION}: update the older one"
         raise BeaconRefused(OTHER_VERSION, text)

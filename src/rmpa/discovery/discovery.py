@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import random
 import time
@@ -19,7 +18,6 @@ from rmpa.discovery.announcing import AddressLimit
 from rmpa.discovery.beacon import (
     MALFORMED,
     OTHER_DOMAIN,
-    OTHER_VERSION,
     RUN_AT,
     Beacon,
     BeaconKind,
@@ -134,14 +132,12 @@ class PacketFilter:
         host, _ = source
         # First, where there is a proof: packets with the forged source of a member must not count as its flood.
         if self._trust is not None:
-            proof = self._verify(self._trust, data, host, now)
-            if proof is None:
-                return None
-            if proof.verdict is Verdict.OLD_KEY:
-                with contextlib.suppress(RemoteProtocolError):
-                    return Beacon.parse(data, self._domain), proof.key
+            if len(data) > limits.BEACON_MAX_BYTES:
                 self._counters.add(MALFORMED)
                 return None
+            proof = self._trust.verify(data, RUN_AT, now)
+            if proof.verdict is not Verdict.ACCEPTED:
+                return self._parse_unproved(proof, data, host, now)
         if not self._sources.take(host, now):
             text = f"{host} sends too many packets to the discovery port; the rest is ignored"
             self._refusals.refuse(now, "beacon.flood", host, text)
@@ -168,55 +164,53 @@ class PacketFilter:
             if counter == OTHER_DOMAIN and multicast:
                 self._counters.add(counter)
                 return None
-            remedy = f"we are of domain {self._domain}: start both with the same --domain (ROS_DOMAIN_ID)"
-            texts = {
-                OTHER_DOMAIN: f"the peer at {host} {error}, {remedy}",
-                OTHER_VERSION: f"the peer at {host} {error}",
-            }
-            text = texts.get(counter, f"from {host}: {error}; is another program there?")
+            foreign = f"from {host}: {error}; is another program there?"
+            text = foreign if counter == MALFORMED else f"the peer at {host} {error}"
             self._refusals.refuse(now, counter, host, text)
             return None
         self._counters.add("beacon.in")
         return packet
 
-    def _verify(self, trust: PacketTrust, data: bytes, host: str, now: float) -> Verification | None:
-        """The proof of a packet that a member of the secured mesh sent just now, or a module that was one.
+    def _parse_unproved(
+        self, proof: Verification, data: bytes, host: str, now: float
+    ) -> tuple[Beacon, int | None] | None:
+        """What a packet contains that no member of the secured mesh sent just now, but perhaps a former member.
 
         Nothing is remembered of other packets, so that forged ones cannot push out what is remembered of real ones.
         """
-        if len(data) > limits.BEACON_MAX_BYTES:
-            self._counters.add(MALFORMED)
-            return None
-        found = trust.verify(data, RUN_AT, now)
-        if found.verdict is Verdict.ACCEPTED:
-            return found
-        # One address must not use up what there is for all.
-        if found.verdict is Verdict.OLD_KEY and self._old_key_sources.take(host, now) and self._old_keys.take(now):
-            self._counters.add("beacon.old_key")
-            return found
-        self.overrun = not self._unproved.take(now)
-        if found.verdict is Verdict.OLD_KEY:
+        verdict = proof.verdict
+        if verdict is Verdict.OLD_KEY:
+            # One address must not use up what there is for all.
+            if self._old_key_sources.take(host, now) and self._old_keys.take(now):
+                beacon = self._parsed(data)
+                self._counters.add("beacon.old_key" if beacon is not None else MALFORMED)
+                return None if beacon is None else (beacon, proof.key)
             self._counters.add("beacon.limited")
+        self.overrun = not self._unproved.take(now)
+        if verdict is Verdict.OLD_KEY:
             return None
-        problem = _problem(found)
+        problem = _problem(proof)
         identity = self._stranger(data, problem, now) if problem else None
         if identity is not None:
             at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
-            self._refusals.refuse(now, f"beacon.{found.verdict}", at, f"{identity.name} at {host} is {problem}")
+            self._refusals.refuse(now, f"beacon.{verdict}", at, f"{identity.name} at {host} is {problem}")
         else:
-            self._counters.add(f"beacon.{found.verdict}")
+            self._counters.add(f"beacon.{verdict}")
         return None
+
+    def _parsed(self, data: bytes) -> Beacon | None:
+        try:
+            return Beacon.parse(data, self._domain)
+        except RemoteProtocolError:
+            return None
 
     def _stranger(self, data: bytes, problem: str, now: float) -> Identity | None:
         """Take in a refused packet; return its sender if that is shown: few are, so a full table takes no more.
 
         One of the two modules has not joined a mesh.
         """
-        if not self._stranger_beacons.take(now):
-            return None
-        try:
-            beacon = Beacon.parse(data, self._domain)
-        except RemoteProtocolError:
+        beacon = self._parsed(data) if self._stranger_beacons.take(now) else None
+        if beacon is None:
             return None
         identity = beacon.identity
         key = identity.name, identity.guid.place
