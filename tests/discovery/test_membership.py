@@ -428,6 +428,22 @@ def test_a_restarted_peer_is_no_rival_of_its_dead_run_however_late_its_link_fall
     assert one.present() == ["peer2"]
 
 
+def test_the_end_of_a_link_is_no_sign_that_its_run_lives(one: Harness) -> None:
+    """A module lost its power and is back; a heartbeat of its new run was lost just when the old link fell."""
+    one.membership.link_up(who(2), one.now)
+    new = Speaker(who(2, run=2))
+    for _ in range(2):
+        one.run(5)
+        one.hear(new())
+    one.run(limits.HEARTBEAT_LATE + 1)
+    one.membership.events()
+    one.membership.link_down(who(2).guid, one.now)
+    assert one.membership.events() == []
+    one.run(3)
+    one.hear(new())
+    assert one.membership.events() == restarted(who(2), who(2, run=2))
+
+
 def test_somebody_else_with_our_guid(one: Harness) -> None:
     twin = Speaker(who(1, run=9, name="twin"))
     one.hear(twin())
