@@ -270,9 +270,7 @@ class RosCore(Core):
         self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
         self.registrations = self._api.registrations
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
-        self._notifier = Notifier(
-            nodes_at=self.registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
-        )
+        self._notifier = Notifier(self.registrations, self.suspect, self.counters)
         self.liveness = Liveness(nodes=self.registrations.nodes, on_dead=self._dead)
         self._rosout = Rosout(self, host, self._advertised) if rosout else None
         self._returned = ReturnedPublishers(self._repeat_publishers)
@@ -386,10 +384,6 @@ class RosCore(Core):
         for topic in yielding_to_data(topics):  # a thousand peers that return have 20,000
             self._api.registrations.notify_subscribers(topic)
         self._carry_out()
-
-    def _unreachable(self, api: str) -> None:
-        for node in self._api.registrations.nodes_at(api):
-            self.suspect(node)
 
     def _dead(self, node: str, api: str) -> None:
         if self._api.registrations.purge(node, api):

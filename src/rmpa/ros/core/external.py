@@ -406,7 +406,7 @@ class ExternalCore(Core):
         answer = await read_response(body)
         survey = read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
         self._seen = body
-        survey = await self._completed(survey)
+        await self._complete(survey)
         if self._ending:
             return True
         if self._problem and self._task is not None:
@@ -415,7 +415,7 @@ class ExternalCore(Core):
         self._take(survey, seen)
         return True
 
-    async def _completed(self, survey: Survey) -> Survey:
+    async def _complete(self, survey: Survey) -> None:
         """Look up the nodes and services that are new in a survey; later polls include them in their request."""
         nodes, services = survey.nodes(), survey.holders[RegistrationKind.SERVICE]
         new_nodes = [node for node in nodes if node not in survey.uris]
@@ -428,7 +428,6 @@ class ExternalCore(Core):
         if tuple(nodes) != self._nodes or tuple(services) != self._services:
             self._nodes, self._services = tuple(nodes), tuple(services)
             self._request, self._seen = b"", b""
-        return survey
 
     def _take(self, survey: Survey, seen: int) -> None:
         if other := self._mirror.taken(survey, self._own_node, seen):

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.ros.master.parameters import SlaveCall
+    from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)
 
@@ -378,21 +379,14 @@ class Notifier:
     """One queue for each slave API, emptied by a task that runs while there is something in it.
 
     Args:
-        nodes_at: Returns the nodes that are registered with a slave API; a failed notification is not sent again if
-            there are none.
-        on_unreachable: Called with a slave API that did not answer: its nodes may be dead.
+        registrations: The master's tables: a failed notification is not sent again once no node has its slave API.
+        suspect: Called with each node of a slave API that did not answer: it may be dead.
         counters: ``notify.sent``, ``notify.failed``, ``notify.dropped``.
     """
 
-    def __init__(
-        self,
-        *,
-        nodes_at: Callable[[str], list[str]],
-        on_unreachable: Callable[[str], None],
-        counters: Counters,
-    ) -> None:
-        self._nodes_at = nodes_at
-        self._on_unreachable = on_unreachable
+    def __init__(self, registrations: Registrations, suspect: Callable[[str], None], counters: Counters) -> None:
+        self._registrations = registrations
+        self._suspect = suspect
         self._counters = counters
         self._queues: dict[str, _Queue] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -435,7 +429,7 @@ class Notifier:
                     backoff.reset()
                 elif method == "shutdown":
                     continue
-                elif not self._nodes_at(api):
+                elif not self._registrations.nodes_at(api):
                     queue.clear()
                 else:
                     if key not in queue:
@@ -461,7 +455,8 @@ class Notifier:
             short = isinstance(error, OutOfDescriptors)
             _log.log(logging.DEBUG if short else logging.INFO, "! %s: %s", api, error)
             if isinstance(error, UnreachableError) and not short:
-                self._on_unreachable(api)
+                for node in self._registrations.nodes_at(api):
+                    self._suspect(node)
             # Else the node got it, or never will: sending again would not help.
             return not isinstance(error, UnreachableError)
         self._counters.add("notify.sent")
@@ -471,7 +466,7 @@ class Notifier:
         """Ask a node whose name another node has taken to end, unless its address is another node's by now."""
         found = await name_at(api, cast("list[str]", topics))
         if found is None:
-            found = next(iter(self._nodes_at(api)), None)
+            found = next(iter(self._registrations.nodes_at(api)), None)
         if found is not None and found != node:
             _log.info("= %s is not asked to end: %s is at %s now", node, found, api)
             self._counters.add("notify.stale")

@@ -78,41 +78,32 @@ def find_service_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
 def _search(
     make: Callable[[str, Found | None, SearchPath], _Type], kind: str, name: str, md5: str, path: SearchPath
 ) -> _Type:
-    """Find a type; if it is missing, search again without the cache, as it may have been built since."""
-    fresh = packages_below.cache_info().currsize == 0
-    try:
-        return _choose(make, kind, name, md5, path)
-    except UnknownTypeError:
-        if fresh:
-            raise
-    packages_below.cache_clear()
-    return _choose(make, kind, name, md5, path)
-
-
-def _choose(
-    make: Callable[[str, Found | None, SearchPath], _Type], kind: str, name: str, md5: str, path: SearchPath
-) -> _Type:
-    """The first valid version that has the sum.
+    """The first valid version that has the sum; if none is known, the cache is cleared: it may have been built since.
 
     Raises:
         UnknownTypeError: There is no version.
         RmpaError: There are versions, but none is valid and has the sum.
     """
-    problem: RmpaError | None = None
-    for found in _versions(kind, name, path):
-        try:
-            made = make(name, found, path)
-        except RmpaError as error:
-            problem = problem or error
-            continue
-        if not md5 or made.md5sum == md5:
-            return made
-        where = made.source or "it comes with rmpa"
-        text = f"has the md5 sum {made.md5sum} here ({where}), and {md5} there"
-        problem = problem or DefinitionError(name, text, "source the workspace that the node over there was built in")
-    if problem is not None:
-        raise problem
-    return _unknown(name, path, kind)
+    fresh = packages_below.cache_info().currsize == 0
+    while True:
+        problem: RmpaError | None = None
+        for found in _versions(kind, name, path):
+            try:
+                made = make(name, found, path)
+            except RmpaError as error:
+                problem = problem or error
+                continue
+            if not md5 or made.md5sum == md5:
+                return made
+            text = f"has the md5 sum {made.md5sum} here ({made.source or 'it comes with rmpa'}), and {md5} there"
+            remedy = "source the workspace that the node over there was built in"
+            problem = problem or DefinitionError(name, text, remedy)
+        if problem is not None and (fresh or not isinstance(problem, UnknownTypeError)):
+            raise problem
+        if fresh:
+            return _unknown(name, path, kind)
+        packages_below.cache_clear()
+        fresh = True
 
 
 def _versions(kind: str, name: str, path: SearchPath) -> Iterator[Found | None]:
