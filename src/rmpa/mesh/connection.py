@@ -354,10 +354,8 @@ class ConnectionProtocol:
         if self.up:
             # A refusal is of a dialler that does not trust this acceptor, or because this module is revoked.
             allowed = kind > FrameKind.REFUSE or (kind == FrameKind.REFUSE and self._secured)
-        elif self.dialled:
-            allowed = kind in (FrameKind.WELCOME, FrameKind.REFUSE)
         else:
-            allowed = kind == FrameKind.HELLO
+            allowed = kind in ((FrameKind.WELCOME, FrameKind.REFUSE) if self.dialled else (FrameKind.HELLO,))
         if not allowed:
             what = FrameKind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
             raise RemoteProtocolError(f"{what} frame while {self.state.name.lower()}")

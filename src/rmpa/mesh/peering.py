@@ -175,9 +175,7 @@ class Peering:
         """
         if identity.instance == self._ours.instance or identity.guid.place == self._ours.guid.place:
             return
-        peer = self._peers.get(identity.guid.place)
-        if peer is None:
-            peer = self._add(identity)
+        peer = self._peer(identity)
         restarted = peer.run.instance != identity.instance
         fresh = not peer.announced or restarted
         if restarted and identity.guid < peer.run.guid and peer.link is not None:
@@ -253,7 +251,7 @@ class Peering:
             dialled: Whether this side dialled.
             endpoint: The endpoint that this side dialled.
         """
-        peer = self._peers.get(identity.guid.place) or self._add(identity)
+        peer = self._peer(identity)
         counted = bool(peer.dialling) and not peer.verified
         if dialled:
             peer.dialling, peer.hello_at = (), None
@@ -410,10 +408,10 @@ class Peering:
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _add(self, identity: Identity) -> Peer:
-        peer = Peer(identity, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
-        self._peers[identity.guid.place] = peer
-        return peer
+    def _peer(self, identity: Identity) -> Peer:
+        """What is known of the peer at this identity's place; a new record if there is none."""
+        new = Peer(identity, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
+        return self._peers.setdefault(identity.guid.place, new)
 
     def _fallback(self, peer: Peer) -> float:
         """Seconds that this side waits for the peer's dial: none if it has the lower GUID, and dials first."""

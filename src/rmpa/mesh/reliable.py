@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Hashable
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.mesh import limits
 
@@ -65,8 +65,6 @@ class ReliableSender:
     def __init__(
         self, depth: int, max_bytes: int, window_messages: int, window_bytes: int, epoch: int, *, first: int = 1
     ) -> None:
-        if not (0 < depth < SERIAL_HALF and 0 < window_messages < SERIAL_HALF):
-            raise LocalProtocolError(f"a depth of {depth} and a window of {window_messages} messages cannot be")
         self._depth = depth
         self._max_bytes = max_bytes
         self._window_messages = window_messages
@@ -150,13 +148,7 @@ class ReliableSender:
         return message
 
     def put_back(self) -> None:
-        """Undo the ``take`` of the last message, which could not be sent: it is the next one again.
-
-        Raises:
-            LocalProtocolError: No message is in flight.
-        """
-        if not self._sent:
-            raise LocalProtocolError("no message is under way that could be taken back")
+        """Undo the ``take`` of the last message, which could not be sent: it is the next one again."""
         message = self._sent.pop()
         self._in_flight_bytes -= len(message.payload)
         self._unsent.appendleft(message)

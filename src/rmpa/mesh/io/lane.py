@@ -135,19 +135,17 @@ class LaneSender:
         """
         self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
 
-    def discard(self, route: int) -> None:
-        """Drop the waiting messages of a route, and its bounds; the route stays open."""
-        self.outbox.discard(route)
+    def discard(self, route: int) -> int:
+        """Drop the waiting messages of a route, and its bounds; the route stays open. Returns their number."""
+        count = self.outbox.discard(route)
         self._open.pop(route, None)
         if self._stream is not None:
             self._stream.pump()
+        return count
 
     def close_route(self, route: int) -> int:
         """Discard the waiting messages of a closed route, and its counts; return the number of messages."""
-        count = self.outbox.discard(route)
-        self._open.pop(route, None)
+        count = self.discard(route)
         self.outbox.dropped.pop(route, None)
         self.outbox.expired.pop(route, None)
-        if self._stream is not None:
-            self._stream.pump()
         return count

@@ -199,8 +199,7 @@ class Connection(ConnectionProtocol):
         self._pings[stamp] = answer
         self.flush()
         try:
-            async with asyncio.timeout(limits.PING_TIMEOUT):
-                return await answer
+            return await asyncio.wait_for(answer, limits.PING_TIMEOUT)
         except TimeoutError:
             return None
         finally:

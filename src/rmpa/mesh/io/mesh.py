@@ -334,19 +334,18 @@ class Mesh(LinkOwner):
         except SecuringError as error:
             self.counters.add(f"link.refused.{error.refuse.label}")
             self._peering.dial_refused(guid, error.refuse, self.clock.now(), endpoint, proved=error.by_us)
-            self._act()
         except OSError as error:
             self.counters.add("link.dial_failed")
             within = limits.REDIAL_TIMEOUT if briefly else limits.DIAL_TIMEOUT
             problem = os.strerror(error.errno) if error.errno else f"no answer within {within:g} s"
             text = f"{places}: {problem}" if endpoint is None else f"{endpoint[0]}:{endpoint[1]}: {error}"
             self._peering.dial_failed(guid, text, self.clock.now(), endpoint)
-            self._act()
         else:
             if self._peering.dial_opened(guid, self.clock.now()):
                 self._open(sock, endpoint, expected=guid, secured=secured)
             else:
                 sock.close()
+        self._act()
 
     def redial(self, link: PeerLink) -> None:
         """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""

@@ -14,6 +14,7 @@ import socket
 import ssl
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.counters import TokenBucket
@@ -196,6 +197,7 @@ def _secured(sock: socket.socket, handshake: TlsHandshake) -> SecuredSocket:
 # --- accepted connections ---------------------------------------------------------------------------------------
 
 
+@dataclass(eq=False)
 class Securing:
     """Secures the accepted connections.
 
@@ -209,24 +211,15 @@ class Securing:
         pause: Stops accepting for some seconds, because too many connections are no member's.
     """
 
-    def __init__(
-        self,
-        security: Membership,
-        *,
-        clock: SystemClock,
-        refusals: RefusalLog,
-        on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None],
-        on_refused: Callable[[str, Refuse], None],
-        on_join: OnJoin | None,
-        pause: Callable[[float], None],
-    ) -> None:
-        self._security = security
-        self._clock = clock
-        self._refusals = refusals
-        self._on_secured = on_secured
-        self._on_refused = on_refused
-        self._on_join = on_join
-        self._pause = pause
+    security: Membership
+    clock: SystemClock
+    refusals: RefusalLog
+    on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None]
+    on_refused: Callable[[str, Refuse], None]
+    on_join: OnJoin | None
+    pause: Callable[[float], None]
+
+    def __post_init__(self) -> None:
         self._bad = TokenBucket(limits.UNPROVEN_RATE, limits.UNPROVEN_BURST)
         self._unproven: dict[asyncio.Task[None], str] = {}
         """Connections without a finished handshake, each with its address; the oldest first."""
@@ -268,14 +261,14 @@ class Securing:
         del self._unproven[oldest]
         oldest.cancel()
         text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
-        self._refusals.refuse(self._clock.now(), "link.pending_full", host, text)
+        self.refusals.refuse(self.clock.now(), "link.pending_full", host, text)
         self._note_bad()
 
     def _note_bad(self) -> None:
         """Leave a flood of connections that are no member's to the kernel for a moment."""
-        if not self._bad.take(self._clock.now()):
-            self._refusals.count("link.paused")
-            self._pause(limits.UNPROVEN_PAUSE)
+        if not self._bad.take(self.clock.now()):
+            self.refusals.count("link.paused")
+            self.pause(limits.UNPROVEN_PAUSE)
 
     async def _secure(self, sock: socket.socket, address: SocketAddress) -> None:
         host = address[0]
@@ -285,18 +278,18 @@ class Securing:
         except SecuringError as error:
             self._note_bad()
             text = f"{'refused a link with' if error.by_us else 'no link with'} {host}: {error}"
-            self._refusals.refuse(self._clock.now(), f"link.refused.{error.refuse.label}", host, text)
-            self._on_refused(host, error.refuse)
+            self.refusals.refuse(self.clock.now(), f"link.refused.{error.refuse.label}", host, text)
+            self.on_refused(host, error.refuse)
             await _linger(sock)
         except (OSError, RmpaError) as error:  # TimeoutError too
             self._note_bad()
-            self._refusals.count("link.unfinished")
+            self.refusals.count("link.unfinished")
             _log.debug("! %s: no TLS handshake: %s", host, str(error) or "no answer in time")
         finally:
             if secured is None:
                 sock.close()
         if secured is not None:
-            self._on_secured(sock, address, secured)
+            self.on_secured(sock, address, secured)
 
     async def _proved(self, sock: socket.socket, host: str) -> SecuredSocket | None:
         """The connection of a member; ``None``: it is none, and nothing is to be told of it.
@@ -314,16 +307,16 @@ class Securing:
             if first[0] != _TLS_HANDSHAKE:
                 self._refuse_plain(sock, host)
                 return None
-            handshake = TlsHandshake(self._security.server_context, server_side=True)
+            handshake = TlsHandshake(self.security.server_context, server_side=True)
             await _shake(sock, handshake, first)
-        if self._on_join is not None and handshake.tls.selected_alpn_protocol() == ALPN_JOIN:
-            await self._on_join(sock, handshake, host)
+        if self.on_join is not None and handshake.tls.selected_alpn_protocol() == ALPN_JOIN:
+            await self.on_join(sock, handshake, host)
             await _linger(sock)
             return None
         secured = _secured(sock, handshake)
         try:
             # Before its hello, which a module without a certificate that holds could hold back.
-            self._security.judge_member(secured[1], None)
+            self.security.judge_member(secured[1], None)
         except TrustError as error:
             refuse = refusal(error.reason, str(error))
             with contextlib.suppress(OSError):
@@ -334,9 +327,9 @@ class Securing:
     def _refuse_plain(self, sock: socket.socket, host: str) -> None:
         """Count, and answer unless there are many."""
         self._note_bad()
-        now, refuse = self._clock.now(), refusal(TrustReason.PLAIN, "the dialler is not secured, but this mesh is")
+        now, refuse = self.clock.now(), refusal(TrustReason.PLAIN, "the dialler is not secured, but this mesh is")
         text = f"refused a connection from {host}: {refuse.text}"
-        self._refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
+        self.refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
         if self._answers.take(now):
             with contextlib.suppress(OSError):
                 sock.send(Frame(FrameKind.REFUSE, refuse.serialize()).serialize())
