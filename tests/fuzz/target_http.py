@@ -78,7 +78,7 @@ async def _serve(data: bytes) -> None:
         if not wire.closed:
             connection.eof_received()
         connection.connection_lost(None)
-    assert server.connections == 0
+    assert len(server._connections) == 0
 
 
 def _be_answered(data: bytes) -> None:

@@ -354,7 +354,7 @@ async def test_dead_nodes_are_found_without_a_hint(monkeypatch: pytest.MonkeyPat
         watch = liveness.Liveness(nodes=lambda: dict(nodes), on_dead=on_dead)
         watch.start()
         await until(lambda: found == ["/dead"])
-        alive_calls = alive.server.connections
+        alive_calls = len(alive.server._connections)
         await watch.close()
     assert alive_calls == 0, "a node that listens is not knocked at"
     assert nodes.keys() == {"/odd", "/alive"}

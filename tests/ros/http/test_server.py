@@ -275,7 +275,7 @@ async def test_slow_connections_block_no_other_client(
             further = await stack.enter_async_context(client(server))
             further.writer.write(post(CALL)[:40])
             await asyncio.sleep(0.01)
-        assert server.connections <= 8
+        assert len(server._connections) <= 8
         assert server.counters["http.refused.connections"] == 0
         assert server.counters["http.evicted.slow"] + server.counters["http.evicted"] >= 5
 
@@ -333,7 +333,7 @@ async def test_caller_may_disconnect_while_its_large_call_is_read(server: XmlRpc
         await c.writer.drain()
         while not any(connection._task for connection in server._connections):
             await asyncio.sleep(0)
-    while server.connections:
+    while len(server._connections):
         await asyncio.sleep(0.01)
     assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
 
@@ -405,7 +405,7 @@ async def test_closing_lets_an_answer_leave(echo: Echo) -> None:
         echo.go.set()
         assert parse_response((await busy.response())[1]) == "waited"
         await closing
-    assert server.connections == 0
+    assert len(server._connections) == 0
 
 
 async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
@@ -488,5 +488,5 @@ async def test_a_client_that_ends_within_a_plain_request_is_closed(server: XmlRp
         c.writer.write((REQUEST % len(body) + body)[:cut])
         c.writer.write_eof()
         await c.ended()
-    while server.connections:
+    while len(server._connections):
         await asyncio.sleep(0.005)

@@ -88,7 +88,7 @@ async def test_a_call_is_answered_and_the_connection_closed(node: SlaveNode) -> 
     assert await client.reply() == FORTY_TWO
     assert await client.ended()
     client.close()
-    assert (endpoint.calls, endpoint.failed, endpoint.connections) == (1, 0, 0)
+    assert (endpoint.calls, endpoint.failed, len(endpoint._clients)) == (1, 0, 0)
 
 
 @pytest.mark.trap(24)
@@ -156,9 +156,9 @@ async def test_callers_behind_probes_that_have_just_left_are_answered(
 
     endpoint = serve(node, add, describe, description=None)
     probes = [await RawClient.call(node, probe="1") for _ in range(3)]
-    await until(lambda: endpoint.connections == 3)
+    await until(lambda: len(endpoint._clients) == 3)
     caller = await RawClient.call(node)
-    await until(lambda: endpoint.connections == 4)
+    await until(lambda: len(endpoint._clients) == 4)
     await caller.send(TWO)
     for probe in probes:
         probe.close()
@@ -166,7 +166,7 @@ async def test_callers_behind_probes_that_have_just_left_are_answered(
     assert (await caller.header())["type"] == ADD.type
     assert await caller.reply() == FORTY_TWO
     caller.close()
-    await until(lambda: not endpoint.connections)
+    await until(lambda: not len(endpoint._clients))
     assert not caplog.records
 
 
@@ -181,9 +181,9 @@ async def test_callers_behind_one_that_fails_are_answered(node: SlaveNode, caplo
 
     endpoint = serve(node, add, describe, description=None, on_mismatch=broken)
     other = await RawClient.call(node, md5sum="0" * 32)
-    await until(lambda: endpoint.connections == 1)
+    await until(lambda: len(endpoint._clients) == 1)
     caller = await RawClient.call(node)
-    await until(lambda: endpoint.connections == 2)
+    await until(lambda: len(endpoint._clients) == 2)
     await caller.send(TWO)
     known.set_result(ADD)
     await caller.header()
@@ -227,7 +227,7 @@ async def test_probes_are_answered_and_may_leave_unread(node: SlaveNode, caplog:
     probe.close()
     for _ in range(20):
         (await RawClient.call(node, probe="1")).close()
-    await until(lambda: not endpoint.connections)
+    await until(lambda: not len(endpoint._clients))
     assert endpoint.calls == 0
     assert not caplog.records
 
@@ -327,7 +327,7 @@ async def test_a_client_that_leaves_in_the_middle_of_a_call_ends_it(node: SlaveN
         await started.wait()
         client.close()
         await cancelled.wait()
-    assert endpoint.connections == 0
+    assert len(endpoint._clients) == 0
 
 
 @pytest.mark.parametrize("size", [0, 65_536, 65_537, 300_000, 5_000_000])
@@ -396,7 +396,7 @@ async def test_a_silent_client_is_closed(node: SlaveNode, monkeypatch: pytest.Mo
     await half.send(TWO[:9])
     assert await silent.ended()
     assert await half.ended()
-    assert endpoint.connections == 1  # persistent ones may wait for their next call as long as they like
+    assert len(endpoint._clients) == 1  # persistent ones may wait for their next call as long as they like
     await idle.send(TWO)
     assert await idle.reply() == FORTY_TWO
     for client in (silent, half, idle):
@@ -416,7 +416,7 @@ async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode)
         await asyncio.sleep(0.05)
     assert calls < 100  # what the kernel's buffers took, some megabytes
     client.close()
-    await until(lambda: not endpoint.connections)
+    await until(lambda: not len(endpoint._clients))
 
 
 async def test_withdrawn_service_answers_waiting_clients(node: SlaveNode) -> None:

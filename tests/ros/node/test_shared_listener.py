@@ -70,7 +70,7 @@ async def test_each_of_many_nodes_is_reached_at_its_own_address(listener: Shared
     before = listening()
     nodes = [await node(listener, f"/n{number}") for number in range(100)]
     assert listening() == before
-    assert len(listener) == len({one.uri for one in nodes}) == 100
+    assert len(listener._nodes) == len({one.uri for one in nodes}) == 100
     for one in nodes:
         address = one.address_of("/t")
         assert address is not None
@@ -81,7 +81,7 @@ async def test_each_of_many_nodes_is_reached_at_its_own_address(listener: Shared
         assert await connect(address) == one.name
     for one in nodes:
         await one.close()
-    assert len(listener) == 0
+    assert len(listener._nodes) == 0
 
 
 async def test_the_address_of_a_closed_node_is_refused_and_not_given_again(listener: SharedListener) -> None:
@@ -140,7 +140,7 @@ async def test_a_burst_of_connections_is_accepted(listener: SharedListener) -> N
 async def test_a_call_under_way_when_its_node_closes_is_not_left_open(listener: SharedListener) -> None:
     made = await node(listener, "/n")
     link = await RawSubscriber.dial((made.uri.split("/")[2].split(":")[0], listener.ports[0]))
-    await until(lambda: made._http._arriving or made._http.connections)
+    await until(lambda: made._http._arriving or made._http._connections)
     await made.close()
     assert await link.ended()
     link.close()

@@ -24,9 +24,8 @@ from rmpa.core.errors import (
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeConnection, NodePing
 from rmpa.ros.http.rpc import call, call_api, connect, is_own_name, split_uri
-from rmpa.ros.node.service_client import exchange_headers
+from rmpa.ros.node.service_client import ask_publisher
 from rmpa.ros.wire.slave_api import read_bus_info
-from rmpa.ros.wire.tcpros import subscriber_header
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Use, is_shortage
@@ -77,22 +76,12 @@ async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
     for topic in dict.fromkeys(["/rosout", *topics][:_TOPICS_ASKED]):
         try:
             async with asyncio.timeout(limits.SLAVE_CALL_TIMEOUT):
-                name = await _publisher_of(api, topic)
+                fields = await ask_publisher(api, topic, _CALLER_ID, Use.CORE)
         except (RosFault, RemoteProtocolError, OSError) as error:
             _log.debug("= %s does not tell its name for %s: %s", api, topic, error)
             continue
-        if name is not None:
-            return name
-    return None
-
-
-async def _publisher_of(api: str, topic: str) -> str | None:
-    reply = await call_api(api, "requestTopic", _CALLER_ID, topic, [["TCPROS"]], use=Use.CORE)
-    match reply:
-        case (1, _, ["TCPROS", str(host), int(port)]):
-            with await connect(host, port, Use.CORE) as sock:
-                fields = await exchange_headers(sock, subscriber_header(topic, _CALLER_ID))
-            return None if fields is None else fields.get("callerid")
+        if fields is not None and "callerid" in fields:
+            return fields["callerid"]
     return None
 
 

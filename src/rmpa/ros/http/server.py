@@ -318,11 +318,6 @@ class XmlRpcServer:
         self.port = 0
         """The listening port; 0 before ``start``."""
 
-    @property
-    def connections(self) -> int:
-        """Open connections."""
-        return len(self._connections)
-
     async def start(self) -> None:
         """Listen.
 

@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import RmpaError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.node.service_client import ask_publisher
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import Header
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -71,14 +70,13 @@ async def fetch_type(
         if node == caller_id:
             continue
         try:
-            reply = await call_api(master_uri, "lookupNode", caller_id, node)
-            header = await _header(str(reply.value), where, f"{caller_id}_learns") if reply.code == 1 else {}
-            kind = await asyncio.to_thread(type_of_header, header) if header.get("type") == name else None
-        except RmpaError as error:
-            _log.debug("! %s from %s: %s", name, node, error)
-            continue
-        if kind is not None:
-            return FetchedType(kind, where, node)
+            async with asyncio.timeout(limits.FETCH_TYPE_TIMEOUT):
+                uri = str((await call_api(master_uri, "lookupNode", caller_id, node)).value)
+                header = await ask_publisher(uri, where, f"{caller_id}_learns") or {}
+            if header.get("type") == name:
+                return FetchedType(await asyncio.to_thread(type_of_header, header), where, node)
+        except (RmpaError, OSError) as error:
+            _log.debug("! %s from %s: %s", name, node, printable(str(error)))
     return None
 
 
@@ -126,41 +124,3 @@ async def _publishers(master_uri: str, caller_id: str, name: str) -> list[tuple[
 
 def _pairs(value: XmlRpcValue) -> list[list[XmlRpcValue]]:
     return [pair for pair in value if isinstance(pair, list) and len(pair) == 2] if isinstance(value, list) else []
-
-
-async def _header(uri: str, topic: str, caller_id: str) -> Header:
-    """A publisher's reply header; empty where it sends none.
-
-    Args:
-        uri: Its slave API.
-        topic: The topic.
-        caller_id: Must not be that of a subscriber of the topic: a rospy publisher keeps one connection for each
-            caller id.
-    """
-    told: asyncio.Future[Header] = asyncio.get_running_loop().create_future()
-
-    def tell(header: Header) -> None:
-        if not told.done():
-            told.set_result(header)
-
-    def fail(why: str) -> None:
-        _log.debug("! %s from %s: %s", topic, uri, printable(why))
-        tell({})
-
-    connection = PublisherConnection(
-        topic,
-        uri,
-        caller_id,
-        on_message=lambda _: None,
-        on_header=lambda fields: tell(dict(fields)),
-        on_refused=fail,
-        on_lost=fail,
-    )
-    connection.start()
-    try:
-        async with asyncio.timeout(limits.FETCH_TYPE_TIMEOUT):
-            return await told
-    except TimeoutError:
-        return {}
-    finally:
-        connection.close()

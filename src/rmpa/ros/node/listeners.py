@@ -284,10 +284,6 @@ class SharedListener:
         """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
         self._strays = XmlRpcServer(_former_node, counters=self._counters, name="addresses of former nodes")
 
-    def __len__(self) -> int:
-        """Nodes with an address."""
-        return len(self._addresses)
-
     async def start(self) -> None:
         """Listen, and test whether the addresses work on this machine.
 

@@ -20,8 +20,9 @@ from rmpa.core.errors import (
 )
 from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import connect, keep_alive
+from rmpa.ros.http.rpc import call_api, connect, keep_alive
 from rmpa.ros.node.service_server import BODIES, INLINE, send_large
+from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.tcpros import (
     ANY,
     LENGTH,
@@ -35,8 +36,9 @@ from rmpa.ros.wire.tcpros import (
     parse_reply_head,
     parse_service_uri,
     printable,
+    subscriber_header,
 )
-from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, is_shortage
+from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, Use, is_shortage
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
@@ -383,6 +385,27 @@ async def exchange_headers(sock: socket.socket, header: Header) -> Header | None
         if not chunk:
             return None
         data += chunk
+
+
+async def ask_publisher(uri: str, topic: str, caller_id: str, use: Use = Use.DATA) -> Header | None:
+    """Connect to a publisher, and return the header that it answers; ``None`` where it sends none.
+
+    Args:
+        uri: Its slave API.
+        topic: The topic.
+        caller_id: The asking node. It must not be that of a subscriber of the topic: a rospy publisher keeps one
+            connection for each caller id.
+        use: The purpose of the connection.
+
+    Raises:
+        RmpaError: The publisher does not answer as one does.
+        OSError: The connection fails.
+    """
+    match await call_api(uri, "requestTopic", caller_id, topic, [[TCPROS]], use=use):
+        case (1, _, [protocol, str(host), int(port)]) if protocol == TCPROS:
+            with await connect(host, port, use) as sock:
+                return await exchange_headers(sock, subscriber_header(topic, caller_id))
+    return None
 
 
 def _judge(fields: Header | None, node: str) -> str:

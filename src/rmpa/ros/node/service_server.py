@@ -140,7 +140,7 @@ class ServiceEndpoint:
         *,
         description: ServiceDescription | None = None,
         timeout: float = config_limits.SERVICE_TIMEOUT,
-        on_mismatch: Callable[[Mapping[str, str], str], None] | None = None,
+        on_mismatch: Callable[[Mapping[str, str], str], None] = lambda _, text: _log.warning("! %s", text),
     ) -> None:
         self.service = service
         self.caller_id = caller_id
@@ -153,15 +153,10 @@ class ServiceEndpoint:
         self.failed = 0
         """Requests answered with an error."""
         self._describe = describe
-        self._on_mismatch = on_mismatch
+        self.on_mismatch = on_mismatch
         self._clients: set[_ClientConnection] = set()
         self._describing: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
-
-    @property
-    def connections(self) -> int:
-        """Open connections."""
-        return len(self._clients)
 
     def attach(self, connection: AcceptedConnection) -> None:
         """Take a connection whose header names this service and has the required fields."""
@@ -189,13 +184,6 @@ class ServiceEndpoint:
         for client in tuple(self._clients):
             client.close()
 
-    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """Report a client whose md5 sum does not match; called by its connection."""
-        if self._on_mismatch is not None:
-            self._on_mismatch(fields, text)
-        else:
-            _log.warning("! %s", text)
-
     def remove(self, client: _ClientConnection) -> None:
         """Forget a connection that has ended; called by the connection."""
         self._clients.discard(client)
@@ -203,31 +191,27 @@ class ServiceEndpoint:
             self._empty.set_result(None)
 
     async def _fetch_description(self) -> None:
+        name = f"service [{self.service}]"
+        answer: ServiceDescription | str
         try:
-            answer = await self._call_describe()
+            async with asyncio.timeout(self.timeout):
+                answer = await self._describe() if self._describe is not None else f"{name} has no description yet"
+        except TimeoutError:
+            answer = f"{name}: its server did not describe it within {self.timeout:g} s"
+        except RmpaError as error:
+            answer = str(error)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! %s could not be described", self.service)
+            answer = f"{name}: [{self.caller_id}] failed to describe it; its log says why"
         finally:
             self._describing = None
         waiting = [client for client in self._clients if not client.opened]
         if isinstance(answer, str):
             self._each(waiting, lambda client: client.refuse(answer))
-        else:
-            self.description = answer
-            self._each(waiting, lambda client: client.open(answer))
-            self._each(waiting, _ClientConnection.resume)  # with requests that are buffered already
-
-    async def _call_describe(self) -> ServiceDescription | str:
-        if self._describe is None:
-            return f"service [{self.service}] has no description yet"
-        try:
-            async with asyncio.timeout(self.timeout):
-                return await self._describe()
-        except TimeoutError:
-            return f"service [{self.service}]: its server did not describe it within {self.timeout:g} s"
-        except RmpaError as error:
-            return str(error)
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! %s could not be described", self.service)
-            return f"service [{self.service}]: [{self.caller_id}] failed to describe it; its log says why"
+            return
+        self.description = answer
+        self._each(waiting, lambda client: client.open(answer))
+        self._each(waiting, _ClientConnection.resume)  # with requests that are buffered already
 
     def _each(self, clients: Iterable[_ClientConnection], answer: Callable[[_ClientConnection], None]) -> None:
         """Answers clients; one whose answer fails loses its connection, and the next ones get theirs."""
@@ -269,7 +253,7 @@ class _ClientConnection:
         connection, endpoint = self._connection, self._endpoint
         problem = check_client(connection.request, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
-            endpoint.mismatch(connection.request, problem)
+            endpoint.on_mismatch(connection.request, problem)
             self.refuse(problem)
             return
         self.opened = True

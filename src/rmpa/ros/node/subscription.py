@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
@@ -482,13 +483,18 @@ class Subscription:
     ) -> None:
         self.topic = topic
         self.type_name = type_name
-        self._caller_id = caller_id
+        self._connection = partial(
+            PublisherConnection,
+            topic,
+            caller_id=caller_id,
+            type_name=type_name,
+            md5sum=md5sum,
+            definition=definition,
+            nodelay=nodelay,
+        )
         self._on_message = on_message
         self._on_refused = on_refused
         self._own_uri = own_uri
-        self._md5sum = md5sum
-        self._definition = definition
-        self._nodelay = nodelay
         self._number = number
         self._connections: dict[str, PublisherConnection] = {}
 
@@ -525,17 +531,11 @@ class Subscription:
         self.update(())
 
     def _connect(self, uri: str) -> None:
-        connection = PublisherConnection(
-            self.topic,
-            uri,
-            self._caller_id,
+        connection: PublisherConnection = self._connection(
+            uri=uri,
             on_message=lambda framed: self._on_message(connection, framed),
             on_refused=lambda text: self._on_refused(connection, text),
             on_oversized=lambda size: self._oversized(connection, size),
-            type_name=self.type_name,
-            md5sum=self._md5sum,
-            definition=self._definition,
-            nodelay=self._nodelay,
             number=self._number(),
         )
         self._connections[uri] = connection

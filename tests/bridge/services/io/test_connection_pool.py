@@ -68,12 +68,12 @@ async def test_the_server_says_what_it_is_and_its_connection_stays_for_a_call(de
     assert (told.type, told.md5sum) == ("a/Add", MD5)
     desk.call(b"1")
     await desk.until(calls=1)
-    assert desk.pool.size == desk.endpoint.connections == 1
+    assert desk.pool.size == len(desk.endpoint._clients) == 1
     desk.calls[0].reply(True, b"one")
     await desk.until(answers=1)
     desk.call(b"2")
     await desk.until(calls=2)
-    assert desk.endpoint.connections == 1, "an idle connection is used again"
+    assert len(desk.endpoint._clients) == 1, "an idle connection is used again"
     desk.calls[1].fail("it sticks")
     await desk.until(answers=2)
     assert desk.answers == {b"1": (True, b"one"), b"2": (False, b"it sticks")}
