@@ -14,7 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import is_crossing_name
+from rmpa.bridge.messages import TopicOffer, is_crossing_name
 from rmpa.bridge.policy import Local, PolicyDecision, RelayPaths, may_have
 from rmpa.trust.permissions import PermissionDecision
 
@@ -24,6 +24,16 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Message, Origin
     from rmpa.config.peer_rules import Access
+
+
+def wire_of(offer: Any) -> Any:
+    """How the module of an offer, which is a topic's or a service's, names what is offered."""
+    return offer.source if isinstance(offer, TopicOffer) else offer.service
+
+
+def _is_same(entry: Remote[Any], offer: Any) -> bool:
+    """Whether an offer is what an entry was made of."""
+    return entry.node == offer.node and entry.origin == offer.origin and entry.type == getattr(offer, "type", None)
 
 
 class Effects:
@@ -124,10 +134,6 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     @abstractmethod
     def offer_for(self, key: KeyT, local: LocalT, wire: str) -> OfferT:
         """The offer of an entry under a name on the wire."""
-
-    @abstractmethod
-    def wire_of(self, offer: OfferT) -> KeyT:
-        """How peers name the entry of an offer."""
 
     @abstractmethod
     def _message(self, added: tuple[OfferT, ...], removed: tuple[KeyT, ...], full: bool, more: bool) -> Message:
@@ -255,7 +261,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         if local is None or not self.judge_for(told, key, local).allowed:
             return None
         name = self._out.context.names.wire_name(told.name, self.name_of(key))
-        return key if self.wire_of(self.offer_for(key, local, name)) == wire else None
+        return key if wire_of(self.offer_for(key, local, name)) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:
         """Whether an entry may cross to a peer, and the rule that decides; ``None``: the graph has no such entry."""
@@ -303,8 +309,8 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         for key in tuple(islice(told.due, limits.ADVERTISED_AT_ONCE)):
             del told.due[key]
             offer, before = self._offer(told, key), told.offers.get(key)
-            if before is not None and (offer is None or self.wire_of(offer) != self.wire_of(before[0])):
-                wire = self.wire_of(before[0])
+            if before is not None and (offer is None or wire_of(offer) != wire_of(before[0])):
+                wire = wire_of(before[0])
                 del told.offers[key], told.by_wire[wire]
                 told.due |= dict.fromkeys(told.behind.pop(wire, ()))
                 removed.append(wire)
@@ -314,10 +320,10 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
                 continue
             if before is not None and before == (offer, self.offered[key] if self.renews else before[1]):
                 continue
-            holder = told.by_wire.setdefault(self.wire_of(offer), key)
+            holder = told.by_wire.setdefault(wire_of(offer), key)
             if holder != key:
-                told.behind.setdefault(self.wire_of(offer), []).append(key)
-                name, other = self.name_of(self.wire_of(offer)), self.name_of(holder)
+                told.behind.setdefault(wire_of(offer), []).append(key)
+                name, other = self.name_of(wire_of(offer)), self.name_of(holder)
                 text = f"{key} would be {name} at {told.name}, as {other} is already: rename one"
                 self._out.warn("names.taken", f"{peer} {key}", text)
                 continue
@@ -351,6 +357,7 @@ class Remote(Generic[KeyT]):
         wire: Its key by wire names.
         name: Its topic or service here.
         node: Its node, in the peer's graph.
+        type: Its message type; ``None`` for a service.
         origin: Its module and node, if the peer only relays it.
         shown: Whether it is in the local graph.
         cause: The kind of the reason why it is not: ``CONFLICT``, ``DENIED`` or ``CROWDED``; empty: another one.
@@ -361,6 +368,7 @@ class Remote(Generic[KeyT]):
     wire: KeyT
     name: str
     node: str
+    type: str | None = None
     origin: Origin | None = None
     shown: bool = False
     cause: str = ""
@@ -502,16 +510,8 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         """Judge by new rules, an entry with each item; what they do not change goes on untouched."""
 
     @abstractmethod
-    def wire_of(self, offer: OfferT) -> KeyT:
-        """How the peer names what it offers."""
-
-    @abstractmethod
     def _entry(self, peer: int, offer: OfferT) -> EntryT:
         """The entry of an offer."""
-
-    @abstractmethod
-    def _is_same(self, entry: EntryT, offer: OfferT) -> bool:
-        """Whether an offer is what an entry was made of."""
 
     @abstractmethod
     def _came(self, entry: EntryT) -> None:
@@ -566,7 +566,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         known, added, removed = self._peers.get(peer), cast("Any", message.added), cast("Any", message.removed)
         if known is None:
             return iter(())
-        return known.changes(added, removed, self.wire_of, full=message.full, more=message.more)
+        return known.changes(added, removed, wire_of, full=message.full, more=message.more)
 
     def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
         """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""
@@ -589,9 +589,9 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         return True
 
     def _add(self, peer: int, known: Heard[KeyT, EntryT, OfferT], offer: OfferT, now: float) -> None:
-        wire = self.wire_of(offer)
+        wire = wire_of(offer)
         entry = known.entries.get(wire)
-        if entry is not None and self._is_same(entry, offer):
+        if entry is not None and _is_same(entry, offer):
             self._came_again(entry, now)
             return
         if entry is not None:
@@ -628,6 +628,11 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         if known.free(entry.node, most):
             return ""
         return f"{known.name} has more nodes than limits.nodes = {most} of this module"
+
+    def name_here(self, peer: int, wire: str, origin: Origin | None) -> str:
+        """The name here of a topic or service, by the rules for its own module, not by those for the relay."""
+        module = self._peers[peer].name if origin is None else origin.name
+        return self._out.context.names.local_name(module, wire)
 
     def _speaker(self, entry: EntryT) -> tuple[str, str]:
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""

@@ -72,8 +72,8 @@ class ServicesSection:
             The names, ``None`` for all, and how many services are left out.
         """
         first, shown, hidden = set(self._services.exports.seen), Counter[str](), Counter[str]()
-        for peer, remote in yielding_to_data(list(self._services.imports)):
-            known = self._services.shown(peer, remote.name)
+        for _, remote in yielding_to_data(list(self._services.imports)):
+            known = self._services.shown(remote)
             if remote.route or remote.problem or (known is not None and (known.stats.calls or known.mismatch)):
                 first.add(remote.name)
             (shown if remote.shown else hidden)[remote.name] += 1
@@ -137,7 +137,7 @@ class ServicesSection:
             yield self._import(peer, remote)
 
     def _import(self, peer: int, remote: RemoteService) -> ServiceInfo:
-        shown = self._services.shown(peer, remote.name) if remote.shown else None
+        shown = self._services.shown(remote)
         decision = self._bridge.context.services.judge(remote.name, remote.node)
         figures = _figures(shown.stats if shown else None)
         figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem

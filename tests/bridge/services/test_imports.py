@@ -44,7 +44,7 @@ def imports() -> ServiceImports:
 
 
 def opened(imports: ServiceImports) -> None:
-    assert imports.want(1, "/add", 0.0) == [Send(1, OpenService(ROUTE, "/add"))]
+    assert imports.want(imports.get(1, "/add"), 0.0) == [Send(1, OpenService(ROUTE, "/add"))]
     assert imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5)) == [
         OpenedService(1, "/add", ROUTE, REQUESTS, ServiceDescription("a/Add", MD5))
     ]
@@ -105,17 +105,18 @@ def test_policy_hides_here_too() -> None:
 
 def test_an_opened_service_is_known_until_its_server_is_another_one(imports: ServiceImports) -> None:
     opened(imports)
-    assert imports.want(1, "/add", 1.0) == [], "it is open"
-    closing = imports.release(1, "/add")
+    assert imports.want(imports.get(1, "/add"), 1.0) == [], "it is open"
+    closing = imports.release(imports.get(1, "/add"), "no node calls it")
     assert closing[0] == Send(1, CloseService(ROUTE))
     assert about(imports) == ServiceDescription("a/Add", MD5)
     assert imports.advertised(1, offer("/add")) == [ForgetAbout(1, "/add")]
     assert about(imports) is None
-    assert imports.want(1, "/add", 2.0) == [Send(1, OpenService(ROUTE + 2, "/add"))], "a route is never used again"
+    remote = imports.get(1, "/add")
+    assert imports.want(remote, 2.0) == [Send(1, OpenService(ROUTE + 2, "/add"))], "a route is never used again"
 
 
 def test_a_peer_that_does_not_answer_is_given_up(imports: ServiceImports) -> None:
-    imports.want(1, "/add", 3.0)
+    imports.want(imports.get(1, "/add"), 3.0)
     due = imports.next_timer()
     assert due == 3.0 + limits.ROUTE_OPEN_TIMEOUT
     assert imports.handle_timer(due - 0.1) == []
@@ -126,7 +127,7 @@ def test_a_peer_that_does_not_answer_is_given_up(imports: ServiceImports) -> Non
 
 
 def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
-    imports.want(1, "/add", 0.0)
+    imports.want(imports.get(1, "/add"), 0.0)
     assert imports.closed(1, ServiceClosed(ROUTE, "no")) == [EndedService(1, "/add", ROUTE, "no")]
     assert imports.closed(1, ServiceClosed(ROUTE, "no")) == []
     remote = imports.get(1, "/add")
@@ -137,10 +138,9 @@ def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
 def test_a_lost_link_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
     opened(imports)
     assert imports.link_down(1) == [EndedService(1, "/add", ROUTE, "the link to base was lost")]
-    assert imports.is_away(1)
     assert hidden(imports, 1) == ""
     with pytest.raises(LocalProtocolError):
-        imports.want(1, "/add", 1.0)
+        imports.want(imports.get(1, "/add"), 1.0)
     assert imports.link_up(1, "base", rank=10) == []
     assert imports.advertised(1, offer("/add", full=True)) == [ForgetAbout(1, "/add")]
     opened(imports)  # routes are counted by link
@@ -174,17 +174,17 @@ def test_opened_twice_breaks_the_protocol(imports: ServiceImports) -> None:
 
 def test_what_is_not_shown_is_not_opened(imports: ServiceImports) -> None:
     imports.local("/add", "/mine")
-    for service in ("/add", "/nothing"):
-        with pytest.raises(LocalProtocolError):
-            imports.want(1, service, 0.0)
-    assert imports.release(1, "/add") == imports.release(7, "/nothing") == []
+    remote = imports.get(1, "/add")
+    with pytest.raises(LocalProtocolError):
+        imports.want(remote, 0.0)
+    assert imports.release(remote, "no node calls it") == []
 
 
 def test_names_here_are_made_by_the_peers_rules() -> None:
     made = ServiceImports(rules(peers=(PeerRule("robot", prefix="/robot1"),)))
     made.link_up(1, "robot", rank=1)
     assert made.advertised(1, offer("/go", full=True)) == [Provide(1, "/robot1/go", "/n")]
-    assert made.want(1, "/robot1/go", 0.0) == [Send(1, OpenService(ROUTE, "/go"))]
+    assert made.want(made.get(1, "/robot1/go"), 0.0) == [Send(1, OpenService(ROUTE, "/go"))]
     made.closed(1, ServiceClosed(ROUTE, "no"))
     changed = apply_rules(made, rules(peers=(PeerRule("robot", prefix="/r"),)))
     assert [type(action) for action in changed] == [Withdraw, Provide]

@@ -131,10 +131,11 @@ class World:
 
     def want(self, service: str) -> None:
         if service in self.visible and self.linked:
-            self.act(self.imports.want(1, service, self.now))
+            self.act(self.imports.want(self.imports.get(1, service), self.now))
 
     def release(self, service: str) -> None:
-        self.act(self.imports.release(1, service))
+        if (remote := self.imports.get(1, service)) is not None:
+            self.act(self.imports.release(remote, "no node calls it"))
 
     def change_rules(self, _service: str) -> None:
         self.rules = STRICT if self.rules is OPEN else OPEN

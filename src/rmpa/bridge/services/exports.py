@@ -94,10 +94,6 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
         """As of ``OfferBook``."""
         return ServiceOffer(wire, local.node, local.origin)
 
-    def wire_of(self, offer: ServiceOffer) -> str:
-        """As of ``OfferBook``."""
-        return offer.service
-
     def _message(self, added: tuple[ServiceOffer, ...], removed: tuple[str, ...], full: bool, more: bool) -> Message:
         return AdvertiseServices(added, removed, full, more)
 

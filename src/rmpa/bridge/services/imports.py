@@ -91,11 +91,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """The peer's service that is in the local graph by this name."""
         return self._shown.get(service)
 
-    def is_away(self, peer: int) -> bool:
-        """Whether a peer has no link at this moment and may come back."""
-        found = self._peers.get(peer)
-        return found is not None and found.away
-
     # --- links ---------------------------------------------------------------------------------------------------
 
     def link_down(self, peer: int) -> None:
@@ -126,17 +121,9 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     # --- what peers offer ----------------------------------------------------------------------------------------
 
-    def wire_of(self, offer: ServiceOffer) -> str:
-        """As of ``ImportBook``."""
-        return offer.service
-
     def _entry(self, peer: int, offer: ServiceOffer) -> RemoteService:
-        module = offer.origin.name if offer.origin is not None else self._peers[peer].name
-        name = self._out.context.names.local_name(module, offer.service)
+        name = self.name_here(peer, offer.service, offer.origin)
         return RemoteService(peer=peer, wire=offer.service, name=name, node=offer.node, origin=offer.origin)
-
-    def _is_same(self, entry: RemoteService, offer: ServiceOffer) -> bool:
-        return (entry.node, entry.origin) == (offer.node, offer.origin)
 
     def _came_again(self, entry: RemoteService, now: float) -> None:  # noqa: ARG002 - as of ImportBook
         """The server was replaced, or the link is a new one: the type may have changed."""
@@ -153,7 +140,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def _went(self, entry: RemoteService, reason: str) -> None:
         # Messages may have crossed: the route asked for last may be open at the peer, for another server perhaps.
-        self._release(entry, reason)
+        self.release(entry, reason)
         self._unclaim(entry)
         if entry.shown:
             self._hide(entry, reason)
@@ -181,9 +168,10 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         """Judge by new rules, a service with each item; services that they do not affect stay shown and open."""
         for _, remote in list(self):
             known = self._peers.get(remote.peer)
-            module = remote.origin.name if remote.origin is not None else known.name if known is not None else ""
-            name = self._out.context.names.local_name(module, remote.wire)
-            if known is not None and known.entries.get(remote.wire) is remote and name != remote.name:
+            if known is None or known.entries.get(remote.wire) is not remote:
+                continue
+            name = self.name_here(remote.peer, remote.wire, remote.origin)
+            if name != remote.name:
                 self._went(remote, "a rule has another name for it now")
                 remote.name = name
                 self._claims.setdefault(name, {})[remote] = None
@@ -217,7 +205,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
                 module, relay = self._speaker(remote)
                 self._out.context.gate.admits(Access.SERVE, module, service, relay=relay)
         if shown is not None and left:
-            self._release(shown, left)
+            self.release(shown, left)
             self._hide(shown, left)
         if chosen is not None and not chosen.shown:
             self._peers[chosen.peer].show(chosen)
@@ -283,7 +271,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     # --- calling -------------------------------------------------------------------------------------------------
 
-    def want(self, peer: int, service: str, now: float) -> None:
+    def want(self, remote: RemoteService, now: float) -> None:
         """Open a service that a local node wants to call, or whose type it wants to know.
 
         Nothing happens if the route is asked for or open already.
@@ -291,9 +279,9 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         Raises:
             LocalProtocolError: The service is not shown, or its peer has no link: check before the call.
         """
-        known, remote = self._peers.get(peer), self.get(peer, service)
-        if known is None or remote is None or not remote.shown or known.away:
-            raise LocalProtocolError(f"{service} of peer {peer} cannot be opened")
+        known = self._peers.get(remote.peer)
+        if known is None or not remote.shown or known.away:
+            raise LocalProtocolError(f"{remote.name} of peer {remote.peer} cannot be opened")
         if not remote.route:
             known.last_route += 1
             # Odd ones are for replies; the even ones are for requests of the peer.
@@ -302,8 +290,8 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             known.routes[remote.route] = remote
             self._opening[remote] = None
             self._out.arm_timer()
-            timeout = self._out.context.services.timeout(service)
-            self._out.send(peer, OpenService(remote.route, remote.wire, timeout))
+            timeout = self._out.context.services.timeout(remote.name)
+            self._out.send(remote.peer, OpenService(remote.route, remote.wire, timeout))
 
     def opened(self, peer: int, message: ServiceOpened) -> None:
         """Handle a peer's answer that a service is open.
@@ -331,11 +319,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if known is not None and (remote := known.routes.get(message.route)) is not None:
             self._end(remote, message.reason)
 
-    def release(self, peer: int, service: str, reason: str = "no node calls it") -> None:
-        """Close the route of a service that is not needed now; the next call opens it again."""
-        if (remote := self.get(peer, service)) is not None:
-            self._release(remote, reason)
-
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds; ``None``: no route is asked for."""
         return min((remote.due for remote in self._opening), default=None)
@@ -343,9 +326,10 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
     def handle_timer(self, now: float) -> None:
         """Give up the routes that the peers have not opened in time."""
         for remote in [one for one in self._opening if one.due <= now]:
-            self._release(remote, f"the agent of {self.peer_name(remote.peer)} does not answer")
+            self.release(remote, f"the agent of {self.peer_name(remote.peer)} does not answer")
 
-    def _release(self, remote: RemoteService, reason: str) -> None:
+    def release(self, remote: RemoteService, reason: str) -> None:
+        """Close the route of a service that is not needed now; the next call opens it again."""
         if remote.route:
             if not self._peers[remote.peer].away:
                 self._out.send(remote.peer, CloseService(remote.route))

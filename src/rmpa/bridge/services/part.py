@@ -51,9 +51,7 @@ class ShownService:
     """A peer's service in the local graph.
 
     Args:
-        peer: The peer's number.
-        service: The service's name here.
-        node: Its node, in the peer's graph.
+        remote: The service.
         peer_name: The peer's name.
         stats: Counts and latencies of its calls.
         proxy: The proxy of its node; ``None`` until that exists.
@@ -64,9 +62,7 @@ class ShownService:
         mismatch: The error that the last client with another MD5 sum got; empty if there was none.
     """
 
-    peer: int
-    service: str
-    node: str
+    remote: RemoteService
     peer_name: str
     stats: CallStats = field(default_factory=CallStats)
     proxy: SlaveNode | None = None
@@ -79,7 +75,7 @@ class ShownService:
     @property
     def text(self) -> str:
         """The service and its peer, for texts."""
-        return f"service [{self.service}] of {self.peer_name}"
+        return f"service [{self.remote.name}] of {self.peer_name}"
 
 
 class Services(GraphPart):
@@ -102,8 +98,7 @@ class Services(GraphPart):
         self.make_room: Callable[[str], None] = lambda _: None
         """Called with a service whose name a node has already: a gateway's node of another site leaves it."""
         self._budgets: dict[int, Budgets] = {}
-        self._shown: dict[tuple[int, str], ShownService] = {}
-        self._callers: dict[tuple[int, int], ShownService] = {}
+        self._shown: dict[RemoteService, ShownService] = {}
         self.serving = Serving(shared, self.exports, self._budgets)
         """The servers of this module that peers call."""
         self.direct_exports = ServiceGrants(shared, self.exports, self.warn)
@@ -114,23 +109,22 @@ class Services(GraphPart):
         """The peers' services in the local graph."""
         return iter(self._shown.values())
 
-    def shown(self, peer: int, service: str) -> ShownService | None:
-        """A peer's service in the local graph, by its name here; ``None`` if it is not shown."""
-        return self._shown.get((peer, service))
+    def shown(self, remote: RemoteService) -> ShownService | None:
+        """A peer's service in the local graph; ``None`` if it is not shown."""
+        return self._shown.get(remote)
 
     def reload(self) -> None:
         """As of ``GraphPart``."""
         super().reload()
         self.direct_exports.judge_again()
-        for shown in yielding_to_data(list(self._shown.values()), every=16):
-            if (remote := self.imports.get(shown.peer, shown.service)) is not None:
-                self.direct_imports.shown(remote)
-            timeout, endpoint = self.context.services.timeout(shown.service), shown.endpoint
+        for shown in yielding_to_data(list(self), every=16):
+            self.direct_imports.shown(shown.remote)
+            timeout, endpoint = self.context.services.timeout(shown.remote.name), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
                 if shown.caller is not None and not shown.caller.active:
                     # The next call opens it again, with the new timeout in its request.
-                    self.imports.release(shown.peer, shown.service, "its timeout has changed")
+                    self.imports.release(shown.remote, "its timeout has changed")
 
     # --- the bridge's part -------------------------------------------------------------------------------------
 
@@ -149,9 +143,7 @@ class Services(GraphPart):
         """As of ``GraphPart``; open the services of the peer that calls wait for."""
         self._budgets[session.peer] = Budgets()
         super().link_up(session)
-        for shown in [
-            one for one in self._shown.values() if one.peer == session.peer and (one.waiting or one.asking)
-        ]:
+        for shown in [one for one in self if one.remote.peer == session.peer and (one.waiting or one.asking)]:
             self._want(shown)
 
     def link_down(self, session: PeerSession) -> None:
@@ -207,23 +199,22 @@ class Services(GraphPart):
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
-        peer = session.peer
-        for (owner, _), shown in list(self._callers.items()):
-            if owner == peer and shown.caller is not None:
+        for shown in list(self):
+            if shown.remote.peer == session.peer and shown.caller is not None:
                 shown.caller.lane_lost()
-        self.serving.lane_lost(peer)
+        self.serving.lane_lost(session.peer)
 
     def reconcile(self) -> None:
         """Register missing services again, and close routes and connections that are not used."""
         self.look_again()
         services = self._core.state().services
         before = self.now() - limits.SERVICE_IDLE
-        for shown in yielding_to_data(list(self._shown.values()), every=16):
+        for shown in yielding_to_data(list(self), every=16):
             proxy, caller = shown.proxy, shown.caller
-            if proxy is not None and shown.service not in services:
+            if proxy is not None and shown.remote.name not in services:
                 self._register(shown, proxy)
             if caller is not None and not caller.active and caller.used_at < before:
-                self.imports.release(shown.peer, shown.service)
+                self.imports.release(shown.remote, "no node calls it")
         self.serving.close_idle(before)
 
     # --- the local graph ---------------------------------------------------------------------------------------
@@ -263,21 +254,21 @@ class Services(GraphPart):
         name = self._shared.sessions.proxy_name(session, node, remote.origin)
         source, place = Source(f"service {service}", node), service_place(service, name)
         self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
-        shown = self._shown[peer, service] = ShownService(peer, service, node, self.imports.peer_name(peer))
+        shown = self._shown[remote] = ShownService(remote, self.imports.peer_name(peer))
         session.proxies.hold(node, f"service {service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(remote)
 
     def _expose(self, shown: ShownService, proxy: SlaveNode) -> None:
         """Register a service at its proxy, which exists now; do nothing if the service was withdrawn meanwhile."""
-        if self._shown.get((shown.peer, shown.service)) is not shown or shown.endpoint is not None:
+        if self._shown.get(shown.remote) is not shown or shown.endpoint is not None:
             return
         shown.proxy = proxy
         shown.endpoint = ServiceEndpoint(
-            shown.service,
+            shown.remote.name,
             proxy.name,
             lambda call: self._call(shown, call),
             lambda: self._describe(shown),
-            timeout=self.context.services.timeout(shown.service),
+            timeout=self.context.services.timeout(shown.remote.name),
             on_mismatch=lambda fields, text: self._mismatched(shown, fields, text),
         )
         proxy.add_service(shown.endpoint)
@@ -285,40 +276,42 @@ class Services(GraphPart):
 
     def _proxy_uri(self, peer: int, service: str) -> str:
         """The address of the proxy of a peer's service; empty if there is none."""
-        shown = self._shown.get((peer, service))
+        remote = self.imports.get(peer, service)
+        shown = self._shown.get(remote) if remote is not None else None
         return shown.proxy.service_uri if shown is not None and shown.proxy is not None else ""
 
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
-        if self._is_taken(shown, proxy):
-            self.make_room(shown.service)
-        if self._is_taken(shown, proxy):
+        service = shown.remote.name
+        if self._is_taken(service, proxy):
+            self.make_room(service)
+        if self._is_taken(service, proxy):
             return  # another node was first: the scan hides this service, or did so already
-        code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
+        code, status, _ = self._core.call("registerService", proxy.name, service, proxy.service_uri, proxy.uri)
         if code != 1:
-            _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
+            _log.error("! the local core does not take %s of %s: %s", service, proxy.name, status)
 
-    def _is_taken(self, shown: ShownService, proxy: SlaveNode) -> bool:
-        return any(node != proxy.name for node in self._core.state().services.get(shown.service, {}))
+    def _is_taken(self, service: str, proxy: SlaveNode) -> bool:
+        return any(node != proxy.name for node in self._core.state().services.get(service, {}))
 
     def withdraw(self, remote: RemoteService, reason: str) -> None:
         """Remove a peer's service from the local graph; its waiting calls fail with the reason."""
         self._shared.relay.gone(remote.peer, Source(f"service {remote.name}", remote.node))
-        shown = self._shown.pop((remote.peer, remote.name), None)
+        shown = self._shown.pop(remote, None)
         if shown is None:
             return
         self.direct_imports.hidden(remote, end=remote.cause == DENIED)
         text = f"{shown.text}: {reason}"
         self._fail_waiting(shown, text)
         if (proxy := shown.proxy) is not None:
-            self._core.call("unregisterService", proxy.name, shown.service, proxy.service_uri)
-            proxy.remove_service(shown.service, text)
+            self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
+            proxy.remove_service(remote.name, text)
         session = self._shared.sessions.get(remote.peer)
         if session is not None:
             session.proxies.release(remote.node, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
         """What is known of a shown service may no longer be true."""
-        shown = self._shown.get((remote.peer, remote.name))
+        shown = self._shown.get(remote)
         if shown is not None:
             if shown.endpoint is not None:
                 shown.endpoint.description = None
@@ -334,13 +327,12 @@ class Services(GraphPart):
         self._want(shown)
 
     async def _describe(self, shown: ShownService) -> ServiceDescription | str:
-        remote = self.imports.get(shown.peer, shown.service)
-        if remote is not None and remote.about is not None:
-            return remote.about
+        if shown.remote.about is not None:
+            return shown.remote.about
         if shown.caller is not None:  # its offer has come again since it was opened: the server may be another one
             if shown.caller.active:
                 return shown.caller.description
-            self.imports.release(shown.peer, shown.service, "its type is asked for again")
+            self.imports.release(shown.remote, "its type is asked for again")
         answer: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
         shown.asking.append(answer)
         self._want(shown)
@@ -348,25 +340,24 @@ class Services(GraphPart):
 
     def _want(self, shown: ShownService) -> None:
         """Open a service, unless its peer has no link now: then the next ``link_up``, or ``gone``, ends the wait."""
-        remote, session = self.imports.get(shown.peer, shown.service), self._shared.sessions.get(shown.peer)
-        if remote is None or not remote.shown:
+        remote, session = shown.remote, self._shared.sessions.get(shown.remote.peer)
+        if not remote.shown:
             self._fail_waiting(shown, f"{shown.text} has just gone")
         elif session is not None and session.state is PeerState.AWAY:
-            text = f"service [{shown.service}]: the agent of {shown.peer_name} has crashed, only direct calls work"
+            text = f"service [{remote.name}]: the agent of {shown.peer_name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
-        elif remote.state == "idle" and not self.imports.is_away(shown.peer):
-            self.imports.want(shown.peer, shown.service, self.now())
+        elif session is not None and session.linked:
+            self.imports.want(remote, self.now())
 
     def opened(self, remote: RemoteService) -> None:
         """A service can be called: requests go out on ``remote.requests``, replies come in on ``remote.route``."""
-        shown = self._shown.get((remote.peer, remote.name))
+        shown = self._shown.get(remote)
         session = self._shared.sessions.get(remote.peer)
         if shown is None or session is None or not session.linked or remote.about is None:
             return
         budgets = self._budgets[remote.peer]
         caller = Caller(session.link, remote.requests, shown.text, budgets, shown.stats, remote.about)
         shown.caller = session.link.routes[remote.route] = caller
-        self._callers[remote.peer, remote.route] = shown
         asking, shown.asking = shown.asking, []
         for future in asking:
             if not future.done():
@@ -380,13 +371,12 @@ class Services(GraphPart):
         session = self._shared.sessions.get(remote.peer)
         if session is not None:
             session.link.routes.pop(route, None)
-        shown = self._callers.pop((remote.peer, route), None)
-        if shown is not None and shown.caller is not None:
-            caller, shown.caller = shown.caller, None
-            caller.close(reason)
-        shown = self._shown.get((remote.peer, remote.name))
-        if shown is not None and shown.caller is None:
-            self._fail_waiting(shown, f"{shown.text}: {reason}")
+        if (shown := self._shown.get(remote)) is None:
+            return
+        if shown.caller is not None:
+            shown.caller.close(reason)
+            shown.caller = None
+        self._fail_waiting(shown, f"{shown.text}: {reason}")
 
     def _fail_waiting(self, shown: ShownService, text: str) -> None:
         asking, shown.asking = shown.asking, []
@@ -405,10 +395,10 @@ class Services(GraphPart):
         shown.mismatch = text
         shown.stats.calls += 1
         shown.stats.fail(text)
-        self.warn(_MISMATCH, f"{shown.service}{caller_id}", text)
-        session, remote = self._shared.sessions.get(shown.peer), self.imports.get(shown.peer, shown.service)
-        if session is not None and session.linked and remote is not None:
-            args: dict[str, Any] = {"service": remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
+        self.warn(_MISMATCH, f"{shown.remote.name}{caller_id}", text)
+        session = self._shared.sessions.get(shown.remote.peer)
+        if session is not None and session.linked:
+            args: dict[str, Any] = {"service": shown.remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
             self._shared.rpc.notify(session, _MISMATCH, args)
 
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:

@@ -162,10 +162,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         """As of ``OfferBook``."""
         return TopicOffer(wire, key.node, local.type, local.origin)
 
-    def wire_of(self, offer: TopicOffer) -> Source:
-        """As of ``OfferBook``."""
-        return offer.source
-
     def _message(self, added: tuple[TopicOffer, ...], removed: tuple[Source, ...], full: bool, more: bool) -> Message:
         return Advertise(added, removed, full, more)
 

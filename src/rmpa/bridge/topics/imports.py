@@ -45,15 +45,12 @@ from rmpa.mesh import limits as mesh_limits
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from rmpa.bridge.messages import Origin
-
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class RemoteTopic(Remote[Source]):
     """One source of one peer.
 
     Args:
-        type: Its message type.
         hidden: Why it is not in the local graph, or empty.
         wanted: Whether a local node listens.
         route: The route's id while it is requested or open, else 0.
@@ -217,25 +214,13 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
 
     # --- what peers offer ----------------------------------------------------------------------------------------
 
-    def wire_of(self, offer: TopicOffer) -> Source:
-        """As of ``ImportBook``."""
-        return offer.source
-
     def _entry(self, peer: int, offer: TopicOffer) -> RemoteTopic:
         # Many sources share the names of nodes and types, and each is kept once.
         source, kind = Source(offer.topic, sys.intern(offer.node)), sys.intern(offer.type)
-        name = self._local_name(peer, source, offer.origin)
+        name = self.name_here(peer, source.topic, offer.origin)
         entry = RemoteTopic(peer=peer, wire=source, name=name, node=source.node, origin=offer.origin, type=kind)
         self._topics.setdefault(peer, {}).setdefault(name, {})[source] = None
         return entry
-
-    def _local_name(self, peer: int, source: Source, origin: Origin | None) -> str:
-        """The topic here, by the rules for the source's own module, not by those for the relay."""
-        module = self._peers[peer].name if origin is None else origin.name
-        return self._out.context.names.local_name(module, source.topic)
-
-    def _is_same(self, entry: RemoteTopic, offer: TopicOffer) -> bool:
-        return (entry.type, entry.origin) == (offer.type, offer.origin)
 
     def _came(self, entry: RemoteTopic) -> None:
         self._judge(entry)
@@ -285,7 +270,7 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
                 yield
 
     def _rejudge(self, entry: RemoteTopic, now: float) -> None:
-        name = self._local_name(entry.peer, entry.wire, entry.origin)
+        name = self.name_here(entry.peer, entry.wire.topic, entry.origin)
         if name != entry.name:
             if entry.shown:
                 self._hide(entry)

@@ -484,7 +484,7 @@ class ServiceEvidence:
         remote = self._services.imports.get(session.peer, service)
         if remote is None:
             return ServiceAtClient(wire=wire)
-        shown = self._services.shown(session.peer, service)
+        shown = self._services.shown(remote)
         hidden, cause = self._services.imports.why_hidden(remote)
         if shown is None or shown.proxy is None:
             return ServiceAtClient(wire=wire, offered=True, node=remote.node, hidden=hidden, denied=cause == DENIED)
