@@ -115,7 +115,6 @@ class Rosout:
         self._node: SlaveNode | None = None
         self._loggers: LoggerServices | None = None
         self._keeper: asyncio.Task[None] | None = None
-        self._asked_to_end = False
         self._changed = asyncio.Event()
 
     @property
@@ -145,7 +144,7 @@ class Rosout:
             self._changed.set()
 
     async def _begin(self) -> None:
-        core, self._asked_to_end = self._core, False
+        core = self._core
         node = SlaveNode(
             NODE,
             self._host,
@@ -192,8 +191,7 @@ class Rosout:
 
     def _killed(self, reason: str) -> None:
         _log.info("= %s was asked to end (%s)", NODE, reason)
-        self._asked_to_end = True
-        self._changed.set()
+        self._core.call("unregisterPublisher", NODE, AGGREGATED, self.uri)  # which is noticed as any such change
 
     async def _keep(self) -> None:
         while True:
@@ -201,8 +199,7 @@ class Rosout:
             self._changed.clear()
             # Both registrations must be in the graph.
             core, ours = self._core, self.uri
-            there = core.publishers(AGGREGATED).get(NODE) == core.subscribers(TOPIC).get(NODE) == ours
-            if self._asked_to_end or not there:
+            if not core.publishers(AGGREGATED).get(NODE) == core.subscribers(TOPIC).get(NODE) == ours:
                 await self._end()
                 await asyncio.sleep(limits.ROSOUT_RESPAWN)
                 await self._restart()
