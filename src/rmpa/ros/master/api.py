@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 SUCCESS: Final = 1
-FAILURE: Final = 0
 ERROR: Final = -1
 _DOES: Final = {
     RegistrationKind.PUBLISHER: "publishes",
@@ -196,7 +195,7 @@ class MasterApi:
         try:
             found = self.parameters.search(caller_id, key)
         except ValueError as error:
-            return RosReply(FAILURE, str(error), 0)
+            return RosReply(0, str(error), 0)
         if found is None:
             return RosReply(ERROR, f"there is no {key} in {caller_id} or above", "")
         return RosReply(SUCCESS, f"found {found}", found)

@@ -14,6 +14,10 @@ from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind
 
 ANY_TYPE: Final = "*"
 _NONE: Final[dict[str, str]] = {}
+_OTHER_SIDE: Final = {
+    RegistrationKind.PUBLISHER: RegistrationKind.SUBSCRIBER,
+    RegistrationKind.SUBSCRIBER: RegistrationKind.PUBLISHER,
+}
 Name = Annotated[str, msgspec.Meta(pattern="^/", max_length=limits.CORE_STATE_NAME_MAX)]
 """A name in a core's state file."""
 
@@ -77,12 +81,8 @@ class Registrations:
 
     def counterparts(self, kind: RegistrationKind, key: str) -> list[str] | int:
         """The value in the reply to a registration: the slave APIs at the other side of a topic; 1 for a service."""
-        match kind:
-            case RegistrationKind.PUBLISHER:
-                return list(self.at(RegistrationKind.SUBSCRIBER, key).values())
-            case RegistrationKind.SUBSCRIBER:
-                return list(self.at(RegistrationKind.PUBLISHER, key).values())
-        return 1
+        other = _OTHER_SIDE.get(kind)
+        return 1 if other is None else list(self.at(other, key).values())
 
     def service_uri(self, service: str) -> str | None:
         """The ``rosrpc://`` URI of a service's provider."""
