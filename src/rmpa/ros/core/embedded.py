@@ -165,7 +165,7 @@ class Rosout:
             TOPIC,
             NODE,
             on_message=pass_on,
-            on_refused=_refused,
+            on_refused=lambda publisher, text: _log.info("! %s is not aggregated: %s", publisher.uri, text),
             own_uri=node.uri,
             type_name=LOG.type,
             md5sum=LOG.md5sum,
@@ -224,10 +224,6 @@ class Rosout:
                 await asyncio.sleep(limits.ROSOUT_LOOK)
         self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)
-
-
-def _refused(publisher: PublisherConnection, text: str) -> None:
-    _log.info("! %s of %s is not aggregated: %s", TOPIC, publisher.uri, text)
 
 
 class RosCore(Core):

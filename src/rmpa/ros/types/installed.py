@@ -332,13 +332,9 @@ class SearchPath:
 
     def __str__(self) -> str:
         """The searched places, for the text of errors."""
-        variables = (
-            ("ROS_PACKAGE_PATH", self.packages),
-            ("CMAKE_PREFIX_PATH", self.prefixes),
-            ("PYTHONPATH", self.python),
-        )
+        variables = {"ROS_PACKAGE_PATH": self.packages, "CMAKE_PREFIX_PATH": self.prefixes, "PYTHONPATH": self.python}
         cut = [root for root in self.packages if not packages_below(root)[1]]
-        shown = [f"{name} ({_shown(entries)})" for name, entries in variables]
+        shown = [f"{name} ({_shown(entries)})" for name, entries in variables.items()]
         note = f"; of {_shown(cut)} only the first {limits.PACKAGE_FOLDERS_MAX} folders" if cut else ""
         return ", ".join([*shown, *self.system]) + note
 
