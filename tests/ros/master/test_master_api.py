@@ -34,7 +34,7 @@ class Master:
 
     def __call__(self, method: str, *params: XmlRpcValue) -> RosReply:
         reply = self.api.call(method, params)
-        self.calls, self.changes = self.api.take()
+        self.calls, self.changes = self.api.registrations.take()
         serialize_response(list(reply))  # whatever is answered can be said
         return reply
 
@@ -187,7 +187,7 @@ def test_dead_node_is_purged_and_subscribers_notified(master: Master) -> None:
     registrations = master.api.registrations
     assert not registrations.purge("/dead", C), "it came back at another URI"
     assert registrations.purge("/dead", A)
-    calls, changes = master.api.take()
+    calls, changes = master.api.registrations.take()
     assert calls == [(B, "publisherUpdate", "/t", [])]
     assert [(change.kind, change.added) for change in changes] == [
         (RegistrationKind.PUBLISHER, False),

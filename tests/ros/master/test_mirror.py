@@ -72,7 +72,7 @@ class Pair:
 
     def changes(self) -> set[tuple[str, str, str]]:
         """What has changed: ``+`` or ``-``, the topic or service, the node."""
-        return {("+" if c.added else "-", c.name, c.node) for c in self.mirror.take_changes()}
+        return {("+" if c.added else "-", c.name, c.node) for c in self.mirror.registrations.take()[1]}
 
     def _many(self, calls: list[XmlRpcValue]) -> XmlRpcValue:
         return self.master.answer("system.multicall", [calls])
@@ -88,7 +88,10 @@ def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
     assert pair.look() == []
-    assert GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.mirror.take_changes()
+    assert (
+        GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING)
+        in pair.mirror.registrations.take()[1]
+    )
     state = pair.mirror.registrations.state()
     assert state == pair.master.registrations.state()
     assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}
@@ -130,10 +133,10 @@ def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     assert pair.mirror.registrations.types()["/t"] == STRING
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
-    pair.mirror.take_changes()
+    pair.mirror.registrations.take()[1]
     pair.theirs("registerPublisher", "/other", "/t", "std_msgs/Int8", THEIRS)
     pair.look()
-    changes = pair.mirror.take_changes()
+    changes = pair.mirror.registrations.take()[1]
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
 
 
@@ -141,11 +144,11 @@ def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", "*", THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", "*", MOVED)
     pair.look()
-    pair.mirror.take_changes()
+    pair.mirror.registrations.take()[1]
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", STRING, MOVED)
     pair.look()
-    changes = {(change.name, change.node, change.type) for change in pair.mirror.take_changes()}
+    changes = {(change.name, change.node, change.type) for change in pair.mirror.registrations.take()[1]}
     assert changes == {("/t", "/p", STRING), ("/u", "/s", STRING)}
     assert pair.mirror.registrations.state() == pair.master.registrations.state()
 

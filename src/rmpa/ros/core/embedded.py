@@ -365,7 +365,7 @@ class RosCore(Core):
             self._carry_out()
 
     def _carry_out(self) -> None:
-        calls, changes = self._api.take()
+        calls, changes = self.registrations.take()
         if self.stored is not None:
             self.stored.note_change()
         # Queued before the callbacks run: what a callback registers must be notified after these calls.

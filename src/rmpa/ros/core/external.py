@@ -451,7 +451,8 @@ class ExternalCore(Core):
     # --- changes of the graph and of the master ---------------------------------------------------------------
 
     def _report_changes(self) -> None:
-        self.report(yielding_to_data(self._mirror.take_changes()))
+        _, changes = self.registrations.take()  # the master itself notifies the nodes
+        self.report(yielding_to_data(changes))
 
     def _lost(self, error: RmpaError) -> None:
         problem = str(error)

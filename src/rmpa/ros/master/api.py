@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.ros import limits
 from rmpa.ros.master import parameters as params
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind, SlaveCall, resolve, with_slash
+from rmpa.ros.master.parameters import RegistrationKind, resolve, with_slash
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
@@ -150,12 +150,6 @@ class MasterApi:
             case _:
                 problem = RosFault(1, f"{brief(call)} is not a struct of methodName and params")
         return {"faultCode": problem.code, "faultString": problem.text}
-
-    def take(self) -> tuple[list[SlaveCall], list[GraphChange]]:
-        """Return the calls of slaves and the changes since the previous call of this method, in order."""
-        taken = self.registrations.calls, self.registrations.changes
-        self.registrations.calls, self.registrations.changes = [], []
-        return taken
 
     # --- the node's own API -----------------------------------------------------------------------------------
 

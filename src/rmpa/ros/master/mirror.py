@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.parameters import GraphChange, RegistrationKind
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
 from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 
@@ -197,12 +197,6 @@ class Mirror:
     def unregister_calls(self) -> list[Call]:
         """The calls that unregister all that the agent registered, the latest registration first."""
         return [_unregister(entry, *own) for entry, own in reversed(self._own.items())]
-
-    def take_changes(self) -> list[GraphChange]:
-        """Return the changes since the previous call of this method."""
-        self.registrations.calls.clear()  # the master notifies the nodes
-        changes, self.registrations.changes = self.registrations.changes, []
-        return changes
 
     # --- the agent's own registrations ------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ class NodeRecord(msgspec.Struct):
 class Registrations:
     """The tables, and what follows from each change.
 
-    Each change appends to ``calls`` (of slaves, to be made in order) and to ``changes``; the owner empties both.
+    Each change appends to ``calls`` (of slaves, to be made in order) and to ``changes``; the owner takes both.
     """
 
     def __init__(self) -> None:
@@ -209,6 +209,12 @@ class Registrations:
         # Nodelets of one process share a slave API, which is notified once.
         apis = dict.fromkeys(self.at(RegistrationKind.SUBSCRIBER, topic).values())
         self.calls += [(api, "publisherUpdate", topic, publishers) for api in apis]
+
+    def take(self) -> tuple[list[SlaveCall], list[GraphChange]]:
+        """Return the calls of slaves and the changes since the previous call of this method, in order."""
+        taken = self.calls, self.changes
+        self.calls, self.changes = [], []
+        return taken
 
     # --- the tables -------------------------------------------------------------------------------------------
 

@@ -48,7 +48,7 @@ class FakeCore:
 
     def call(self, caller: str, method: str, *params: XmlRpcValue) -> RosReply:
         reply = self.api.call(method, (caller, *params))
-        for api, what, key, _ in self.api.take()[0]:
+        for api, what, key, _ in self.api.registrations.take()[0]:
             if (api, what) == (OURS, "paramUpdate"):
                 self.told(key.rstrip("/"))
         return reply
