@@ -200,16 +200,14 @@ class Stream:
         often has room again at once.
         """
         sent = 0
-        while sent < size:
-            try:
-                more = self._sock.sendmsg(unsent(parts, sent) if sent else parts)
-            except (BlockingIOError, InterruptedError):
-                break
-            except OSError as error:
-                self._lost(error)
-                break
-            sent += more
-            self.bytes_out += more
+        try:
+            while sent < size:
+                sent += self._sock.sendmsg(unsent(parts, sent) if sent else parts)
+        except (BlockingIOError, InterruptedError):
+            pass
+        except OSError as error:
+            self._lost(error)
+        self.bytes_out += sent
         return sent
 
     def _flush_later(self) -> None:
@@ -324,10 +322,8 @@ class Stream:
         if self._writing or self.outbox:
             self._keep_rest(kept, 0)  # after the entries that the outbox is sending
             return
-        if len(kept) == 1:
-            self._send_now(*kept[0])
-            return
-        sent = self._transmit([buffer for parts, _, _ in kept for buffer in parts], size)
+        whole = kept[0][0] if len(kept) == 1 else [buffer for parts, _, _ in kept for buffer in parts]
+        sent = self._transmit(whole, size)
         if sent < size and not self.closed:
             self._keep_rest(kept, sent)
         else:
