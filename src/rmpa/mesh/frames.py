@@ -55,14 +55,13 @@ class FrameKind(IntEnum):
 PACE_NEEDED: Final = 1
 """Bit of a pace frame's route field: something at the sender depends on the connection, so neither side may rest.
 Bits that are not known are ignored."""
-PAYLOAD_MAX: Final[dict[int, int]] = dict.fromkeys(map(int, FrameKind), 0) | {
-    FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,
-    FrameKind.WELCOME: limits.HELLO_PAYLOAD_MAX,
-    FrameKind.REFUSE: limits.HELLO_PAYLOAD_MAX,
+_SHORT: Final = (FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE, FrameKind.BYE)
+PAYLOAD_MAX: Final[dict[int, int]] = {
+    **dict.fromkeys(FrameKind, 0),
+    **dict.fromkeys(_SHORT, limits.HELLO_PAYLOAD_MAX),
     FrameKind.PONG: _STAMPS.size,
     FrameKind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
     FrameKind.DATA: limits.DATA_PAYLOAD_MAX,
-    FrameKind.BYE: limits.HELLO_PAYLOAD_MAX,
 }
 """The most bytes of payload that a frame of each kind may claim."""
 

@@ -23,7 +23,7 @@ KEEPALIVE_INTERVAL: Final = 0.25
 IDLE_LEASE: Final = 16.0
 """The lease of a link at rest: no route, no call and no request depends on it. Its silence is noticed later, and it
 costs a twentieth of the packets. Both ends agree on it; an earlier release never does. With more than 50 peers it is
-longer (``mesh.keepalive.RestPace``)."""
+longer (``mesh.keepalive.rest_lease``)."""
 IDLE_KEEPALIVE_INTERVAL: Final = 5.0
 """Interval of the keepalives of a link at rest: two of them may be late before the link falls."""
 IDLE_KEEPALIVES_PER_SECOND: Final = 10.0

@@ -465,7 +465,7 @@ class PeersSection:
             remote=f"{host}:{port}",
             dialled=link.dialled,
             up_ago=now - (link.since or now),
-            rtt=link.rtt,
+            rtt=link.connection.clock.rtt,
             clock_offset=link.clock_offset,
             clock_error=link.clock_error,
             bytes_in=link.bytes_in,
@@ -474,7 +474,7 @@ class PeersSection:
             dropped=link.dropped,
             heard_ago=now - link.heard_at,
             rests=link.rests,
-            lease=link.lease,
+            lease=link.connection.keepalive.remote_lease,
             lanes=(
                 _lane(link.express, link.connection.stream),
                 msgspec.structs.replace(

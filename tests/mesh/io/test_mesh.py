@@ -41,7 +41,7 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
                 assert link.dialled == (peer.identity.guid < link.guid)
             assert {s.state for s in peer.mesh.peers()} == {"linked"}
         link = made[0].link(made[1])
-        await until(lambda: link.rtt is not None, "a round trip")
+        await until(lambda: link.connection.clock.rtt is not None, "a round trip")
         assert link.clock_offset is not None
         assert link.clock_error is not None
         assert abs(link.clock_offset) <= link.clock_error

@@ -402,11 +402,6 @@ class PeerLink:
         return self.used and not self.alive
 
     @property
-    def rtt(self) -> float | None:
-        """The last round trip in seconds; ``None`` before the first."""
-        return self.connection.clock.rtt
-
-    @property
     def clock_offset(self) -> float | None:
         """Seconds that the peer's wall clock is ahead of ours; ``None`` if unknown."""
         return (self.connection.clock.estimate(self._mesh.clock.now()) or (None, None))[0]
@@ -459,13 +454,8 @@ class PeerLink:
 
     @property
     def rests(self) -> bool:
-        """Whether the link is at rest: keepalives are rare, and silence is noticed within ``lease``."""
+        """Whether the link is at rest: keepalives are rare, and silence is noticed late."""
         return self.connection.rests
-
-    @property
-    def lease(self) -> float:
-        """Seconds of silence after which the link counts as lost."""
-        return self.connection.keepalive.remote_lease
 
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped; see ``Connection``."""

@@ -255,7 +255,7 @@ class Mesh(LinkOwner):
             link.crashed |= connection.crashed
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
-            needed = link.lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
+            needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
             self._peering.link_down(link.id, reason, now, silent=link.silent, needed=needed)
         self._act()
         self._links.pop(connection.id, None)
