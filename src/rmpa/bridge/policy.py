@@ -428,7 +428,8 @@ class RelayPaths:
         Returns:
             Whether the best relay to the module has changed.
         """
-        if self._is_ours(origin) or peer not in self._linked:
+        ours = self.instance in (origin.instance, *origin.path)
+        if ours or peer not in self._linked:
             return False
         before, ways = self._best(origin.instance), self._ways.setdefault(origin.instance, {})
         known, count = ways.pop(peer, (origin, 0))
@@ -452,9 +453,6 @@ class RelayPaths:
         if best is not None and best != peer:
             return f"{origin.name} is reached by way of {self._linked[best][0]}"
         return ""
-
-    def _is_ours(self, origin: Origin) -> bool:
-        return origin.instance == self.instance or self.instance in origin.path
 
     def _direct(self, origin: Origin) -> bool:
         # Every member of a mesh hears the instances of the others, and may claim one; see Identity.is_same_run.

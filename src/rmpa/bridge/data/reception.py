@@ -35,19 +35,15 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import Publication
 
 
-def _never() -> float:
-    """Returns minus infinity: there was no silence yet."""
-    return -math.inf
-
-
 class LinkTime:
     """Offset of the peer's clock, and the end of the last silence; shared by all flows of a link."""
 
     __slots__ = ("ahead_ns", "error_ns", "resumed_at")
 
     def __init__(self) -> None:
-        self.resumed_at: Callable[[], float] = _never
-        """Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``."""
+        self.resumed_at: Callable[[], float] = lambda: -math.inf
+        """Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``. Minus
+        infinity: there was none yet."""
         self.ahead_ns = 0
         """The peer's wall clock minus the local one, ns."""
         self.error_ns: int | None = None
@@ -117,7 +113,7 @@ class ImportFlow(DataHandler):
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = QosWatch(contract, self._loop.time(), past)
-        self._watch_timer = MachineTimer(self.watch.next_timer, self._watch_due)
+        self._watch_timer = MachineTimer(self.watch.next_timer, lambda now: self._tell(self.watch.handle_timer(now)))
         self.counts: Counter[str] = Counter()
         """Messages that were not delivered: ``lost`` in the sender's queue or on a link, ``late`` (behind newer ones,
         or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their lifespan)."""
@@ -406,9 +402,6 @@ class ImportFlow(DataHandler):
         occurred = self.watch.lost(count, self._loop.time())
         if self._reliable:
             self._on_event(occurred)
-
-    def _watch_due(self, now: float) -> None:
-        self._tell(self.watch.handle_timer(now))
 
     def _tell(self, events: Iterable[QosEvent]) -> None:
         for occurred in events:

@@ -148,10 +148,6 @@ class RemoteSubscribers:
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
         """The connections that stand for a peer's listeners, by the listeners' local names."""
 
-    def shown(self, peer: int, source: Source) -> tuple[str, ...]:
-        """The names under which a peer's listeners are connected to a local publisher."""
-        return tuple(sorted(self._shown.get((peer, source), ())))
-
     # --- our listeners, to the peer that publishes ------------------------------------------------------------------
 
     def changed(self, peer: int, source: Source) -> None:

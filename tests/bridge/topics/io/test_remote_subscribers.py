@@ -178,10 +178,10 @@ async def test_each_is_connected_under_its_name_here_until_it_leaves(world: Worl
     assert world.told(7, "/server", "/echo") == ["/rmpa/base/echo", "/rmpa/base/server"]
     assert [one.what[:2] for one in Connection.made] == [("/count/goal", URI)] * 2
     assert world.told(7, "/server") == ["/rmpa/base/server"]
-    assert world.presence.shown(1, GOAL) == ("/rmpa/base/server",)
+    assert list(world.presence._shown[1, GOAL]) == ["/rmpa/base/server"]
     assert len(Connection.made) == 2, "who stays is not connected anew"
     assert world.told(7) == []
-    assert world.presence.shown(1, GOAL) == ()
+    assert not world.presence._shown
 
 
 async def test_nobody_stays_behind_a_route_a_link_or_the_end(world: World) -> None:
