@@ -253,6 +253,10 @@ class ServiceConnection:
             if head is None:
                 return 0, REPLY.size
             self._ok, size = head
+            end = REPLY.size + size
+            if len(data) >= end:
+                self._answered((self._ok, bytes(data[REPLY.size : end])))
+                return end, 0
             at, body = REPLY.size, BodyBuffer(size)
         at += body.take(data[at:])
         self._body = None if body.whole else body

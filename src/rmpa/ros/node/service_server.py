@@ -81,7 +81,7 @@ class ServiceCall:
     __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
 
     def __init__(
-        self, client: _ClientConnection, service: str, caller_id: str, request: bytearray, deadline: float
+        self, client: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
     ) -> None:
         self._client: _ClientConnection | None = client
         self.service = service
@@ -330,6 +330,9 @@ class _ClientConnection:
             if size > limits.SERVICE_MESSAGE_MAX:
                 self._too_large(size)
                 return at, 0
+            if len(data) >= at + size:
+                self._start_call(bytes(data[at : at + size]))
+                return at + size, 0
             body = self._body = BodyBuffer(size)
         at += body.take(data[at:])
         if body.whole:
@@ -339,7 +342,7 @@ class _ClientConnection:
             self._watch(self._connection.bytes_in)
         return at, 0
 
-    def _start_call(self, request: bytearray) -> None:
+    def _start_call(self, request: bytes | bytearray) -> None:
         self._stop_timer()
         endpoint = self._endpoint
         endpoint.calls += 1
