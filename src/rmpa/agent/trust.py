@@ -247,11 +247,8 @@ class AgentTrust(Part):
                 raise
             except Exception:  # noqa: BLE001 - the task's top: the next look may succeed
                 _log.exception("! the certificate could not be renewed")
-            try:
-                async with asyncio.timeout(limits.RENEWAL_LOOK):
-                    await self._wake.wait()
-            except TimeoutError:
-                pass
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), limits.RENEWAL_LOOK)
 
     async def _look(self) -> None:
         wall = self.membership.wall()
@@ -293,7 +290,8 @@ class AgentTrust(Part):
             await self._renew_by_dial()
         self._backoff.reset()
         self._problem = ""
-        _log.info("= the certificate is renewed until %s", _when(self.membership.certificate.expires))
+        expires = time.localtime(self.membership.certificate.expires)
+        _log.info("= the certificate is renewed until %s", time.strftime("%Y-%m-%d %H:%M", expires))
 
     async def _renew_by_link(self, session: PeerSession) -> None:
         hosts = self.page_hosts()
@@ -356,10 +354,6 @@ def _read(raw: object, form: type[_T]) -> _T:
         return msgspec.convert(raw, form)
     except msgspec.ValidationError as error:
         raise RemoteProtocolError(f"a message about trust: {error}") from None
-
-
-def _when(wall: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M", time.localtime(wall))
 
 
 # Answers ``rmpa trust …`` on the control socket of a secured agent.

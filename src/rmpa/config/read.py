@@ -224,30 +224,30 @@ _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A raw value, and where it was written.
+    """A raw value of a setting, and where it was written.
 
     Attributes:
+        setting: The setting.
         raw: The value as it was written.
         source: The option, the variable, or the key of the file.
         path: The file, for a value of a file.
         text: That file's text.
-        key: The key in it.
     """
 
+    setting: Setting
     raw: object
     source: str
     path: Path | None = None
     text: str = field(default="", repr=False)
-    key: Key = ()
 
-    def read(self, setting: Setting) -> object:
+    def read(self) -> object:
         """The typed value.
 
         Raises:
             ConfigError: It cannot be used; the error names the place.
         """
         try:
-            return setting.type.read(self.raw)
+            return self.setting.type.read(self.raw)
         except BadValue as error:
             remedy = error.remedy
             if error.better is not None:
@@ -259,12 +259,12 @@ class Given:
         """The error that says where it was written; ``at`` is the place inside of the value."""
         if self.path is None:
             return ConfigError(self.source, problem, remedy)
-        place = (*self.key, *at)
+        place = (*self.setting.key, *at)
         return ConfigError(dotted(place), problem, remedy, self.path, line_of(self.text, place))
 
     def __str__(self) -> str:
         """Where it was written: ``--port``, ``RMPA_PORT``, ``/etc/rmpa/rmpa.toml:3``."""
-        return self.source if self.path is None else f"{self.path}:{line_of(self.text, self.key)}"
+        return self.source if self.path is None else f"{self.path}:{line_of(self.text, self.setting.key)}"
 
     def _written(self, value: str) -> str:
         if self.path is not None:
@@ -317,13 +317,13 @@ def load_settings(
     named = options.get("config")
     path = find_config_file(str(named) if named else None, environ, cwd or Path(), notes)
     from_file = _file_layer(path) if path is not None else {}
-    for name, given in from_file.items():
-        given.read(_BY_NAME[name])  # a mistake in the file is an error even where an option outweighs it
+    for given in from_file.values():
+        given.read()  # a mistake in the file is an error even where an option outweighs it
     from_variables, from_options = _variable_layer(environ, notes), _option_layer(options)
     said = from_file | from_variables | from_options
-    external = "core_mode" in said and said["core_mode"].read(_BY_NAME["core_mode"]) == "external"
+    external = "core_mode" in said and said["core_mode"].read() == "external"
     strongest = _ros_layer(environ, host_name, notes, external=external) | said
-    values = {name: given.read(_BY_NAME[name]) for name, given in strongest.items()}
+    values = {name: given.read() for name, given in strongest.items()}
     directory = state_dir(environ, str(values.get("state_dir") or ""))
     names = {
         NameSource.OPTION: _name_in(from_options),
@@ -334,7 +334,7 @@ def load_settings(
     }
     values["name"] = choose_name(names).name
     if directory is not None and names[NameSource.KEPT] and "name" not in strongest:
-        strongest["name"] = Given(names[NameSource.KEPT], str(directory / NAME_FILE))
+        strongest["name"] = Given(_BY_NAME["name"], names[NameSource.KEPT], str(directory / NAME_FILE))
     settings = Settings(config_file=path)
     for name, value in values.items():
         settings = _with(settings, name.split("."), value)
@@ -350,7 +350,7 @@ def load_settings(
 
 def _name_in(layer: _Layer) -> str:
     """The module's name as one source says it; empty: it does not."""
-    return str(layer["name"].read(_BY_NAME["name"])) if "name" in layer else ""
+    return str(layer["name"].read()) if "name" in layer else ""
 
 
 def _with(table: _Table, path: Sequence[str], value: object) -> _Table:
@@ -434,7 +434,7 @@ def _file_layer(path: Path) -> _Layer:
     found = parse_config(data, path)
     text = data.decode("utf-8-sig")
     return {
-        setting.name: Given(found[setting.key], ".".join(setting.key), path, text, setting.key)
+        setting.name: Given(setting, found[setting.key], ".".join(setting.key), path, text)
         for setting in SETTINGS
         if setting.key in found
     }
@@ -448,13 +448,15 @@ def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
             near = did_you_mean(variable, VARIABLES)
             notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))
     return {
-        setting.name: Given(environ[setting.env], setting.env) for setting in SETTINGS if environ.get(setting.env)
+        setting.name: Given(setting, environ[setting.env], setting.env)
+        for setting in SETTINGS
+        if environ.get(setting.env)
     }
 
 
 def _option_layer(options: Mapping[str, object]) -> _Layer:
     return {
-        setting.name: Given(raw, setting.flag)
+        setting.name: Given(setting, raw, setting.flag)
         for setting in SETTINGS
         if setting.option and (raw := options.get(setting.option_name)) not in (None, ())
     }
@@ -477,9 +479,9 @@ def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
 
 
 def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, external: bool) -> _Layer:
-    layer: _Layer = {}
+    found: dict[str, tuple[object, str]] = {}
     if environ.get("ROS_DOMAIN_ID"):
-        layer["domain"] = Given(environ["ROS_DOMAIN_ID"], "ROS_DOMAIN_ID")
+        found["domain"] = (environ["ROS_DOMAIN_ID"], "ROS_DOMAIN_ID")
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     known = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
     if reach and reach not in known:
@@ -487,22 +489,22 @@ def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, 
         remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(known)}"
         raise ConfigError("ROS_AUTOMATIC_DISCOVERY_RANGE", f"{reach!r} is not a range", remedy)
     if reach == "OFF":
-        layer["multicast"] = Given(False, "ROS_AUTOMATIC_DISCOVERY_RANGE")
+        found["multicast"] = (False, "ROS_AUTOMATIC_DISCOVERY_RANGE")
     elif reach == "LOCALHOST":
-        layer["interfaces"] = Given(["lo"], "ROS_AUTOMATIC_DISCOVERY_RANGE")
+        found["interfaces"] = (["lo"], "ROS_AUTOMATIC_DISCOVERY_RANGE")
     static = environ.get("ROS_STATIC_PEERS", "")
     if static and reach == "OFF":
         notes.append("ROS_STATIC_PEERS is ignored, as in ROS 2: ROS_AUTOMATIC_DISCOVERY_RANGE is OFF")
     elif static:
-        layer["seeds"] = Given([p.strip() for p in static.split(";") if p.strip()], "ROS_STATIC_PEERS")
+        found["seeds"] = ([p.strip() for p in static.split(";") if p.strip()], "ROS_STATIC_PEERS")
     uri = environ.get("ROS_MASTER_URI", "")
     if uri and external:
-        layer["core_master"] = Given(uri, "ROS_MASTER_URI")
+        found["core_master"] = (uri, "ROS_MASTER_URI")
     elif uri:
         port = _local_master_port(uri, environ, host_name, notes)
         if port is not None:
-            layer["core_port"] = Given(port, "ROS_MASTER_URI")
-    return layer
+            found["core_port"] = (port, "ROS_MASTER_URI")
+    return {name: Given(_BY_NAME[name], raw, source) for name, (raw, source) in found.items()}
 
 
 def _local_master_port(uri: str, environ: Mapping[str, str], host_name: str, notes: list[str]) -> int | None:

@@ -46,7 +46,8 @@ def found_mesh(store: TrustStore, name: str, label: str, wall: float) -> None:
     Raises:
         StartError: The clock is not set, or a file cannot be written.
     """
-    _check_clock(wall)
+    if wall < limits.EARLIEST_TIME:
+        raise StartError("the clock of this machine", "is not set", _CLOCK)
     ca_pem, key_pem = new_key(), new_key()
     ca_key, key = private_key(ca_pem, files_of.CA_KEY), private_key(key_pem, files_of.KEY)
     ca = certificates.make_ca(ca_key, label, _serial(), wall)
@@ -326,8 +327,3 @@ def _serial() -> int:
 
 def _issued(name: str, wall: float, key: bytes, hosts: tuple[str, ...] = ()) -> Issued:
     return Issued(name, int(wall), int(wall) + limits.CERTIFICATE_LIFETIME, hosts, key)
-
-
-def _check_clock(wall: float) -> None:
-    if wall < limits.EARLIEST_TIME:
-        raise StartError("the clock of this machine", "is not set", _CLOCK)
