@@ -130,8 +130,8 @@ class AgentTrust(Part):
         self._problem = ""
         bridge.rpc.on_notification(HAVE, self._have, Needs((), "numbers of the documents that each member has"))
         signed = Needs((), "a document holds by the signature of the mesh's authority")
-        for kind in Document:
-            bridge.rpc.on_notification(kind.notice, partial(self._document, kind), signed)
+        bridge.rpc.on_notification(Document.DENY.notice, partial(self._document, Document.DENY), signed)
+        bridge.rpc.on_notification(Document.KEYS.notice, partial(self._document, Document.KEYS), signed)
         own = Needs((), "the certificate for the peer's own certified name, unless that is revoked")
         bridge.rpc.on_request(RENEW, self._renew_other, own)
 
