@@ -20,6 +20,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
+from rmpa.mesh.io.link import PeerLink
 from rmpa.mesh.io.securing import Securing
 from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tls import TlsHandshake
@@ -223,7 +224,7 @@ async def test_nor_while_its_link_is_silent(lab: Authority, monkeypatch: pytest.
     """A member that claims instance and address of another one, under its own name."""
     async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
-        monkeypatch.setattr(base.mesh, "_alive", lambda _: False)
+        monkeypatch.setattr(PeerLink, "alive", False)
         thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
         try:
             await thief.mesh.start()

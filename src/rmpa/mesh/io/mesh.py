@@ -73,7 +73,7 @@ class Mesh(LinkOwner):
         self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self._refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
-        self._peering = Peering(identity, rng=rng, alive=self._alive)
+        self._peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
         self._timer = MachineTimer(self._peering.next_timer, self._due, now=self.clock.now)
         self._connections: dict[int, Connection] = {}
         self._links: dict[int, PeerLink] = {}
@@ -316,11 +316,6 @@ class Mesh(LinkOwner):
     def _due(self, now: float) -> None:
         self._peering.handle_timer(now)
         self._act()
-
-    def _alive(self, link_id: int) -> bool:
-        """Whether bytes were received on a link lately, at its pace."""
-        link = self._links.get(link_id)
-        return link is not None and link.alive
 
     # --- dialling -------------------------------------------------------------------------------------------------
 
