@@ -23,6 +23,10 @@ def test_each_subscriber_settles_on_the_path_that_the_conditions_ask_for(block: 
         DirectScenario(seed).play()
 
 
+def test_a_source_that_is_shown_again_at_once_is_not_left_by_the_list_of_its_end() -> None:
+    DirectScenario(1154).play()
+
+
 def test_a_seed_replays_exactly() -> None:
     assert DirectScenario(7).play() == DirectScenario(7).play()
 

@@ -346,6 +346,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         if path.endpoint is not None and not self._closed:
             self._shared.counters.add("direct.hung_up")
             self._spawn(self._leave(path), f"hang up {path.want.user}")
+            # The source may be shown again at once: the list of its end must not be the last one that arrives.
+            asyncio.get_running_loop().call_later(limits.DIRECT_LIST_AGAIN, self._list_again, path)
 
     async def _leave(self, path: TopicPath) -> tuple[str, int] | None:
         """Make a subscriber leave all of its connections to a node; return a direct one that stays."""
