@@ -71,16 +71,24 @@ class Grants:
 
     def __init__(self, shared: Shared) -> None:
         self._shared = shared
-        self._asked: dict[tuple[int, Want], _Entry] = {}
-        """By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked for."""
+        self._asked: dict[int, dict[Want, _Entry]] = {}
+        """By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked for.
+        A peer may ask for thousands, so nothing here passes over those of all peers for one of them."""
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
         """What ``of`` returns; ``None``: grants have changed since it was made."""
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
-        for (peer, want), (_, _, found) in list(self._asked.items()):
+        for session, asked, found in self._entries():
             if isinstance(found, Grant):
-                yield peer, want, found
+                yield session.peer, asked.want, found
+
+    def _entries(self) -> list[_Entry]:
+        return [entry for entries in self._asked.values() for entry in entries.values()]
+
+    def _granted(self, want: Want) -> bool:
+        """Whether any peer has a grant for a user."""
+        return any(want in entries and isinstance(entries[want][2], Grant) for entries in self._asked.values())
 
     def of(self, name: str, node: str) -> list[tuple[int, str, Grant]]:
         """The grants for one node's topic or service: peer, user, and where."""
@@ -110,15 +118,16 @@ class Grants:
 
     async def _ask(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         asked = read_ask(args)
-        key, before = (session.peer, asked.want), self._answer(session, asked.want)
+        before = self._answer(session, asked.want)
         found: Grant | Unmet | None = self._judge(session, asked)
         if asked.broken and isinstance(before, Grant):
             self._broke(asked.want)
         if found is None:
-            self._asked[key] = session, asked, before
+            self._asked.setdefault(session.peer, {})[asked.want] = session, asked, before
             found = await self._find(session, asked.want)
             found = self._judge(session, asked) or found  # the graph may have changed meanwhile
-            if key not in self._asked or self._asked[key][1] is not asked:
+            entry = self._asked.get(session.peer, {}).get(asked.want)
+            if entry is None or entry[1] is not asked:
                 return reply_of(_GIVEN_UP)  # released, or asked again
         self._set(session, asked, found)
         if isinstance(found, Grant):
@@ -127,7 +136,7 @@ class Grants:
         return reply_of(found)
 
     def _answer(self, session: PeerSession, want: Want) -> Grant | Unmet | None:
-        entry = self._asked.get((session.peer, want))
+        entry = self._asked.get(session.peer, {}).get(want)
         return entry[2] if entry is not None else None
 
     def _judge(self, session: PeerSession, asked: DirectAsk) -> Unmet | None:
@@ -135,10 +144,10 @@ class Grants:
         unmet = self._unmet(session, asked)
         if unmet is not None or isinstance(self._answer(session, asked.want), Grant):
             return unmet
-        granted = [(peer, want) for peer, want, _ in self]
-        if asked.user and asked.want in (want for _, want in granted):
+        if asked.user and self._granted(asked.want):
             return Unmet(Condition.CALLER_ID, f"a node {asked.user} of another module is connected already")
-        if sum(peer == session.peer for peer, _ in granted) >= limits.DIRECT_MAX:
+        own = self._asked.get(session.peer, {}).values()
+        if sum(isinstance(found, Grant) for _, _, found in own) >= limits.DIRECT_MAX:
             return Unmet(Condition.LIMIT, f"more than {limits.DIRECT_MAX} direct connections to this module")
         return None
 
@@ -149,25 +158,26 @@ class Grants:
     def _set(self, session: PeerSession, asked: DirectAsk, found: Grant | Unmet | None) -> None:
         """Note what a peer is answered; ``None``: it does not ask any more."""
         want, before, self._by_node = asked.want, self._answer(session, asked.want), None
-        self._asked.pop((session.peer, want), None)
+        own = self._asked.setdefault(session.peer, {})
+        own.pop(want, None)
         if found is not None and not self._is_hidden(found):
-            self._asked[session.peer, want] = session, asked, found
+            own[want] = session, asked, found
         if isinstance(found, Unmet):
-            refused = [
-                key for key, (one, _, answer) in self._asked.items() if one is session and isinstance(answer, Unmet)
-            ]
+            refused = [one for one, (_, _, answer) in own.items() if isinstance(answer, Unmet)]
             if len(refused) > limits.DIRECT_MAX:
-                del self._asked[refused[0]]
+                del own[refused[0]]
+        if not own:
+            del self._asked[session.peer]
         if isinstance(before, Grant) == isinstance(found, Grant):
             return
         self._changed(session, want, granted=isinstance(found, Grant))
-        for other, one, answer in list(self._asked.values()) if isinstance(before, Grant) else ():
-            if one.want == want and other is not session and isinstance(answer, Unmet):
-                self._tell(other, want)  # perhaps it was refused because of the user's name
+        for peer, entries in list(self._asked.items()) if isinstance(before, Grant) else ():
+            if peer != session.peer and want in entries and isinstance(entries[want][2], Unmet):
+                self._tell(entries[want][0], want)  # perhaps it was refused because of the user's name
 
     def _again(self, which: Callable[[Want], bool]) -> None:
         """Let peers ask again: something has changed."""
-        for session, asked, found in list(self._asked.values()):
+        for session, asked, found in self._entries():
             if found is not None and which(asked.want):
                 self._tell(session, asked.want)
 
@@ -188,7 +198,7 @@ class Grants:
         Args:
             refused: Have the peers ask again for what they were refused, too.
         """
-        for session, asked, before in list(self._asked.values()):
+        for session, asked, before in self._entries():
             granted = isinstance(before, Grant)
             if before is None or not (refused or granted):
                 continue
@@ -203,13 +213,14 @@ class Grants:
 
     def link_up(self, session: PeerSession) -> None:
         """Let a peer ask again for what it uses; what it was granted over an earlier link ends a little later."""
-        before = [asked for one, asked, _ in self._asked.values() if one is session]
+        before = [asked for _, asked, _ in self._asked.get(session.peer, {}).values()]
         if before:
-            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, before)
+            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, session, before)
 
-    def _expire(self, before: list[DirectAsk]) -> None:
-        for session, asked, _ in list(self._asked.values()):
-            if any(asked is one for one in before):
+    def _expire(self, session: PeerSession, before: list[DirectAsk]) -> None:
+        for asked in before:
+            entry = self._asked.get(session.peer, {}).get(asked.want)
+            if entry is not None and entry[1] is asked:
                 self._set(session, asked, None)
 
     def link_down(self, session: PeerSession) -> None:
@@ -230,9 +241,8 @@ class Grants:
 
     def gone(self, session: PeerSession) -> None:
         """Forget what a peer asked for."""
-        for one, asked, _ in list(self._asked.values()):
-            if one is session:
-                self._set(session, asked, None)
+        for _, asked, _ in list(self._asked.get(session.peer, {}).values()):
+            self._set(session, asked, None)
 
     def _end(self, session: PeerSession, port: int) -> None:
         if session.same_machine:
@@ -384,7 +394,7 @@ class TopicGrants(Grants):
 
     def reconcile(self, subscribers: Mapping[str, Mapping[str, str]]) -> None:
         """Register missing subscribers again: the core has been restarted."""
-        for session, asked, found in list(self._asked.values()):
+        for session, asked, found in self._entries():
             proxy = session.proxies.get(asked.user) if isinstance(found, Grant) else None
             if proxy is not None and proxy.name not in subscribers.get(asked.name, {}):
                 self._register(asked.name, proxy)
