@@ -108,31 +108,36 @@ def test_a_file_is_read_again(tmp_path: Path) -> None:
     assert (before.policy.deny, load().settings.policy.deny) == ((), ("/x",))
 
 
+async def nothing() -> None:
+    """Start, close or watch nothing."""
+
+
 # --- SIGHUP -------------------------------------------------------------------------------------------------------
 
 
 async def test_sighup_reloads_and_notifies_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(reload, "notify_service_manager", told.append)
-    monkeypatch.setattr(reload, "_has_terminal", lambda: False)
+    monkeypatch.setattr(reload, "has_terminal", lambda: False)
     applied: list[Settings] = []
-    made = reloader(lambda: Loaded(NEW), applied)
-    following = asyncio.create_task(made.follow_signal(lambda: pytest.fail("it must go on")))
-    await asyncio.sleep(0)
-    os.kill(os.getpid(), signal.SIGHUP)
-    async with asyncio.timeout(20):
-        while "READY=1" not in told:
+
+    async def start() -> None:
+        os.kill(os.getpid(), signal.SIGHUP)  # also one that comes during the start
+
+    async def watch() -> None:
+        while told.count("READY=1") < 2:
             await asyncio.sleep(0.005)
+
+    await reload.serve(start, nothing, reloader(lambda: Loaded(NEW), applied), watch)
     assert applied
-    assert told[0].startswith("RELOADING=1\nMONOTONIC_USEC=")
-    following.cancel()
-    await asyncio.wait([following])
+    assert told[0] == "READY=1"
+    assert told[1].startswith("RELOADING=1\nMONOTONIC_USEC=")
 
 
 async def test_an_ignored_sighup_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        await reloader(lambda: pytest.fail("no reload was asked for"), []).follow_signal(lambda: None)
+        await reload.serve(nothing, nothing, reloader(lambda: pytest.fail("no reload was asked for"), []), nothing)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -122,37 +122,32 @@ class Reloader:
         for key in reply.restart:
             _log.warning("! %s only holds after a restart", key)
 
-    async def follow_signal(self, stop: Callable[[], object]) -> None:
-        """Read the settings again at each SIGHUP, until cancelled; nothing if the signal is ignored (``nohup``).
+    async def follow(self, came: asyncio.Event, stop: Callable[[], object], *, had_terminal: bool) -> None:
+        """Read the settings again at each SIGHUP, until cancelled.
 
         Args:
+            came: Set by the signal.
             stop: Called if the terminal was closed, which sends the signal to end its programs.
+            had_terminal: Whether there was one when the process began.
         """
-        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-            return
-        had_terminal, came, loop = _has_terminal(), asyncio.Event(), asyncio.get_running_loop()
-        loop.add_signal_handler(signal.SIGHUP, came.set)
-        try:
-            while await came.wait():
-                came.clear()
-                if had_terminal and not _has_terminal():
-                    _log.info("= the terminal is gone")
-                    stop()
-                    return
-                notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
-                try:
-                    await self.reload()
-                except ConfigError as error:
-                    _log.error("! the settings stay as they are: %s", error)
-                except Exception:  # noqa: BLE001 - a fault of one reload must not stop the next one
-                    _log.exception("! the settings could not be read again")
-                finally:
-                    notify_service_manager("READY=1")
-        finally:
-            loop.remove_signal_handler(signal.SIGHUP)
+        while await came.wait():
+            came.clear()
+            if had_terminal and not has_terminal():
+                _log.info("= the terminal is gone")
+                stop()
+                return
+            notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+            try:
+                await self.reload()
+            except ConfigError as error:
+                _log.error("! the settings stay as they are: %s", error)
+            except Exception:  # noqa: BLE001 - a fault of one reload must not stop the next one
+                _log.exception("! the settings could not be read again")
+            finally:
+                notify_service_manager("READY=1")
 
 
-def _has_terminal() -> bool:
+def has_terminal() -> bool:
     """Whether this process has a controlling terminal that is still there."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_CLOEXEC))
@@ -336,13 +331,16 @@ async def serve(
     loop.set_default_executor(realtime.worker_pool())
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
+    came, had_terminal = asyncio.Event(), has_terminal()
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
+        loop.add_signal_handler(signal.SIGHUP, came.set)
     await start()
-    tasks = [asyncio.create_task(reloader.follow_signal(stop.set), name="read the settings again")]
+    following = reloader.follow(came, stop.set, had_terminal=had_terminal)
+    tasks = [asyncio.create_task(following, name="read the settings again")]
     if watch is not None:
         tasks.append(asyncio.create_task(watch(), name="watch"))
         tasks[1].add_done_callback(lambda _: stop.set())
     try:
-        await asyncio.sleep(0)  # the signal is handled from here on, before readiness is told
         notify_service_manager("READY=1")
         await stop.wait()
         notify_service_manager("STOPPING=1")
