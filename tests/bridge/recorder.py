@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge.context import BridgeContext, Names, ServiceRules
+from rmpa.bridge.messages import Source
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.services import exports as service_exports
@@ -20,11 +21,11 @@ from rmpa.core.contract import Contract, Contracts
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.messages import Description, Message, Origin, RouteOpened, Source
+    from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.exports import ServiceRoute
     from rmpa.bridge.services.imports import RemoteService
-    from rmpa.bridge.topics.exports import ExportRoute
+    from rmpa.bridge.topics.exports import ExportRoute, LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription
 
@@ -337,6 +338,18 @@ class Exports(Recorded):
     ) -> None:
         out = Out(context(policy, contracts, names, limit_settings, gate), numbering=numbering)
         super().__init__(topic_exports.Exports(out), out)
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics that the graph has."""
+        return {source.topic for source in self.book.seen}
+
+    def graph(self, topic: str, publishers: dict[str, LocalSource]) -> list[Any]:
+        """Set a topic's publishers, by node."""
+        before = [source.node for source in self.book.seen if source.topic == topic]
+        for node in dict.fromkeys((*before, *publishers)):
+            self.book.put(Source(topic, node), publishers.get(node))
+        return self.out.take()
 
     def link_away(self, peer: int) -> tuple[list[Any], bool]:
         """What is done, and whether a route waits."""

@@ -181,19 +181,21 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     # --- entries -------------------------------------------------------------------------------------------------
 
-    def put(self, key: KeyT, local: LocalT | None) -> None:
-        """Set what the local graph has under a key; ``None``: nothing. ``advertise`` tells peers what changes."""
-        if self.seen.get(key) == local:
+    def put(self, key: KeyT, local: LocalT | None, *, again: bool = False) -> None:
+        """Offer what the local graph has under a key, or keep it home; ``advertise`` tells peers what changes.
+
+        Args:
+            key: The key.
+            local: The entry; ``None``: the graph has none.
+            again: Judge it although the graph is as before: a rule has changed, or there is room below the limit.
+        """
+        if self.seen.get(key) == local and not again:
             return
         if local is None:
             del self.seen[key]
         else:
             self.seen[key] = local
-        self.follow(key)
-
-    def follow(self, key: KeyT) -> None:
-        """Offer an entry, or keep it home, by the facts of now; call it again whenever one has changed."""
-        local, before = self.seen.get(key), self.offered.get(key)
+        before = self.offered.get(key)
         if local is None or not self.judge(key, local).allowed:
             self.beyond.pop(key, None)
             if before is not None:
@@ -201,7 +203,8 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
                 self.note(key)
                 self._ended(key, f"{self.owner} has gone" if local is None else "a rule keeps it home now")
                 if self.beyond and len(self.offered) < self.limit:
-                    self.follow(next(iter(self.beyond)))
+                    first = next(iter(self.beyond))
+                    self.put(first, self.seen[first], again=True)
         elif local != before:
             if before is None and len(self.offered) >= self.limit:
                 self.beyond[key] = None
@@ -223,7 +226,8 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     def reload(self) -> Iterator[None]:
         """Judge by new rules, an entry with each item; then peers are told what has changed for them."""
         for key in tuple(self.seen):
-            self.follow(key)
+            if key in self.seen:
+                self.put(key, self.seen[key], again=True)
             yield
         for told in self.peers.values():
             told.due |= dict.fromkeys(self.offered)
@@ -511,11 +515,11 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     @abstractmethod
     def _entry(self, peer: int, offer: OfferT) -> EntryT:
-        """The entry of an offer."""
+        """The entry of an offer, listed under its name here."""
 
     @abstractmethod
-    def _came(self, entry: EntryT) -> None:
-        """Show an entry that was added, or hide it."""
+    def _judge(self, entry: EntryT) -> None:
+        """Show an entry or hide it, by the facts of now; call it again whenever one has changed."""
 
     @abstractmethod
     def _came_again(self, entry: EntryT, now: float) -> None:
@@ -524,10 +528,6 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     @abstractmethod
     def _went(self, entry: EntryT, reason: str) -> None:
         """End what uses an entry and take it out of the local graph; it is in no list of its peer any more."""
-
-    @abstractmethod
-    def _ways_changed(self, instances: Collection[str]) -> None:
-        """Judge what relays bring of these modules: the best path to them may be another one."""
 
     @property
     def limit(self) -> int:
@@ -604,7 +604,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         entry = known.entries[wire] = self._entry(peer, offer)
         if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
             self._ways_changed({entry.origin.instance})
-        self._came(entry)
+        self._judge(entry)
 
     def _warn_limit(self, peer: str, kind: str, limit: int) -> None:
         text = f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is "
@@ -638,6 +638,14 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""
         name = self._peers[entry.peer].name
         return (name, "") if entry.origin is None else (entry.origin.name, name)
+
+    def _ways_changed(self, instances: Collection[str]) -> None:
+        """Judge what relays bring of modules whose best path may be another one."""
+        wanted = {instance for instance in instances if instance in self.ways}
+        entries = (entry for known in self._peers.values() for entry in known.entries.values()) if wanted else ()
+        relayed = [entry for entry in entries if entry.origin is not None and entry.origin.instance in wanted]
+        for entry in sorted(relayed, key=lambda one: not one.shown):  # shown ones first: their names get free
+            self._judge(entry)
 
     def reached_here(self, instance: str, *, reached: bool) -> None:
         """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""

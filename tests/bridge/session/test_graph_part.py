@@ -50,7 +50,7 @@ class Part(GraphPart):
     def _look_at(self, name: str) -> None:
         if name in self.failing:
             raise RuntimeError("once")
-        self.exports.graph(name, {"/n": LOCAL})
+        self.exports.put(Source(name, "/n"), LOCAL)
 
     def _names(self) -> Iterable[str]:
         return ()

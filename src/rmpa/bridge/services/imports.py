@@ -123,7 +123,9 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def _entry(self, peer: int, offer: ServiceOffer) -> RemoteService:
         name = self.name_here(peer, offer.service, offer.origin)
-        return RemoteService(peer=peer, wire=offer.service, name=name, node=offer.node, origin=offer.origin)
+        entry = RemoteService(peer=peer, wire=offer.service, name=name, node=offer.node, origin=offer.origin)
+        self._claims.setdefault(name, {})[entry] = None
+        return entry
 
     def _came_again(self, entry: RemoteService, now: float) -> None:  # noqa: ARG002 - as of ImportBook
         """The server was replaced, or the link is a new one: the type may have changed."""
@@ -131,11 +133,10 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         if entry.shown:
             self._do.forget_about(entry)
 
-    def _came(self, entry: RemoteService) -> None:
-        """Choose after one more claim to a name; a thousand modules may have it, so only if it may be chosen."""
-        self._claims.setdefault(entry.name, {})[entry] = None
+    def _judge(self, entry: RemoteService) -> None:
+        """As of ``ImportBook``; a thousand modules may have a name, so only if it may go first."""
         first = self._shown.get(entry.name)
-        if entry.name not in self._local and (first is None or self._rank(entry) < self._rank(first)):
+        if entry.name not in self._local and (first is None or self._rank(entry) <= self._rank(first)):
             self._choose(entry.name)
 
     def _went(self, entry: RemoteService, reason: str) -> None:
@@ -182,12 +183,6 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         for peer, known in list(self._peers.items()):
             while self._peers.get(peer) is known and self._admit(peer, known, now):
                 yield
-
-    def _ways_changed(self, instances: Collection[str]) -> None:
-        wanted = {instance for instance in instances if instance in self.ways}
-        for _, remote in list(self) if wanted else ():
-            if remote.origin is not None and remote.origin.instance in wanted:
-                self._choose(remote.name)
 
     def _choose(self, service: str) -> None:
         """Show the one service of a name that goes first, by the facts of now; call it whenever one has changed."""

@@ -41,7 +41,7 @@ from rmpa.core.identity import is_later, serial_add
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
 
@@ -98,7 +98,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
-        self._nodes: dict[str, tuple[str, ...]] = {}
         self._routes: dict[int, dict[int, Source]] = {}
         """The open source of each route id, for each linked peer."""
         self._flows: dict[Source, _Flow] = {}
@@ -107,11 +106,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         """The run of each named peer that had no link when a route of it ended, so that it may miss messages."""
 
     # --- for others ----------------------------------------------------------------------------------------------
-
-    @property
-    def topics(self) -> Collection[str]:
-        """The topics with publishers, as ``graph`` was told last."""
-        return self._nodes.keys()
 
     def topics_for(self, peer: int) -> int:
         """How many topics a peer was told."""
@@ -164,14 +158,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def _message(self, added: tuple[TopicOffer, ...], removed: tuple[Source, ...], full: bool, more: bool) -> Message:
         return Advertise(added, removed, full, more)
-
-    def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> None:
-        """Set a topic's present publishers, by node."""
-        before = self._nodes.pop(topic, ())
-        if publishers:
-            self._nodes[topic] = tuple(publishers)
-        for node in (*(one for one in before if one not in publishers), *publishers):
-            self.put(Source(topic, node), publishers.get(node))
 
     def reload(self) -> Iterator[None]:
         """Judge by new rules. Routes that they end, end at once: a slow peer is told of the topics later."""

@@ -222,9 +222,6 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
         self._topics.setdefault(peer, {}).setdefault(name, {})[source] = None
         return entry
 
-    def _came(self, entry: RemoteTopic) -> None:
-        self._judge(entry)
-
     def _came_again(self, entry: RemoteTopic, now: float) -> None:
         if not entry.route and entry.until is None:
             entry.problem = ""  # the peer was away, and is back
@@ -283,19 +280,11 @@ class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
             self._close(entry, missed=entry.wanted)
             self.follow(entry, now)
 
-    def _ways_changed(self, instances: Collection[str]) -> None:
-        """Judge sources of modules whose path may have changed; shown ones first, so that their names get free."""
-        wanted = {instance for instance in instances if instance in self.ways}
-        touched = [one for one in self if (o := one[2].origin) and o.instance in wanted] if wanted else []
-        for peer, source, _ in sorted(touched, key=lambda one: not one[2].shown):
-            self._judge_at(peer, source)
-
     def _judge_at(self, peer: int, source: Source) -> None:
         if (entry := self.get(peer, source)) is not None:
             self._judge(entry)
 
     def _judge(self, entry: RemoteTopic) -> None:
-        """Show a source or hide it, by the facts of now; call it again whenever one has changed."""
         known, before = self._peers[entry.peer], entry.cause
         entry.hidden, entry.cause = self.why_hidden(entry)
         known.wait(entry, crowded=entry.cause == CROWDED)

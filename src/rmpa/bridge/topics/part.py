@@ -21,7 +21,7 @@ from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
-from rmpa.bridge.topics.peer_topics import LossReports, PeerTopics, TopicEvents
+from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
 from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
@@ -75,6 +75,8 @@ class Topics(GraphPart, TopicEvents):
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports, self.peers)
         self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
+        self._nodes: dict[str, tuple[str, ...]] = {}
+        """By topic: the nodes that publish it, as it was looked at last."""
         self._ticker: asyncio.TimerHandle | None = None
 
     def of(self, session: PeerSession) -> PeerTopics:
@@ -203,11 +205,15 @@ class Topics(GraphPart, TopicEvents):
             self.look((change.name,))
 
     def _names(self) -> Iterable[str]:
-        return (*self.exports.topics, *self._shared.core.state().publishers)
+        return (*self._nodes, *self._shared.core.state().publishers)
 
     def _look_at(self, name: str) -> None:
-        local = self._local.of(name)
-        self.exports.graph(name, local | self._local.relayed(name))
+        local, before = self._local.of(name), self._nodes.pop(name, ())
+        publishers = local | self._local.relayed(name)
+        if publishers:
+            self._nodes[name] = tuple(publishers)
+        for node in dict.fromkeys((*before, *publishers)):
+            self.exports.put(Source(name, node), publishers.get(node))
         self.imports.local_type(name, next((one.type for one in reversed(local.values())), None))
 
     def reconcile(self) -> None:
@@ -287,13 +293,14 @@ class Topics(GraphPart, TopicEvents):
         return topics.position(entry.wire) if (topics := self.peers.get(entry.peer)) is not None else None
 
     def publish(self, entry: RemoteTopic) -> None:
-        """Publish a peer's source in the local graph."""
+        """Publish a peer's source at its proxy, in a later turn of the loop."""
         session, topics, source = self._shared.sessions.get(entry.peer), self.peers.get(entry.peer), entry.wire
         if session is not None and topics is not None:
             name = self._shared.sessions.proxy_name(session, source.node, entry.origin)
             place = (entry.name, name)
             self._shared.relay.pass_on(session.peer, session.link.identity, source, place, entry.origin)
-            topics.publish(entry)
+            topic = PeerTopic(topics, entry)
+            session.proxies.hold(source.node, source, topic.ready, topic.left)
             self.direct_imports.shown(entry)
 
     def retract(self, entry: RemoteTopic) -> None:

@@ -245,11 +245,6 @@ class PeerTopics:
         flow = self.flow(source)
         return flow.position if flow is not None else None
 
-    def publish(self, entry: RemoteTopic) -> None:
-        """Publish a source at its proxy, in a later turn of the loop."""
-        topic = PeerTopic(self, entry)
-        self.session.proxies.hold(entry.node, entry.wire, topic.ready, topic.left)
-
     def retract(self, source: Source) -> None:
         """Retract a source: its data stops at once, its registration in a later turn of the loop."""
         if (topic := self.topics.get(source)) is not None:

@@ -14,7 +14,7 @@ from rmpa.bridge.messages import Description, RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
-from rmpa.bridge.topics.peer_topics import PeerTopics
+from rmpa.bridge.topics.peer_topics import PeerTopic, PeerTopics
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
@@ -95,7 +95,8 @@ class Proxied:
         self.topics = PeerTopics(cast("Any", shared), cast("Any", part), session, {})
 
     async def publish(self) -> Publication:
-        self.topics.publish(RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B"))
+        topic = PeerTopic(self.topics, RemoteTopic(peer=1, wire=CMD, name=CMD.topic, node=CMD.node, type="a/B"))
+        self.proxies.hold(CMD.node, CMD, topic.ready, topic.left)
         await asyncio.sleep(0.01)
         publication = self.topics.publication(CMD)
         assert publication is not None
