@@ -94,7 +94,7 @@ async def test_a_failed_trial_leaves_nothing_open(monkeypatch: pytest.MonkeyPatc
     async def refuse(*_: object) -> None:
         raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
 
-    monkeypatch.setattr(shared_listener, "_test_address", refuse)
+    monkeypatch.setattr(shared_listener.SharedListener, "_test_address", refuse)
     nodes = ProxyNodes(core())
     await nodes.start()
     assert "Connection refused" in nodes.listening
