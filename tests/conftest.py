@@ -33,6 +33,8 @@ _PROBES: Final = {
 _TESTS: Final = Path(__file__).parent
 _ROOMS: Final = {"core", "runtime", "discovery", "mesh", "ros", "bridge", "resource"}
 """Rooms whose coroutine tests fail when code of rmpa blocks the event loop."""
+_TAKEN: Final = ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET", "PYTHONPATH", "SUDO_UID")
+"""Settings of the user that no test may depend on, beside those of ROS and rmpa."""
 _numbers = itertools.count(1)
 # Hypothesis has chosen its profile by now ("ci" where the variable CI is set), and tests take the rest from it. On a
 # loaded machine an example takes any time: pytest's time-out bounds a test.
@@ -125,5 +127,5 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None
     """Take the user's ROS and rmpa settings away, so that no test depends on them; nothing is kept in his home."""
     monkeypatch.setenv("XDG_STATE_HOME", str(state_home / str(next(_numbers))))
     for name in list(os.environ):
-        if name.startswith(("ROS_", "RMPA_")) or name in ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET", "SUDO_UID"):
+        if name.startswith(("ROS_", "RMPA_")) or name in _TAKEN:
             monkeypatch.delenv(name)
