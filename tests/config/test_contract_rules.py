@@ -200,6 +200,8 @@ RULE = '[[contract]]\ntopics = ["/a"]\n'
         (RULE + "deadline = 2026-01-01", "3: contract.deadline: datetime.date(2026, 1, 1) is not a duration"),
         (RULE + "lifespan = '5 sec'", "3: contract.lifespan: '5 sec' is not a duration; a lifespan is seconds as a"),
         (RULE + "lifespan = 86401", "3: contract.lifespan: 86401 is out of range; a lifespan is between 0.001 and "),
+        (RULE + f"max_rate = {'9' * 400}", "3: contract.max_rate: 99999999"),
+        (RULE + f"deadline = -{'9' * 400}", "3: contract.deadline: -9999999"),
         (RULE + "max_rate = 0", "3: contract.max_rate: 0 is out of range; a rate is between 0.001 and 1000000 Hz; "),
         (RULE + "max_rate = '100 ms'", "3: contract.max_rate: '100 ms' is a duration, not a rate; did you mean"),
         (RULE + "max_rate = 'fast'", "3: contract.max_rate: 'fast' is not a rate; a rate is messages a second as a"),

@@ -226,6 +226,7 @@ _BYTES: Final = {"b": 1, "kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 1024, "mib": 10
     "gbit": 125e6,
 }
 """By unit: so many bytes it is."""
+_HUGE: Final = 1 << 63
 _INFINITE: Final = "infinite"
 """ROS 2's own word for a duration without a bound; it lifts the bound that an earlier rule has set."""
 _UNLIMITED: Final = "unlimited"
@@ -235,9 +236,10 @@ _UNLIMITED: Final = "unlimited"
 def _quantity(raw: object, what: str, example: str, endless: str) -> tuple[float, str]:
     """The number and the unit (in lower case; empty for a plain number); infinite for the word for no bound."""
     if not isinstance(raw, str):
-        if isinstance(raw, bool) or not isinstance(raw, int | float) or math.isnan(raw):
+        if isinstance(raw, bool) or not isinstance(raw, int | float) or raw != raw:  # noqa: PLR0124 - NaN
             raise BadValue(f"{shown(raw)} is not {what}", example)
-        return float(raw), ""  # TOML's whole numbers have 64 bits
+        # A whole number of hundreds of digits has no float; what is out of every range stays so.
+        return float(max(-_HUGE, min(raw, _HUGE)) if isinstance(raw, int) else raw), ""
     text = raw.strip().lower()
     match = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*([a-zµ]+(?:/s)?)", text)
     if text != endless and not match:
