@@ -27,10 +27,9 @@ from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.process import notify_service_manager
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 
     from rmpa.config.read import Loaded
-    from rmpa.config.schema import Setting
     from rmpa.config.settings import Settings
 
 WEB_RESTART_FIRST: Final = 0.5
@@ -98,7 +97,8 @@ class Reloader:
             return reply
 
     def _compare(self, loaded: Loaded) -> ReloadReply:
-        differences = list(_differences(self._settings, loaded.settings))
+        values = [(each, each.value_in(self._settings), each.value_in(loaded.settings)) for each in SETTINGS]
+        differences = [(setting, old, new) for setting, old, new in values if old != new]
         return ReloadReply(
             file=str(loaded.settings.config_file or ""),
             changed=tuple(setting.title for setting, _, _ in differences if setting.live),
@@ -154,14 +154,6 @@ def has_terminal() -> bool:
     except OSError:
         return False
     return True
-
-
-def _differences(old: Settings, new: Settings) -> Iterator[tuple[Setting, object, object]]:
-    """``(setting, old value, new value)`` of each that differs."""
-    for setting in SETTINGS:
-        before, after = setting.value_in(old), setting.value_in(new)
-        if before != after:
-            yield setting, before, after
 
 
 def _taken(name: str, old: Any, new: Any) -> Any:
@@ -266,34 +258,26 @@ class WebProcess:
             await asyncio.sleep(delay)
 
     async def _run(self) -> int:
-        process = await asyncio.to_thread(self._spawn)
+        # In a session of its own Ctrl-C does not reach it: it ends with the agent, and not before.
+        process = await asyncio.to_thread(
+            lambda: subprocess.Popen(  # noqa: S603 - our own program
+                self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environ
+            )
+        )
         try:
             self.pid = process.pid
             await _ended(process.pid)
-        except asyncio.CancelledError:
-            await self._end(process)
-            raise
         finally:
             self.pid = None
             if process.stdin is not None:
                 process.stdin.close()
-        return process.wait()
-
-    def _spawn(self) -> subprocess.Popen[bytes]:
-        # In a session of its own Ctrl-C does not reach it: it ends with the agent, and not before.
-        return subprocess.Popen(  # noqa: S603 - our own program
-            self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environ
-        )
-
-    async def _end(self, process: subprocess.Popen[bytes]) -> None:
-        if process.stdin is not None:
-            process.stdin.close()
-        try:
-            async with asyncio.timeout(WEB_END_TIMEOUT):
-                await _ended(process.pid)
-        except TimeoutError:
-            process.kill()
-        process.wait()
+            try:
+                async with asyncio.timeout(WEB_END_TIMEOUT):
+                    await _ended(process.pid)
+            except TimeoutError:
+                process.kill()
+            process.wait()
+        return process.returncode
 
 
 async def _ended(pid: int) -> None:

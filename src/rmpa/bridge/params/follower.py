@@ -43,7 +43,7 @@ class Followed:
         had: Whether this run of the owner has had a value. Before that, an absent value does not delete the one here.
         due: Whether the local core is to be compared with the owner's value, and set.
         told: Whether the owner's value has come since the last comparison; else what differs was changed here.
-        doubted: Whether the local core has reported a change of it since the last comparison.
+        doubted: Whether the local core has reported a change of it since the last comparison, or that has failed.
         problem: Why it is not followed, or empty.
     """
 
@@ -142,11 +142,11 @@ class Params(Part):
 
     async def close(self) -> None:
         """End all tasks, and unsubscribe from the local core, which may live on; the values stay there."""
-        tasks = [task for task in (self._looking, self._working, *self._asking.values()) if task is not None]
+        found = (self._looking, self._working, *self._asking.values(), *self.owner.tasks())
+        tasks = [task for task in found if task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await self.owner.close()
         with contextlib.suppress(RmpaError, TimeoutError):
             async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
                 await self._core.leave_others(set())
@@ -269,14 +269,12 @@ class Params(Part):
 
     async def _work(self) -> None:
         """Set the values that are due; ``look`` tries again what failed."""
-        failed: set[FollowRule] = set()
         try:
-            while todo := [entry for entry in self.followed if entry.due and entry.rule not in failed]:
+            while todo := [entry for entry in self.followed if entry.due]:
                 for entry in todo:
                     try:
                         await self._apply(entry)
                     except RmpaError as error:
-                        failed.add(entry.rule)
                         entry.problem = str(error)
                         self._refuse("param.failed", str(entry.rule), f"{entry.rule} is not as over there: {error}")
         except Exception:  # noqa: BLE001 - a task's top
@@ -302,7 +300,8 @@ class Params(Part):
             entry.text, entry.known = None, False
             raise
         except RmpaError:
-            entry.due, entry.told = True, told
+            entry.doubted = True
+            entry.told = entry.told or told
             raise
         entry.problem = ""
 

@@ -6,7 +6,6 @@ The parameters of the local core as XML-RPC text; long values are converted with
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -197,8 +196,7 @@ class _Follower:
         session: The peer.
         asker: The same, for its permissions.
         keys: What it follows.
-        told: The mark (``_mark``) of the value that it was told last of each key.
-        changed: The keys of which it is to be told.
+        told: The mark (``_mark``) of the value that it was told last of each key; it is told of keys without one.
         task: Tells it.
     """
 
@@ -206,7 +204,6 @@ class _Follower:
     asker: _Asker
     keys: set[str] = field(default_factory=set)
     told: dict[str, int] = field(default_factory=dict)
-    changed: set[str] = field(default_factory=set)
     task: asyncio.Task[None] | None = None
 
 
@@ -267,15 +264,17 @@ class ParamOwner:
             restarted: Whether the core was restarted: it has none of the subscriptions.
         """
         for key in self.followed:
-            followers = [one for one in self._followers.values() if key in one.keys]
             await self._core.follow(key)
-            changed = followers if restarted else []
-            if not restarted and any(one.told.get(key) for one in followers):
-                with contextlib.suppress(LocalProtocolError):  # too large, which was reported when it was told
+            compared = [one for one in self._followers.values() if restarted or one.told.get(key)]
+            mark = None
+            if compared and not restarted:
+                try:
                     mark = _mark(await self._core.get_text(key))
-                    changed = [one for one in followers if one.told.get(key, 0) not in {0, mark}]
-            for one in changed:
-                self._tell_soon(one, {key})
+                except LocalProtocolError:  # too large, which was reported when it was told
+                    continue
+            for one in compared:
+                if one.told.get(key) != mark:
+                    self._tell_soon(one, {key})
         for one in self._followers.values():
             self._tell_soon(one, set())  # what could not be told
 
@@ -284,12 +283,9 @@ class ParamOwner:
         for one in self._followers.values():
             self._tell_soon(one, {key for key in one.keys if self._why_not_follow(one.asker, key)})
 
-    async def close(self) -> None:
-        """Stop telling peers."""
-        tasks = [one.task for one in self._followers.values() if one.task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    def tasks(self) -> Iterable[asyncio.Task[None] | None]:
+        """Those that tell peers."""
+        return (follower.task for follower in self._followers.values())
 
     # --- requests -----------------------------------------------------------------------------------------------
 
@@ -372,16 +368,15 @@ class ParamOwner:
         follower.keys = wanted
         for key in wanted:
             await self._core.follow(key)
-        self._tell_soon(follower, wanted)
+        follower.told = {}
+        self._tell_soon(follower, set())
         return {"refused": refused}
 
     def _why_not_get(self, key: str, value: XmlRpcValue) -> str:
-        names: Iterable[str] = (key,)
-        if isinstance(value, dict):
-            if _ALL & {*self._settings.params.remote_get}:
-                return ""
-            names = (name for name, _ in yielding_to_data(leaves(key, value))) if value else names
-        return next((why for name in names if (why := why_not_get(self._settings, name))), "")
+        if _ALL & {*self._settings.params.remote_get}:
+            return ""
+        names = yielding_to_data(leaves(key, value or None))  # an empty namespace is judged by its own name
+        return next((why for name, _ in names if (why := why_not_get(self._settings, name))), "")
 
     def _why_not_follow(self, asker: _Asker, key: str) -> str:
         return why_not_follow(self._settings, key) or self._why_denied(asker, key)
@@ -401,8 +396,7 @@ class ParamOwner:
         """Why the permissions do not let a peer have a parameter, or all of a namespace; empty if they do."""
         if not self._gate.on:
             return ""
-        names = [name for name, _ in leaves(key, value)] if isinstance(value, dict) and value else [key]
-        for name in yielding_to_data(names):
+        for name, _ in yielding_to_data(leaves(key, value or None)):
             decision, whose = self._judge(asker, name)
             if not decision.allowed:
                 self._gate.refused(Access.PARAM, whose, name, decision)
@@ -420,20 +414,21 @@ class ParamOwner:
     # --- telling the followers -----------------------------------------------------------------------------------
 
     def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
-        follower.changed |= keys
-        if follower.changed and follower.task is None:
+        for key in keys:
+            follower.told.pop(key, None)
+        if follower.task is None and not follower.keys <= follower.told.keys():
             name = f"tell {follower.session.link.name} of parameters"
             follower.task = asyncio.create_task(self._tell(follower), name=name)
 
     async def _tell(self, follower: _Follower) -> None:
         """Tell a peer the present values of what has changed, one after the other; what fails is left to ``look``."""
         try:
-            while follower.changed:
+            while not follower.keys <= follower.told.keys():
                 await asyncio.sleep(limits.PARAM_GATHER)
-                for key in list(follower.changed):
-                    follower.changed.discard(key)  # before it is read: it may change meanwhile
+                for key in follower.keys - follower.told.keys():
+                    follower.told[key] = 0  # before it is read: a change meanwhile takes the mark away
                     if key in follower.keys and not await self._tell_one(follower, key):
-                        follower.changed.add(key)
+                        follower.told.pop(key, None)
                         return
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! telling peers of parameters failed")
@@ -462,7 +457,8 @@ class ParamOwner:
         except RmpaError as error:
             _log.warning("! %s is not told of %s: %s", follower.session.link.name, key, error)
             return False
-        follower.told[key] = _mark(text)
+        if key in follower.told:
+            follower.told[key] = _mark(text)
         return True
 
 

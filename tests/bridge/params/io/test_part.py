@@ -484,19 +484,30 @@ async def test_a_core_that_is_started_anew_gets_all_of_it_again(sides: Any) -> N
     await until(lambda: pad.core.get("/arm") == 2)
 
 
+@pytest.mark.parametrize("value", [1, "x" * 9000], ids=["small", "large"])
 async def test_what_the_core_did_not_take_at_once_is_not_taken_for_a_change_of_a_node_here(
-    sides: Any, caplog: pytest.LogCaptureFixture
+    sides: Any, caplog: pytest.LogCaptureFixture, value: XmlRpcValue
 ) -> None:
     base, pad = Side("base"), Side("pad", follows(ARM))
     sides(base, pad)
-    base.core.set("/arm", 1)
+    base.core.set("/arm", value)
     pad.core.down = True
     join(base, pad)
     await until(lambda: pad.states() == {"/arm": "refused"})
     pad.core.down = False
     await pad.look()
-    assert pad.core.get("/arm") == 1
+    assert pad.core.get("/arm") == value
     assert "put back" not in caplog.text
+
+
+async def test_what_a_peer_no_longer_follows_is_forgotten(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad")
+    sides(base, pad)
+    join(base, pad)
+    for number in range(3):
+        await pad.ask(transfer.FOLLOW, {"keys": [f"/p{number}"]})
+        await until(lambda: base.params.owner._followers[1].task is None)
+    assert base.params.owner._followers[1].told.keys() == {"/p2"}
 
 
 async def test_a_lost_notification_is_noticed(sides: Any) -> None:
