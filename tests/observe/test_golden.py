@@ -69,12 +69,12 @@ def with_peers(*peers: PeerInfo) -> Snapshot:
     return msgspec.structs.replace(SNAPSHOT, peers=peers, notes=())
 
 
-def with_stuck() -> Snapshot:
-    """A direct topic; another one whose subscriber has to be relayed and cannot be moved."""
-    caught = {"state": "relayed", "condition": "name", "text": "it has another name there", "stuck": "not permitted"}
-    stuck = msgspec.structs.replace(DIRECT, subscribers=(msgspec.structs.replace(VIEWER, **caught),))
+def with_misplaced() -> Snapshot:
+    """A direct topic; another one whose subscriber is direct and has to be relayed."""
+    caught = {"state": "relayed", "condition": "name", "text": "it has another name there"}
+    misplaced = msgspec.structs.replace(DIRECT, subscribers=(msgspec.structs.replace(VIEWER, **caught),))
     cmd, odom = SNAPSHOT.topics
-    topics = (msgspec.structs.replace(cmd, routes=(DIRECT,)), msgspec.structs.replace(odom, routes=(stuck,)))
+    topics = (msgspec.structs.replace(cmd, routes=(DIRECT,)), msgspec.structs.replace(odom, routes=(misplaced,)))
     return msgspec.structs.replace(with_peers(JOYSTICK), topics=topics)
 
 
@@ -94,7 +94,7 @@ def findings() -> Iterator[Check]:
         "few": with_files(near=True),
         "none": with_files(near=True, problem="node /x is refused: none left; raise it"),
         "alone": with_peers(),
-        "stuck": with_stuck(),
+        "misplaced": with_misplaced(),
         "refused": with_peers(msgspec.structs.replace(PC, state="refused", conflicts=("no remedy",), last_error="")),
     }
     yield from judge_agents(shown, "0.1.0")
@@ -217,7 +217,7 @@ def snapshots() -> Iterator[Snapshot]:
         out = msgspec.structs.replace(route, direction="out", state="away", kept=7, node="/mine")
         topics = (msgspec.structs.replace(topic, routes=(route, healthy, out)),)
         yield msgspec.structs.replace(with_peers(JOYSTICK, PC), topics=topics)
-    yield with_stuck()
+    yield with_misplaced()
     refused = msgspec.structs.replace(SNAPSHOT.topics[1], mismatches=("pc/viewer wants another md5",))
     gone = UnreachableInfo(node="/odd", uri="http://nosuch:1/", problem="no such name", ago=20.0, withdrawn=True)
     called = ServiceInfo(name="/add", node="/adder", direction="in", peer="joystick", calls=3, type="a/Add")

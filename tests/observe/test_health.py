@@ -323,9 +323,9 @@ def test_direct_and_relayed_subscribers_share_a_status() -> None:
         ({"wanted": "direct", "condition": "transport"}, DiagnosticLevel.OK, "10.0 Hz, 0.41 ms"),
         ({"wanted": "direct", "condition": "measures"}, DiagnosticLevel.OK, "10.0 Hz, 0.41 ms"),
         (
-            {"wanted": "auto", "transport": "direct", "endpoint": "10.0.0.2:41234", "stuck": "not permitted"},
+            {"wanted": "auto", "transport": "direct", "endpoint": "10.0.0.2:41234"},
             DiagnosticLevel.WARN,
-            "direct to 10.0.0.2:41234 for /viewer, has to be relayed, but its connection cannot be ended",
+            "direct to 10.0.0.2:41234 for /viewer, has to be relayed: no way",
         ),
     ],
 )

@@ -7,11 +7,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from rmpa.observe.why.diagnosis import fallbacks, route_texts, stuck, subscriber_text
+from rmpa.observe.why.diagnosis import misplaced, route_texts, subscriber_text
 from tests.observe.samples import DIRECT, VIEWER
 
 SAID = "a node /viewer of another module is connected already"
-STUCK = "its connection cannot be ended (Operation not permitted)"
 RELAYED: dict[str, Any] = {"transport": "relay", "state": "relayed", "condition": "caller_id", "text": SAID}
 WHY = f"{SAID} (condition caller_id)"
 
@@ -24,11 +23,7 @@ WHY = f"{SAID} (condition caller_id)"
         (RELAYED | {"transport": ""}, f"relayed for /viewer, once it connects: {WHY}"),
         (
             RELAYED | {"transport": "direct"},
-            f"direct to 10.0.0.2:41234 for /viewer, is moved to the relayed transport: {WHY}",
-        ),
-        (
-            RELAYED | {"transport": "direct", "stuck": "Operation not permitted"},
-            f"direct to 10.0.0.2:41234 for /viewer, has to be relayed, but {STUCK}: {WHY}",
+            f"direct to 10.0.0.2:41234 for /viewer, has to be relayed: {WHY}",
         ),
         (
             {"transport": "relay", "state": "asking"},
@@ -69,9 +64,9 @@ def test_a_topic_that_is_relayed_by_rule_says_so() -> None:
 )
 def test_only_a_direct_contract_that_falls_back_is_warned_of(wanted: str, condition: str, warned: bool) -> None:
     one = msgspec.structs.replace(VIEWER, **(RELAYED | {"wanted": wanted, "condition": condition}))
-    assert bool(fallbacks(msgspec.structs.replace(DIRECT, subscribers=(one, VIEWER)))) is warned
+    assert bool(misplaced(msgspec.structs.replace(DIRECT, subscribers=(one, VIEWER)))) is warned
 
 
-def test_a_subscriber_that_cannot_be_moved_is_stuck() -> None:
-    one = msgspec.structs.replace(VIEWER, stuck="Operation not permitted")
-    assert stuck(msgspec.structs.replace(DIRECT, subscribers=(VIEWER, one))) == [one]
+def test_a_subscriber_that_is_direct_and_has_to_be_relayed_is_warned_of() -> None:
+    one = msgspec.structs.replace(VIEWER, **(RELAYED | {"transport": "direct", "condition": "transport"}))
+    assert misplaced(msgspec.structs.replace(DIRECT, subscribers=(VIEWER, one))) == [one]

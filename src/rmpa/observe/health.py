@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import remedy
 from rmpa.observe import limits
 from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
-from rmpa.observe.why.diagnosis import BY_RULE, fallbacks, stuck, subscriber_text
+from rmpa.observe.why.diagnosis import BY_RULE, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import (
     ARRAY_TYPE,
@@ -388,7 +388,7 @@ def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple
         return FAIL, "; ".join(topic.mismatches)
     if route.problem:
         return WARN, route.problem
-    if troubled := [*stuck(route), *fallbacks(route)]:
+    if troubled := misplaced(route):
         return WARN, "; ".join(subscriber_text(one) for one in troubled)
     deadline = route.contract.get("deadline")
     if isinstance(deadline, float) and route.age is not None and route.age > deadline:

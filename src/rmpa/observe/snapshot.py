@@ -170,7 +170,6 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
             lost. What was published meanwhile is lost, and not counted.
         interrupted: How long the last of these lasted, or lasts, in seconds.
         interrupted_ago: Seconds since it was over; ``None`` while it lasts.
-        stuck: Why its direct connection cannot be ended although it has to be relayed; empty: nothing is wrong.
     """
 
     node: str
@@ -184,7 +183,6 @@ class SubscriberTransport(msgspec.Struct, kw_only=True, frozen=True):
     interruptions: int = 0
     interrupted: float | None = None
     interrupted_ago: float | None = None
-    stuck: str = ""
 
 
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):

@@ -169,7 +169,6 @@ def _subscriber(path: Path[RemoteTopic], now: float) -> SubscriberTransport:
         endpoint=f"{endpoint[0]}:{endpoint[1]}" if endpoint is not None else "",
         condition=unmet.condition.value if unmet is not None else "",
         text=unmet.text if unmet is not None else "",
-        stuck=path.stuck,
     )
 
 

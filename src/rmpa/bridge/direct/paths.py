@@ -62,7 +62,6 @@ class Path(Generic[EntryT]):
         since: When it was made, monotonic seconds.
         place: Where it is connected: ``AGENTS``, an address and port, or ``LOST``; ``None``: nowhere, by itself.
         placed_at: When ``place`` was set, monotonic seconds.
-        stuck: Why its direct connection cannot be ended although it has to be relayed; empty: it can.
         mover: Moves the subscriber.
     """
 
@@ -80,7 +79,6 @@ class Path(Generic[EntryT]):
     since: float = 0.0
     place: tuple[str, int] | None = None
     placed_at: float = 0.0
-    stuck: str = ""
     mover: asyncio.Task[None] | None = None
 
     @property

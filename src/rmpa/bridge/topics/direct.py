@@ -295,8 +295,6 @@ class TopicPaths(Paths["RemoteTopic"]):
     def _put(self, path: TopicPath, place: tuple[str, int], at: float | None = None) -> None:
         """Note where a subscriber is now; one that is lost is interrupted until it is somewhere again."""
         path.place, path.placed_at = place, self._now() if at is None else at
-        if place in {LOST, AGENTS, path.target}:
-            path.stuck = ""
         self._interrupted(path, lasts=place is LOST)
         self._place(path)
         self._watch()
@@ -368,10 +366,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         return f"{path.entry.wire} to {path.want.user}"
 
     def _decided(self, path: TopicPath) -> None:
-        if path.endpoint == path.target:
-            path.stuck = ""
-            if path.endpoint is not None:
-                self._interrupted(path, lasts=False)
+        if path.endpoint == path.target is not None:
+            self._interrupted(path, lasts=False)
         self._place(path)
         self._watch()
 
@@ -415,7 +411,7 @@ class TopicPaths(Paths["RemoteTopic"]):
         A second connection would double messages.
 
         Returns:
-            The other end of one that stays: it is ``keep``, its node is stopped, or it cannot be ended (``stuck``).
+            The other end of one that stays: it is ``keep``, its node is stopped, or it cannot be ended.
         """
         uri, topic, proxy = self._uri(path), path.want.name, path.session.proxies.get(path.want.node)
         address = (path.endpoint or (path.session.address,))[0]  # the peer may have another one by now
@@ -440,7 +436,7 @@ class TopicPaths(Paths["RemoteTopic"]):
                 return end
             if problem := await end_link(link):
                 if end != path.target:  # it may be allowed again meanwhile
-                    self._warn_stuck(path, end, problem)
+                    self._warn(path, end, problem)
                 return end
         return None
 
@@ -457,9 +453,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         if not self._closed and path.mover is None:
             self._spawn(self._list(path), f"call back {path.want.user}")
 
-    def _warn_stuck(self, path: TopicPath, endpoint: tuple[str, int], problem: str) -> None:
+    def _warn(self, path: TopicPath, endpoint: tuple[str, int], problem: str) -> None:
         source, user = path.entry.wire, path.want.user
-        path.stuck = problem
         text = (
             f"{source}: {user} stays connected to {endpoint[0]}:{endpoint[1]}: a rospy subscriber leaves only when "
             f"its connection is ended, and this agent may not do that ({problem}); see rmpa doctor"
@@ -479,10 +474,10 @@ class TopicPaths(Paths["RemoteTopic"]):
         self._watch()
         settled: list[tuple[TopicPath, tuple[str, int]]] = []
         for path in self:
-            if not path.stuck:
-                self._place(path)
-            is_settled = path.mover is None and self._now() - path.placed_at > limits.DIRECT_SETTLE
-            if path.endpoint is not None and is_settled:
+            if self._now() - path.placed_at <= limits.DIRECT_SETTLE:
+                continue
+            self._place(path)
+            if path.endpoint is not None and path.mover is None:
                 settled.append((path, path.endpoint))
         wanted = Counter(endpoint for _, endpoint in settled)
         there = {address: standing(address) for address in {endpoint[0] for endpoint in wanted}}

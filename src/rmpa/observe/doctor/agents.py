@@ -18,7 +18,7 @@ from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
 from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.observe.why.diagnosis import fallbacks, stuck, subscriber_text
+from rmpa.observe.why.diagnosis import misplaced, subscriber_text
 from rmpa.observe.why.diagnosis import remedy as remedy_for
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime.kernel_tcp import listening_sockets
@@ -116,7 +116,7 @@ def _transport(snapshot: Snapshot) -> Iterator[Check]:
     """Subscribers that are relayed although a contract says "direct", or are direct although they must not be."""
     for topic in snapshot.topics:
         for route in topic.routes:
-            for one in (*stuck(route), *fallbacks(route)):
+            for one in misplaced(route):
                 text = f"of {route.peer}: {subscriber_text(one)}"
                 yield Check("transport", WARN, text, remedy_for(one), where=topic.name)
 

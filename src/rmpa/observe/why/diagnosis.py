@@ -273,7 +273,9 @@ _REMEDIES: Final = {
 REMEDY: Final = "docs/contracts.md explains the conditions"
 UNMEASURED: Final = "not measured: the nodes are connected directly"
 """In place of figures."""
-STUCK_REMEDY: Final = "give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
+_STAYS_DIRECT: Final = (
+    "if it stays so, give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
+)
 _WAITS: Final = {
     "asking": "the peer's agent is asked for a direct connection, and its node is tried",
     "direct": "it may connect directly, and has not asked for the topic yet",
@@ -297,11 +299,7 @@ def subscriber_text(one: SubscriberTransport, since: str = "") -> str:
         return f"direct for {node}, to port {one.endpoint} of this machine"
     if one.transport == "direct":
         text = f"direct to {one.endpoint} for {node}"
-        if one.stuck:
-            return f"{text}, has to be relayed, but its connection cannot be ended ({one.stuck}): {reason}"
-        if one.state == "relayed":
-            return f"{text}, is moved to the relayed transport: {reason}"
-        return text
+        return f"{text}, has to be relayed: {reason}" if one.state == "relayed" else text
     if one.transport == "relay":
         return f"relayed for {node}: {reason or _MOVES.get(one.state, one.state)}"
     if one.state == "relayed":
@@ -319,22 +317,21 @@ def route_texts(route: RouteInfo) -> list[str]:
 
 
 def remedy(one: SubscriberTransport) -> str:
-    """What to do about a subscriber that is relayed, or cannot be."""
-    return STUCK_REMEDY if one.stuck else _REMEDIES.get(one.condition, REMEDY)
+    """What to do about a subscriber that is relayed, or has to be."""
+    return _STAYS_DIRECT if one.transport == "direct" else _REMEDIES.get(one.condition, REMEDY)
 
 
-def fallbacks(route: RouteInfo) -> list[SubscriberTransport]:
-    """The subscribers that are relayed although their module's contract says ``direct``; without those by rule."""
+def misplaced(route: RouteInfo) -> list[SubscriberTransport]:
+    """The subscribers that are direct and have to be relayed, or relayed although their contract says ``direct``.
+
+    Without those that are relayed by a rule, or because RMPA's own tools measure.
+    """
     return [
         one
         for one in route.subscribers
-        if one.wanted == "direct" and one.state == "relayed" and one.condition not in {BY_RULE, BY_TOOL}
+        if one.state == "relayed"
+        and (one.transport == "direct" or (one.wanted == "direct" and one.condition not in {BY_RULE, BY_TOOL}))
     ]
-
-
-def stuck(route: RouteInfo) -> list[SubscriberTransport]:
-    """The subscribers whose direct connection cannot be ended although they have to be relayed."""
-    return [one for one in route.subscribers if one.stuck]
 
 
 # The stages of ``rmpa why`` for subscribers that are connected to the publisher directly. Pure.
@@ -350,8 +347,7 @@ def connected_directly(route: RouteInfo) -> list[SubscriberTransport]:
 def transport(route: RouteInfo) -> Check:
     """The transport of each subscriber, and by which condition it is relayed. It is never the stage that fails."""
     text = "; ".join(route_texts(route)) or "relayed"
-    troubled = [*stuck(route), *fallbacks(route)]
-    if troubled:
+    if troubled := misplaced(route):
         return Check("transport", WARN, text, remedy(troubled[0]))
     return Check("transport", OK, text)
 

@@ -84,7 +84,7 @@ const Route = memo(({ route, own }) => {
 
 // A subscriber of a route where its transport is known: the agents see no message of direct ones.
 const Subscriber = ({ one }) => {
-  const said = [one.condition && one.text, one.stuck && `cannot be moved: ${one.stuck}`, one.transport === "direct" && "not measured: the nodes are connected directly", one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
+  const said = [one.condition && one.text, one.transport === "direct" && "not measured: the nodes are connected directly", one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
   return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">–</td>
     <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">–</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
 };
