@@ -27,6 +27,10 @@ def test_a_source_that_is_shown_again_at_once_is_not_left_by_the_list_of_its_end
     DirectScenario(1154).play()
 
 
+def test_a_release_that_was_lost_with_its_link_is_made_again() -> None:
+    DirectScenario(416).play()
+
+
 def test_a_seed_replays_exactly() -> None:
     assert DirectScenario(7).play() == DirectScenario(7).play()
 

@@ -175,8 +175,7 @@ DIRECT_MAX: Final = 1024
 """Direct connections that one peer may have to publishers of this module, and as many to its services."""
 DIRECT_ADOPT: Final = 10.0
 """Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
-direct connection from an earlier run of the agent. Likewise the seconds that a peer has, after a new link, to ask
-again for what it uses."""
+direct connection from an earlier run of the agent."""
 DIRECT_KEEP: Final = 30.0
 """Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
 (``core.limits.RESUME_WINDOW``)."""

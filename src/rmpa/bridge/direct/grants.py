@@ -212,16 +212,9 @@ class Grants:
                 self._tell(session, asked.want)
 
     def link_up(self, session: PeerSession) -> None:
-        """Let a peer ask again for what it uses; what it was granted over an earlier link ends a little later."""
-        before = [asked for _, asked, _ in self._asked.get(session.peer, {}).values()]
-        if before:
-            asyncio.get_running_loop().call_later(limits.DIRECT_ADOPT, self._expire, session, before)
-
-    def _expire(self, session: PeerSession, before: list[DirectAsk]) -> None:
-        for asked in before:
-            entry = self._asked.get(session.peer, {}).get(asked.want)
-            if entry is not None and entry[1] is asked:
-                self._set(session, asked, None)
+        """Have a peer ask again for what it asked for over an earlier link, or release it."""
+        for want in self._asked.get(session.peer, ()):
+            self._tell(session, want)
 
     def link_down(self, session: PeerSession) -> None:
         """Forget what a peer asked for, and end its connections if it is silent; unless only its agent has died.

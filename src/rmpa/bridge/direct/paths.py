@@ -217,8 +217,12 @@ class Paths(Generic[EntryT]):
         self.update(path)
 
     def _asked_again(self, session: PeerSession, args: dict[str, Any]) -> None:
-        path = self.get(session.peer, read_ask(args).want)
-        if path is not None and path.found is not _UNSTABLE:
+        want = read_ask(args).want
+        path = self.get(session.peer, want)
+        if path is None:
+            self._shared.rpc.notify(session, f"direct.{self.kind}_release", want._asdict())
+        elif path.found is not _UNSTABLE:
+            path.held = True  # an earlier release may have been lost with its link
             self.update(path, pause=path.asked_at + limits.DIRECT_RETRY_PAUSE - self._now())
 
     def _retry(self, path: Path[EntryT]) -> None:

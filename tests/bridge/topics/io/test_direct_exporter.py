@@ -289,17 +289,13 @@ async def test_only_the_crash_of_a_peers_agent_leaves_its_grants_until_it_is_gon
     assert module.granted == []
 
 
-async def test_what_a_peer_does_not_ask_for_after_a_new_link_ends(
-    module: Module, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "DIRECT_ADOPT", 0.02)
+async def test_over_a_new_link_a_peer_is_told_to_ask_again_for_what_it_asked_for_before(module: Module) -> None:
     await module.open()
-    await module.open(subscriber="/logger")
     module.sessions[1].link.crashed = True
     module.sut.link_down(module.sessions[1])
     module.sut.link_up(module.sessions[1])
-    await module.open(subscriber="/logger")
-    await until(lambda: module.granted == [(1, "/logger")])
+    assert [told[:2] for told in module.told] == [(1, AGAIN)]
+    assert module.granted == [(1, "/viewer")]
 
 
 async def test_what_is_released_while_the_node_is_asked_is_not_granted(module: Module) -> None:

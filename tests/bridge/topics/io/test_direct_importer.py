@@ -310,6 +310,11 @@ async def test_a_subscriber_that_ends_frees_its_grant(module: Module) -> None:
     assert list(module.sut) == []
 
 
+async def test_a_grant_that_has_no_use_any_more_is_released(module: Module) -> None:
+    module.sut._asked_again(module.session, {"name": "/chatter", "node": "/talker", "user": "/gone"})
+    assert module.told == ["direct.topic_release"]
+
+
 async def test_a_subscriber_that_the_next_agent_relays_has_lost_its_direct_connection_before(module: Module) -> None:
     module.sut.shown(module.entry)
     assert await module.ask() == DIRECT
