@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge import limits
+from rmpa.bridge import graph_part, limits
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import ContractRule, History, Reliability
@@ -113,6 +113,33 @@ def accounted(world: World, speaker: Speaker, listener: Listener) -> int:
     assert lost_at_sender(a) == missing
     assert unknown_at_receiver(b) == 0
     return missing
+
+
+def test_the_end_of_a_link_is_taken_in_before_the_next_link_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a pause for data between two routes the peer's new link may stand."""
+
+    async def scene(world: World) -> None:
+        speaker, listener = await begin(world)
+        ending = True
+
+        def data() -> None:
+            nonlocal ending
+            if ending:
+                ending = False
+                world.link()
+
+        world.cut()
+        with monkeypatch.context() as patched:
+            patched.setattr(graph_part, "yield_to_data", data)
+            world.notice(0, silent=True)
+            world.notice(1, silent=True)
+        if ending:
+            world.link()
+        await talk(world, speaker, 2.0)
+        await settled(world)
+        assert accounted(world, speaker, listener) == 0
+
+    play(5, scene)
 
 
 # --- one outage ---------------------------------------------------------------------------------------------

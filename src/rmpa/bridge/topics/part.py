@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.data.quality import shown_seconds
@@ -126,10 +126,11 @@ class Topics(GraphPart, TopicEvents):
             # Best-effort messages published until the next link get no sequence: their loss cannot be counted.
             self._shared.counters.add("route.interrupted", interrupted)
         self._subscribers.link_down(peer)
-        self.run(self.exports.link_away(peer))
+        # Without a pause for data: among it could be the peer's new link, which must find all routes suspended.
+        deque(self.exports.link_away(peer), 0)
         if session.link.silent:
             # Most silences end soon with a new link, so nothing leaves the local graph yet.
-            self.run(self.imports.link_away(peer, briefly=True))
+            deque(self.imports.link_away(peer, briefly=True), 0)
 
     def grace_over(self, session: PeerSession) -> bool:
         """Drop the peer's sources that do not outlive their link; return whether any route waits for the peer."""
@@ -137,7 +138,7 @@ class Topics(GraphPart, TopicEvents):
         if not self.exports.waits_for(peer) and not self.imports.waits_for(peer):
             self.imports.detached(peer)
             return False
-        self.run(self.imports.link_away(peer))
+        deque(self.imports.link_away(peer), 0)  # without a pause, as in ``link_down``
         longest = max(*self.imports.outages(peer), self.exports.outage(peer), 0.0)
         _log.info("= %s is away: its reliable topics wait for %s", session.link.name, shown_seconds(longest))
         return True
