@@ -55,7 +55,7 @@ class Held:
     Args:
         at: Seconds since the soak began.
         rss: Resident bytes.
-        fds: Open file descriptors.
+        fds: Open file descriptors, without those of lanes: a bulk lane keeps its own until the link ends.
         sockets: Of these, sockets.
         threads: Of its process.
         tasks: asyncio's, by the name of their coroutine.
@@ -87,12 +87,13 @@ def look(agent: Agent, at: float) -> Held:
     eventually(path.exists, what=f"what {agent.name} holds", every=0.01)
     snapshot = ask(agent)
     routes = [route for topic in snapshot.topics for route in topic.routes if route.state == "open"]
-    fds = _open_files(agent.pid)
+    links = [peer.link for peer in snapshot.peers if peer.link is not None]
+    fds, lanes = _open_files(agent.pid), sum(lane.connected for link in links for lane in link.lanes)
     return Held(
         at=at,
         rss=process.memory_info().rss,
-        fds=len(fds),
-        sockets=sum(name.startswith("socket:") for name in fds),
+        fds=len(fds) - lanes,
+        sockets=sum(name.startswith("socket:") for name in fds) - lanes,
         threads=process.num_threads(),
         tasks=Counter(json.loads(path.read_text(encoding="utf-8"))),
         routes=len(routes),
