@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.offers import CONFLICT
+from rmpa.bridge.peer_offers import CONFLICT
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import ConfigError

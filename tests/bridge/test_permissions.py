@@ -20,7 +20,7 @@ from rmpa.bridge.messages import (
     Source,
     TopicOffer,
 )
-from rmpa.bridge.offers import DENIED
+from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import PermissionGate, Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.topics.exports import LocalSource

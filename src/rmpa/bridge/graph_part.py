@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.direct.grants import Grants
     from rmpa.bridge.direct.paths import Paths
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.offers import ImportBook, OfferBook
+    from rmpa.bridge.offers import OfferBook
+    from rmpa.bridge.peer_offers import ImportBook
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
 

@@ -17,7 +17,7 @@ from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_secon
 from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
 from rmpa.bridge.direct.paths import AGENTS
 from rmpa.bridge.messages import Source
-from rmpa.bridge.offers import CONFLICT, CROWDED
+from rmpa.bridge.peer_offers import CONFLICT, CROWDED
 from rmpa.bridge.policy import PolicyDecision
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.offers import CROWDED
+from rmpa.bridge.peer_offers import CROWDED
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config.peer_rules import PolicySettings

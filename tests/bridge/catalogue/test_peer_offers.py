@@ -6,7 +6,7 @@ from typing import Any
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import AdvertiseServices, ServiceOffer
-from rmpa.bridge.offers import Heard
+from rmpa.bridge.peer_offers import Heard
 from rmpa.config.settings import LimitSettings
 from tests.bridge.recorder import ServiceImports
 from tests.bridge.services.test_rules import rules

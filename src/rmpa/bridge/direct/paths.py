@@ -19,7 +19,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, DirectAsk, Grant, Unmet, Want, read_ask, read_reply
-from rmpa.bridge.offers import EntryT
+from rmpa.bridge.peer_offers import EntryT
 from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError

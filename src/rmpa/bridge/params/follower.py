@@ -172,7 +172,7 @@ class Params(Part):
     # --- the owners ----------------------------------------------------------------------------------------------
 
     def _claim(self, session: PeerSession) -> bool:
-        """Follow from a linked peer what nobody else of its name owns; return whether there is anything."""
+        """Follow a linked peer's parameters that no other peer of its name owns; return whether there are any."""
         owned = [entry for entry in self.followed if entry.rule.owner == session.link.name]
         mine = [entry for entry in owned if entry.peer in (None, session.peer)]
         for entry in mine:

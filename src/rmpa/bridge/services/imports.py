@@ -27,7 +27,7 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
-from rmpa.bridge.offers import CROWDED, DENIED, Effects, ImportBook, Remote
+from rmpa.bridge.peer_offers import CROWDED, DENIED, ImportBook, Remote
 from rmpa.bridge.policy import is_outside
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
@@ -35,6 +35,8 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+
+    from rmpa.bridge.offers import Effects
 
 
 @dataclass(slots=True, eq=False, kw_only=True)

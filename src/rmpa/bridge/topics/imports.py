@@ -34,7 +34,7 @@ from rmpa.bridge.messages import (
     TopicOffer,
     is_crossing_name,
 )
-from rmpa.bridge.offers import CONFLICT, CROWDED, DENIED, Effects, ImportBook, Remote
+from rmpa.bridge.peer_offers import CONFLICT, CROWDED, DENIED, ImportBook, Remote
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core import limits as core_limits
@@ -44,6 +44,8 @@ from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
+
+    from rmpa.bridge.offers import Effects
 
 
 @dataclass(slots=True, eq=False, kw_only=True)

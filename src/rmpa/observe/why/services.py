@@ -14,7 +14,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
-from rmpa.bridge.offers import CONFLICT, DENIED
+from rmpa.bridge.peer_offers import CONFLICT, DENIED
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean

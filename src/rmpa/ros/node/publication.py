@@ -213,7 +213,8 @@ class Publication:
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
         self._connections: tuple[SubscriberConnection, ...] = ()
-        # The message in progress: the bytes to come, who has its beginning, and what has come if it will be latched.
+        # The message in progress: the bytes to come, the subscribers that have its beginning, and, if it will be
+        # latched, what has come.
         self._left = 0
         self._partial: Sequence[tuple[SubscriberConnection, QueuedMessage]] = ()
         self._whole: bytearray | None = None

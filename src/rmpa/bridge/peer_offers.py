@@ -1,0 +1,328 @@
+"""What each peer offers, and what of it is in the local graph. Pure; by level, as ``offers`` is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter, OrderedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
+
+from rmpa.bridge import limits
+from rmpa.bridge.offers import KeyT, OfferT, wire_of
+from rmpa.bridge.policy import RelayPaths
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping
+
+    from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
+    from rmpa.bridge.offers import Effects
+
+
+CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
+"""Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``."""
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Remote(Generic[KeyT]):
+    """A topic or service of one node of a peer, as the peer offers it.
+
+    Args:
+        peer: The peer's number.
+        wire: Its key by wire names.
+        name: Its topic or service here.
+        node: Its node, in the peer's graph.
+        type: Its message type; ``None`` for a service.
+        origin: Its module and node, if the peer only relays it.
+        shown: Whether it is in the local graph.
+        cause: The kind of the reason why it is not: ``CONFLICT``, ``DENIED`` or ``CROWDED``; empty: another one.
+        problem: Why its route was not opened or was closed last, or empty.
+    """
+
+    peer: int
+    wire: KeyT
+    name: str
+    node: str
+    type: str | None = None
+    origin: Origin | None = None
+    shown: bool = False
+    cause: str = ""
+    problem: str = ""
+
+
+EntryT = TypeVar("EntryT", bound=Remote[Any])
+
+
+@dataclass(slots=True, kw_only=True)
+class Heard(Generic[KeyT, EntryT, OfferT]):
+    """What one run of a peer offers, over one or more links.
+
+    A node of it takes a place in the local graph as long as one entry of the node is shown. A lower limit ends
+    nothing that is shown: it holds for the nodes that come.
+
+    Args:
+        name: The peer's name.
+        entries: What is taken of its offers, by name on the wire.
+        refused: The offers beyond the limit, at most ``limits.REFUSED_MAX``; further ones come with its next link.
+        doubtful: What was offered over the last link and is not confirmed over the present one.
+        shown: How many entries of each node are in the local graph.
+        crowded: The nodes without a place, and the entries of each that wait for one (ordered: taking the first item
+            of a plain dict passes over all that were taken before it).
+        away: Whether the peer has no link but may come back.
+        silent: Whether its last link ended by silence.
+        rank: The value of its GUID.
+        routes: The routes that are asked for or open, by number.
+        last_route: The number of the last one.
+    """
+
+    name: str
+    entries: dict[KeyT, EntryT] = field(default_factory=dict)
+    refused: OrderedDict[KeyT, OfferT] = field(default_factory=OrderedDict)
+    doubtful: set[KeyT] = field(default_factory=set)
+    shown: Counter[str] = field(default_factory=Counter)
+    crowded: OrderedDict[str, dict[EntryT, None]] = field(default_factory=OrderedDict)
+    away: bool = False
+    silent: bool = False
+    rank: int = 0
+    routes: dict[int, EntryT] = field(default_factory=dict)
+    last_route: int = 0
+
+    def free(self, node: str, limit: int) -> bool:
+        """Whether a node may show an entry: it has a place, or a place is free."""
+        return node in self.shown or len(self.shown) < limit
+
+    def wait(self, entry: EntryT, *, crowded: bool) -> None:
+        """Note whether an entry waits for a place of its node."""
+        if crowded:
+            self.crowded.setdefault(entry.node, {})[entry] = None
+        elif (waiting := self.crowded.get(entry.node)) is not None:
+            waiting.pop(entry, None)
+            if not waiting:
+                del self.crowded[entry.node]
+
+    def show(self, entry: EntryT) -> None:
+        """Note that an entry is shown."""
+        entry.shown, entry.cause = True, ""
+        self.shown[entry.node] += 1
+
+    def hide(self, entry: EntryT) -> None:
+        """Note that an entry is shown no more; the last one of its node frees the node's place."""
+        entry.shown = False
+        self.shown[entry.node] -= 1
+        if not self.shown[entry.node]:
+            del self.shown[entry.node]
+
+    def admitted(self, limit: int) -> Iterator[EntryT]:
+        """Yield the entries that have a place now, those first whose node has waited longest.
+
+        The caller shows an entry before it asks for the next one, or the place still counts as free.
+        """
+        while self.crowded and self.free(next(iter(self.crowded)), limit):
+            yield from self.crowded.popitem(last=False)[1]
+
+    def give_up(self) -> None:
+        """Forget all that is refused or waits: the peer does not come back soon."""
+        self.crowded.clear()
+        self.refused.clear()
+
+    def changes(
+        self,
+        added: tuple[OfferT, ...],
+        removed: tuple[KeyT, ...],
+        wire: Callable[[OfferT], KeyT],
+        *,
+        full: bool,
+        more: bool,
+    ) -> Iterator[tuple[KeyT, OfferT | None]]:
+        """The changes that an advertisement makes, each with its name on the wire; removals, ``None``, go first.
+
+        Args:
+            added: The offers that the advertisement adds.
+            removed: The names on the wire that it removes.
+            wire: ``(offer)``: the offer's name on the wire.
+            full: Whether it begins a complete catalogue: entries that the catalogue does not contain are removed at
+                its end.
+            more: Whether the complete catalogue goes on with the next advertisement.
+        """
+        if full:
+            self.doubtful = set(self.entries)
+            self.refused.clear()
+        self.doubtful.difference_update(map(wire, added))
+        if self.doubtful and not more:
+            removed += tuple(sorted(self.doubtful))  # type: ignore[type-var] # names are in order
+            self.doubtful = set()
+        yield from ((name, None) for name in removed)
+        yield from ((wire(offer), offer) for offer in added)
+
+
+def _is_same(entry: Remote[Any], offer: Any) -> bool:
+    """Whether an offer is what an entry was made of."""
+    return entry.node == offer.node and entry.origin == offer.origin and entry.type == getattr(offer, "type", None)
+
+
+class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
+    """What peers offer, and what of it is in the local graph.
+
+    Args:
+        out: Has the rules, sends messages and warns; the part itself, which also changes the local graph.
+    """
+
+    kind: ClassVar[str]
+    """The setting that limits the entries of one peer: ``topics`` or ``services``."""
+
+    def __init__(self, out: Effects) -> None:
+        self._out = out
+        self._do: Any = out
+        self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
+        self.ways = RelayPaths(out.context.gate.may_relay)
+        """Selects the path to each module that relays offer."""
+
+    @abstractmethod
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds; ``None`` if no timer runs."""
+
+    @abstractmethod
+    def handle_timer(self, now: float) -> None:
+        """Handle due timers."""
+
+    @abstractmethod
+    def reload(self, now: float) -> Iterator[None]:
+        """Judge by new rules, an entry with each item; what they do not change goes on untouched."""
+
+    @abstractmethod
+    def _entry(self, peer: int, offer: OfferT) -> EntryT:
+        """The entry of an offer, listed under its name here."""
+
+    @abstractmethod
+    def _judge(self, entry: EntryT) -> None:
+        """Show an entry or hide it, by the facts of now; call it again whenever one has changed."""
+
+    @abstractmethod
+    def _came_again(self, entry: EntryT, now: float) -> None:
+        """Take an offer that was taken before, over this link or an earlier one."""
+
+    @abstractmethod
+    def _went(self, entry: EntryT, reason: str) -> None:
+        """End what uses an entry and take it out of the local graph; it is in no list of its peer any more."""
+
+    @property
+    def limit(self) -> int:
+        """How many entries of one peer are taken."""
+        most = self._out.context.settings.limits
+        return most.topics if self.kind == "topics" else most.services
+
+    def refused(self, peer: int) -> int:
+        """How much a peer offers beyond the limit."""
+        return len(known.refused) if (known := self._peers.get(peer)) is not None else 0
+
+    def refused_nodes(self, peer: int) -> Mapping[str, Collection[EntryT]]:
+        """The nodes of a peer that are hidden because of ``limits.nodes``, with their entries."""
+        return known.crowded if (known := self._peers.get(peer)) is not None else {}
+
+    def peer_name(self, peer: int) -> str:
+        """The name of a peer, for texts."""
+        return known.name if (known := self._peers.get(peer)) is not None else "a peer that is gone"
+
+    def link_up(self, peer: int, name: str = "", instance: str = "", rank: int = 0) -> None:
+        """Register a link, of a new peer or of one that was away; its first message begins a full advertisement.
+
+        Args:
+            peer: The peer's number.
+            name: The peer's name, which selects the rules for it.
+            instance: Its run, as 32 hexadecimal digits: what relays offer of it is hidden while it has a link.
+            rank: The value of its GUID.
+        """
+        known = self._peers.setdefault(peer, Heard(name=name))
+        known.away, known.silent, known.rank, known.routes, known.last_route = False, False, rank, {}, 0
+        if instance:
+            self._ways_changed(self.ways.linked(peer, name, instance, rank))
+
+    def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
+        """The changes of an advertisement, one by one, for ``take_in``."""
+        known, added, removed = self._peers.get(peer), cast("Any", message.added), cast("Any", message.removed)
+        if known is None:
+            return iter(())
+        return known.changes(added, removed, wire_of, full=message.full, more=message.more)
+
+    def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
+        """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""
+        known = self._peers.get(peer)
+        if known is None:
+            return
+        if offer is not None:
+            self._add(peer, known, offer, now)
+            return
+        known.refused.pop(wire, None)
+        if (entry := known.entries.get(wire)) is not None:
+            self._drop(entry, f"its server at {known.name} has gone")
+        self._admit(peer, known, now)
+
+    def _admit(self, peer: int, known: Heard[KeyT, EntryT, OfferT], now: float) -> bool:
+        """Take the first offer beyond the limit, if there is room now; return whether there was one."""
+        if not known.refused or len(known.entries) >= self.limit:
+            return False
+        self._add(peer, known, known.refused.popitem(last=False)[1], now)
+        return True
+
+    def _add(self, peer: int, known: Heard[KeyT, EntryT, OfferT], offer: OfferT, now: float) -> None:
+        wire = wire_of(offer)
+        entry = known.entries.get(wire)
+        if entry is not None and _is_same(entry, offer):
+            self._came_again(entry, now)
+            return
+        if entry is not None:
+            self._drop(entry, f"another node of {known.name} provides it now")
+        elif len(known.entries) >= self.limit:
+            if wire in known.refused or len(known.refused) < limits.REFUSED_MAX:
+                known.refused[wire] = offer
+            self._warn_limit(known.name, self.kind, self.limit)
+            return
+        entry = known.entries[wire] = self._entry(peer, offer)
+        if entry.origin is not None and self.ways.count(peer, entry.origin, 1):
+            self._ways_changed({entry.origin.instance})
+        self._judge(entry)
+
+    def _warn_limit(self, peer: str, kind: str, limit: int) -> None:
+        text = f"{peer} has more than limits.{kind} = {limit} of this module; the rest is refused until there is "
+        text += f"room: raise it in rmpa.toml and `rmpa reload`, or deny some; `rmpa peer info {peer}` counts them"
+        self._out.warn(f"{kind}.too_many", peer, text)
+
+    def _drop(self, entry: EntryT, reason: str) -> None:
+        """Forget an entry that is not offered any more, or does not outlive its peer's link."""
+        known = self._peers[entry.peer]
+        del known.entries[entry.wire]
+        known.doubtful.discard(entry.wire)
+        known.wait(entry, crowded=False)
+        another_way = entry.origin is not None and self.ways.count(entry.peer, entry.origin, -1)
+        self._went(entry, reason)
+        if entry.origin is not None and another_way:
+            self._ways_changed({entry.origin.instance})
+
+    def _crowd(self, entry: EntryT) -> str:
+        """Why an entry has no place in the local graph, or empty; see ``Heard``."""
+        known, most = self._peers[entry.peer], self._out.context.settings.limits.nodes
+        if known.free(entry.node, most):
+            return ""
+        return f"{known.name} has more nodes than limits.nodes = {most} of this module"
+
+    def name_here(self, peer: int, wire: str, origin: Origin | None) -> str:
+        """The name here of a topic or service, by the rules for its own module, not by those for the relay."""
+        module = self._peers[peer].name if origin is None else origin.name
+        return self._out.context.names.local_name(module, wire)
+
+    def _speaker(self, entry: EntryT) -> tuple[str, str]:
+        """The module that permissions are asked for, and the peer that relays its entry, or empty."""
+        name = self._peers[entry.peer].name
+        return (name, "") if entry.origin is None else (entry.origin.name, name)
+
+    def _ways_changed(self, instances: Collection[str]) -> None:
+        """Judge what relays bring of modules whose best path may be another one."""
+        wanted = {instance for instance in instances if instance in self.ways}
+        entries = (entry for known in self._peers.values() for entry in known.entries.values()) if wanted else ()
+        relayed = [entry for entry in entries if entry.origin is not None and entry.origin.instance in wanted]
+        for entry in sorted(relayed, key=lambda one: not one.shown):  # shown ones first: their names get free
+            self._judge(entry)
+
+    def reached_here(self, instance: str, *, reached: bool) -> None:
+        """Set whether this module reaches another one outside the mesh; what relays bring of that one is hidden."""
+        (self.ways.reached_here.add if reached else self.ways.reached_here.discard)(instance)
+        self._ways_changed((instance,))
