@@ -82,7 +82,7 @@ soak-web: $(STAMP) chromium  ## modules, topics, clients and pages of rmpa web c
 	$(BIN)/python -m tests.soak.web --seconds $(or $(SECONDS),3600) $(if $(SEED),--seed $(SEED))
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
-	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers,web-peers]'  # a peer that cannot be installed is left out
+	-$(BIN)/pip install -q -c constraints.txt -e '.[web-peers,zenoh-peers]'  # a peer that cannot be installed is left out
 	$(BIN)/python -m lab bench $(ARGS)
 
 experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md

@@ -19,15 +19,11 @@ from lab.bench import (
     gateway,
     idle,
     load,
-    one_of_many,
     period,
     radio,
-    roscore,
     roundtrips,
-    scale,
     services,
     startup,
-    storm,
     throughput,
     web,
 )
@@ -82,25 +78,10 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         only=radio.measure,
     ),
     "load": Measurement("a command while every core is busy", load.measure),
-    "storm": Measurement(
-        "a stream while the core is asked 200 times a second",
-        storm.measure,
-        realtime=partial(storm.measure, realtime=True),
-    ),
-    "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
-    "peers": Measurement(
-        "other middleware (Zenoh, DDS, ZeroMQ) in the same run", roundtrips.peers, needs=()
-    ),  # likewise
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "services": Measurement("a service call through two agents, and a direct one", services.measure),
-    "roscore": Measurement(
-        "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
-    ),
     "fleet": Measurement("2 to 64 modules: start, rest, a stream beside classic ROS, losses", fleet.measure),
-    "one_of_many": Measurement(
-        "one whole agent among 255 peers that are played", one_of_many.measure, (why_no_hosts, why_no_ros)
-    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
     "gateway": Measurement(
         "sites joined by gateways, beside a bare pair of Zenoh programs",

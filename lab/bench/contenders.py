@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from array import array
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from lab.bed.bench import why_no_hosts, why_no_ros
 from lab.bed.namespaces import MACHINE
-from lab.bed.ros import NODES, Ros, compiled, free_port
+from lab.bed.ros import NODES, Ros, compiled
 from lab.bed.transport import require
 from lab.usage import Meter, Usage
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 SIZES: Final = (64, 64 * 1024, 1024 * 1024)
 """Bytes of the messages that are measured."""
 RELAY: Final = Path("/usr/lib/topic_tools/relay")
-_INSTALL: Final = "pip install -c constraints.txt -e '.[lab-peers]'"
 _ROUND_DEADLINE: Final = 120.0
 
 
@@ -91,42 +89,23 @@ class RoundTripPath:
 
 def floor_c(bed: Bed) -> RoundTripPath:
     """Raw TCP in C++."""
-    shell = bed.shell()
     program = compiled("floor", NODES)
-    server = shell.start(program, "serve")
+    return _raw(bed, "floor_c", "C, raw TCP", program)
+
+
+def floor_python(bed: Bed) -> RoundTripPath:
+    """Raw TCP in Python."""
+    return _raw(bed, "floor_python", "Python, raw TCP", sys.executable, NODES / "floor.py")
+
+
+def _raw(bed: Bed, key: str, title: str, *program: str | Path) -> RoundTripPath:
+    """Both ends are one program, called with ``serve``, and with ``ping`` and the port that the other one names."""
+    shell = bed.shell()
+    server = shell.start(*program, "serve", name=f"{key} pong")
     port = str(server.wait_event("up")["port"])
-    return _raw("floor_c", "C, raw TCP", shell.start(program, "ping", port, commands=True), server)
-
-
-def _raw(key: str, title: str, ping: Process, server: Process) -> RoundTripPath:
+    ping = shell.start(*program, "ping", port, name=f"{key} ping", commands=True)
     ping.wait_event("ready")
     return RoundTripPath(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
-
-
-def script(
-    key: str, title: str, program: str, words: Callable[[], list[str]] = list, *, freeze: bool = False
-) -> Callable[[Bed], RoundTripPath]:
-    """Both ends are one Python script of ``nodes/``, called with ``serve`` and with ``ping``.
-
-    Args:
-        key: Its name in JSON.
-        title: Its name in tables.
-        program: The script.
-        words: Makes the arguments of both ends; without any, ``ping`` gets the port at which ``serve`` listens.
-        freeze: Whether both may be stopped while others are measured: not where ends watch each other's life.
-    """
-
-    def start(bed: Bed) -> RoundTripPath:
-        shell, given = bed.shell(), words()
-        server = shell.start(sys.executable, NODES / program, "serve", *given, name=f"{key} pong")
-        up = server.wait_event("up")
-        given = [str(up["port"])] if "port" in up else given
-        ping = shell.start(sys.executable, NODES / program, "ping", *given, name=f"{key} ping", commands=True)
-        ping.wait_event("ready", 30.0)
-        ends = {"ping": ping, "pong": server}
-        return RoundTripPath(key, title, ping, ends, list(ends.values()) if freeze else [])
-
-    return start
 
 
 def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
@@ -208,51 +187,28 @@ class Entry:
 
     Args:
         start: Starts its processes.
-        module: The Python module that it needs, or empty.
         needs: Each says why it cannot run here, or an empty string.
     """
 
     start: Callable[[Bed], RoundTripPath]
-    module: str = ""
     needs: tuple[Callable[[], str], ...] = ()
 
     def why_not(self) -> str:
         """Why it cannot take part here, or an empty string."""
-        if self.module and importlib.util.find_spec(self.module) is None:
-            return f"{self.module} is not installed ({_INSTALL})"
         return next(filter(None, (why() for why in self.needs)), "")
-
-
-def _port() -> list[str]:
-    return [str(free_port())]
 
 
 _ROS: Final = (why_no_ros,)
 _HOSTS: Final = (why_no_ros, why_no_hosts)
 ENTRIES: Final[dict[str, Entry]] = {
     "floor_c": Entry(floor_c, needs=_ROS),  # compiled with the nodes' flags
-    "floor_python": Entry(script("floor_python", "Python, raw TCP", "floor.py", freeze=True)),
+    "floor_python": Entry(floor_python),
     "roscpp_nodelay": Entry(direct("roscpp", nodelay=True), needs=_ROS),
     "roscpp_nagle": Entry(direct("roscpp", nodelay=False), needs=_ROS),
     "roscpp_hosts": Entry(direct_hosts, needs=_HOSTS),
     "rospy_nodelay": Entry(direct("rospy", nodelay=True), needs=_ROS),
     "rospy_nagle": Entry(direct("rospy", nodelay=False), needs=_ROS),
     "relays": Entry(relays, needs=_ROS),
-    "zenoh": Entry(script("zenoh", "zenoh (Python), TCP", "ping_zenoh.py", _port), "zenoh"),
-    "zenoh_shm": Entry(
-        script("zenoh_shm", "zenoh (Python), shared memory", "ping_zenoh.py", lambda: [*_port(), "--shared-memory"]),
-        "zenoh",
-    ),
-    "cyclonedds": Entry(
-        script(
-            "cyclonedds",
-            "cyclonedds (Python), reliable",
-            "ping_dds.py",
-            lambda: [str(free_port() % 200 + 20), *map(str, SIZES)],  # a domain of our own, and the types' sizes
-        ),
-        "cyclonedds",
-    ),
-    "pyzmq": Entry(script("pyzmq", "pyzmq, PAIR over TCP", "ping_zmq.py", freeze=True), "zmq"),
     "agents_hosts": Entry(through("agents_hosts", "roscpp, two agents, two hosts", "relay", network=0), needs=_HOSTS),
     "agents_one_host": Entry(through("agents_one_host", "roscpp, two agents, one host", "relay"), needs=_ROS),
     "direct_hosts": Entry(
@@ -262,9 +218,4 @@ ENTRIES: Final[dict[str, Entry]] = {
         through("direct_one_host", "roscpp, RMPA direct, one host", "direct", flags=("--domain", "1")), needs=_ROS
     ),
 }
-"""All ways to carry bytes from process to process, each at its best (Zenoh peer to peer, DDS over loopback alone)."""
-_LIBRARIES: Final = {"zenoh", "zenoh_shm", "cyclonedds", "pyzmq"}
-PATH: Final = tuple(key for key in ENTRIES if key not in _LIBRARIES)
-"""Those of ``path``: every path of ROS and RMPA."""
-PEERS: Final = tuple(key for key in ENTRIES if key not in {"roscpp_hosts", "relays"})
-"""Those of ``peers``: the libraries beside the nodes."""
+"""All paths of ROS and RMPA, each at its best."""

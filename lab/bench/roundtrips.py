@@ -1,8 +1,7 @@
-"""One-way latency, as half of the round trip: of every path (``path``), and of other middleware (``peers``).
+"""One-way latency, as half of the round trip, of every path.
 
-The contenders take turns in rounds, so that whatever else the machine does hits all alike. Libraries go straight from
-one process to the other; through two agents a message passes two processes more, and both ends stay unmodified ROS
-nodes.
+The contenders take turns in rounds, so that whatever else the machine does hits all alike. Through two
+agents a message passes two processes more, and both ends stay unmodified ROS nodes.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from lab import machine, samples, tables
 from lab.bed.bench import Bed
 from lab.bed.processes import BedError
-from lab.bench.contenders import ENTRIES, PATH, PEERS, SIZES
+from lab.bench.contenders import ENTRIES, SIZES
 from lab.bench.schedule import HostLateness
 from lab.figures import shapes
 from lab.findings import Claim
@@ -89,17 +88,6 @@ Scores = dict[tuple[str, int], TripScore]
 
 def path(quick: bool, console: Console, json: Path | None = None, only: Sequence[str] = ()) -> dict[str, object]:
     """Measure every path of ROS and RMPA, or ``only`` these."""
-    return _measure("path", only or PATH, quick, console, json)
-
-
-def peers(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
-    """Measure the libraries that carry bytes too, in the same run as two agents."""
-    return _measure("peers", PEERS, quick, console, json)
-
-
-def _measure(
-    name: str, keys: Sequence[str], quick: bool, console: Console, json: Path | None = None
-) -> dict[str, object]:
     plan = QUICK if quick else FULL
     if not machine.facts()["python_optimised"]:
         console.print(
@@ -109,7 +97,7 @@ def _measure(
     scores: Scores = {}
     left_out: dict[str, str] = {}
     with Bed() as bed:
-        taking_part = start_all(bed, keys, left_out, console)
+        taking_part = start_all(bed, only or tuple(ENTRIES), left_out, console)
         for turn in range(plan.rounds):
             console.print(f"round {turn + 1} of {plan.rounds}", style="dim")
             first = turn % max(1, len(taking_part))  # so that none always follows the same one
@@ -137,7 +125,7 @@ def _measure(
         for size in plan.trips
     }
     panels = shapes.shares(shown, "one way, µs")
-    return finish(console, name, asdict(plan), result, json, claims=wanted, panels=panels)
+    return finish(console, "path", asdict(plan), result, json, claims=wanted, panels=panels)
 
 
 def claims(scores: Scores) -> list[Claim]:

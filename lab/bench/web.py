@@ -1,22 +1,21 @@
-"""``rmpa web`` beside rosbridge_suite's server and foxglove-sdk's: messages, calls, slow clients, rosapi, pages.
+"""``rmpa web`` beside rosbridge_suite's server and foxglove-sdk's: messages, slow clients, pages.
 
 The servers stand beside each other on this machine and take turns; each has a publisher of its own.
 """
 
 from __future__ import annotations
 
-import statistics
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from lab import samples, tables
+from lab import tables
 from lab.bed.bench import Bed
 from lab.bed.processes import BedError
 from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import dash, ratio, table_of
-from lab.web import page, questions
+from lab.web import page
 from lab.web.messages import Load, Way, stall
 from lab.web.rosbridge_suite import RosbridgeSuite, why_no_suite
 from lab.web.servers import start_rmpa, start_sdk, start_suite, why_no_sdk
@@ -30,16 +29,12 @@ if TYPE_CHECKING:
     from lab.findings import Panel
     from lab.web.servers import WebServer
 
-PARTS: Final = ("messages", "calls", "slow", "rosapi", "page")
+PARTS: Final = ("messages", "slow", "page")
 """What ``--only`` can choose."""
 _MIB: Final = 1 << 20
 _CLIENTS: Final = 4
 _SUITE_TARGET: Final = 5.0
 _SDK_TARGET: Final = 1.5
-_CALL_TARGET: Final = 5.0
-"""Milliseconds, as the next two."""
-_ROSAPI_TARGET: Final = 50.0
-_SEEN_TARGET: Final = 100.0
 _SLOW_TARGET: Final = 16.0
 """Megabytes of 2^20 bytes."""
 _PAGE_TARGET: Final = 5.0
@@ -57,13 +52,9 @@ class WebPlan:
     """How much is measured.
 
     Args:
-        rounds: Turns of each way, and of the calls.
+        rounds: Turns of each way.
         load: To four clients.
         slow: Beside a client that does not read.
-        calls: Of a service, in each turn.
-        topics: In the graph of which rosapi is asked.
-        rosapi_calls: Of each service of rosapi.
-        changes: New topics, in a small graph and in the large one.
         seconds: That one page is served, and half of them in a browser.
         loads: Of the page.
     """
@@ -71,16 +62,12 @@ class WebPlan:
     rounds: int
     load: Load
     slow: Load
-    calls: int
-    topics: int
-    rosapi_calls: int
-    changes: int
     seconds: float
     loads: int
 
 
-FULL: Final = WebPlan(5, Load(_MIB, 20.0, 100), Load(_MIB, 10.0, 100), 200, 1200, 30, 20, 20.0, 5)
-QUICK: Final = WebPlan(1, Load(_MIB, 20.0, 20), Load(_MIB, 10.0, 40), 30, 1200, 3, 4, 6.0, 2)
+FULL: Final = WebPlan(5, Load(_MIB, 20.0, 100), Load(_MIB, 10.0, 100), 20.0, 5)
+QUICK: Final = WebPlan(1, Load(_MIB, 20.0, 20), Load(_MIB, 10.0, 40), 6.0, 2)
 
 
 @dataclass
@@ -152,10 +139,6 @@ def _start(run: _Run) -> dict[str, object]:
     return {"commit": suite.commit, "libraries": suite.libraries}
 
 
-def _rosbridge(run: _Run) -> list[WebServer]:
-    return [server for server in run.servers if "json" in server.hows]
-
-
 # --- messages -----------------------------------------------------------------------------------------------------
 
 
@@ -204,31 +187,6 @@ def _messages(run: _Run) -> None:
     run.claim(text, ratio(costs.get("rmpa foxglove"), costs.get("sdk foxglove")), _SDK_TARGET)
 
 
-# --- calls --------------------------------------------------------------------------------------------------------
-
-
-def _calls(run: _Run) -> None:
-    """A service call through rosbridge."""
-    took: dict[str, list[float]] = {}
-
-    def turn(server: WebServer) -> None:
-        took.setdefault(server.key, []).extend(questions.call_times(server, run.plan.calls))
-
-    for _ in range(run.plan.rounds):
-        run.each("service calls", _rosbridge(run), turn)
-    table = table_of(
-        "std_srvs/SetBool of a roscpp node through rosbridge, ms", ("server",), ("p50", "p99", "max", "calls")
-    )
-    rows = {}
-    for server in [server for server in _rosbridge(run) if server.key in took]:
-        found = samples.summary(took[server.key])
-        table.add_row(server.title, *map(dash, (found.p50, found.p99, found.largest)), str(found.count))
-        rows[server.key] = asdict(found)
-    run.console.print(table)
-    run.result["calls_ms"] = rows
-    run.claim("a service call through rosbridge, ms, p50", samples.summary(took["rmpa"]).p50, _CALL_TARGET)
-
-
 # --- a client that stops reading ----------------------------------------------------------------------------------
 
 
@@ -263,66 +221,6 @@ def _slow(run: _Run) -> None:
     ours = [rows[f"rmpa {how}"] for how in ("cbor-raw", "foxglove")]
     run.claim("a client that does not read costs, MB, the worse", max(row["growth_mb"] for row in ours), _SLOW_TARGET)
     run.claim("messages that the others lose by it", sum(row["lost"] for row in ours), 0.0)
-
-
-# --- rosapi, new topics -------------------------------------------------------------------------------------------
-
-
-def _rosapi(run: _Run) -> None:
-    """Rosapi, and how soon a new topic is seen; in a small graph and in a large one."""
-    plan = run.plan
-    crowds = {server.key: questions.Crowd(server.ros) for server in _rosbridge(run)}
-    seen: dict[tuple[str, str], list[float]] = {}
-    _new_topics(run, crowds, "small", seen)
-    took: dict[str, dict[str, list[float]]] = {}
-
-    def ask(server: WebServer) -> None:
-        crowds[server.key].grow(plan.topics)
-        questions.wait_topics(server, plan.topics)
-        took[server.key] = times = questions.rosapi_times(server, plan.rosapi_calls)
-        if server.key == "rmpa" and (silent := [name for name, found in times.items() if not found]):
-            raise BedError(f"rmpa web gives no answer to /rosapi/{silent[0]}")
-
-    run.each("rosapi", _rosbridge(run), ask)
-    _new_topics(run, crowds, "large", seen)
-    _show_rosapi(run, took)
-    table = table_of("from a topic's registration until it is seen, ms", ("graph", "seen by"), ("p50", "worst"))
-    for (graph, way), delays in seen.items():
-        table.add_row(graph, way, f"{statistics.median(delays):.1f}", f"{max(delays):.1f}")
-    run.console.print(table)
-    run.result["new_topic_ms"] = [
-        {"graph": graph, "way": way, "delays": [round(delay, 2) for delay in delays]}
-        for (graph, way), delays in seen.items()
-    ]
-    for graph, text in (("small", "a small graph"), ("large", f"{plan.topics} topics")):
-        worst = max(max(delays) for (of, way), delays in seen.items() if of == graph and way.startswith("rmpa"))
-        run.claim(f"a new topic is seen in {text}, ms, worst", worst, _SEEN_TARGET)
-
-
-def _new_topics(
-    run: _Run, crowds: dict[str, questions.Crowd], graph: str, seen: dict[tuple[str, str], list[float]]
-) -> None:
-    def look(server: WebServer) -> None:
-        crowd, changes = crowds[server.key], run.plan.changes
-        seen[graph, f"{server.key} rosapi"] = questions.seen_by_rosapi(server, crowd, changes)
-        if "foxglove" in server.hows:
-            seen[graph, f"{server.key} foxglove"] = questions.seen_by_foxglove(server, crowd, changes)
-
-    run.each("new topics", _rosbridge(run), look)
-
-
-def _show_rosapi(run: _Run, took: dict[str, dict[str, list[float]]]) -> None:
-    table = table_of(f"rosapi with {run.plan.topics} topics, ms, p50 (calls)", ("service",), list(took))
-    for name in questions.ROSAPI:
-        cells = [
-            f"{statistics.median(times[name]):.1f} ({len(times[name])})" if times[name] else "no answer"
-            for times in took.values()
-        ]
-        table.add_row(name, *cells)
-    run.console.print(table)
-    run.result["rosapi_ms"] = took
-    worst = max(statistics.median(times) for times in took["rmpa"].values())
-    run.claim(f"rosapi with {run.plan.topics} topics, ms, p50 of its slowest service", worst, _ROSAPI_TARGET)
 
 
 # --- the monitor's page -------------------------------------------------------------------------------------------
@@ -367,6 +265,4 @@ def _page(run: _Run) -> None:
     run.claim(f"{what}, KB of the first load with its first state", total, _BYTES_TARGET)
 
 
-_PARTS: Final[dict[str, Callable[[_Run], None]]] = dict(
-    zip(PARTS, (_messages, _calls, _slow, _rosapi, _page), strict=True)
-)
+_PARTS: Final[dict[str, Callable[[_Run], None]]] = dict(zip(PARTS, (_messages, _slow, _page), strict=True))

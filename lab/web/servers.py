@@ -33,7 +33,7 @@ _URL_WITHIN: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class WebServer:
-    """One server, and a publisher and a service that it serves.
+    """One server, and a publisher that it serves.
 
     Args:
         key: For results.
@@ -62,11 +62,6 @@ class WebServer:
         words = ["--port", str(self.port), "--path", self.path, "--how", how, "--topic", self.topic]
         words += ["--count", str(count), "--stalled", str(stalled)]
         return program("lab.web.reader", *words)
-
-    @property
-    def service(self) -> str:
-        """A std_srvs/SetBool of a roscpp node (``lab/nodes/switch.cpp``)."""
-        return f"{self.topic}/switch"
 
 
 def program(module: str, *words: str) -> Process:
@@ -150,7 +145,6 @@ def start_suite(bed: Bed, suite: RosbridgeSuite) -> WebServer:
 
 def _source(ros: Ros, topic: str) -> Process:
     name = f"{topic.strip('/')}_source"
-    ros.roscpp("switch", name=f"{name}_switch", service=f"{topic}/switch").wait_event("up")
     source = ros.roscpp("source", name=name, topic=topic, queue=_QUEUE, commands=True)
     source.wait_event("up")
     return source

@@ -86,9 +86,10 @@ class Side(ConnectionProtocol):
         )
 
     def judge(self, hello: Hello) -> Refuse | None:
-        if not self.dialled:
+        refuse = super().judge(hello) or self.verdict
+        if not self.dialled and refuse is None:  # a hello that is refused need not name a valid domain
             self.events.append(("hello", hello.identity))
-        return super().judge(hello) or self.verdict
+        return refuse
 
     def opened(self) -> None:
         assert self.remote is not None

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("cyclonedds", reason="the extra lab-peers is not installed")
+pytest.importorskip("cyclonedds", reason="the extra zenoh-peers is not installed")
 
 from cyclonedds.idl import make_idl_struct, types
 
