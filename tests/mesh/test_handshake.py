@@ -56,8 +56,9 @@ def test_names_that_are_not(name: bytes) -> None:
     assert problem(WIRE[:44] + bytes([len(name)]) + name).code == Refusal.MALFORMED
 
 
-def test_a_lease_of_nothing_and_a_refusal_of_nothing() -> None:
+def test_a_lease_of_nothing_a_domain_of_none_and_a_refusal_of_nothing() -> None:
     assert problem(WIRE[:32] + bytes(4) + WIRE[36:]).code == Refusal.MALFORMED
+    assert "no domain 1056" in problem(replace(HELLO, domain=1056).serialize()).text
     with pytest.raises(RemoteProtocolError):
         Refuse.parse(b"\x00")
 
@@ -151,7 +152,7 @@ def test_unreachable_guid_is_malformed(place: str) -> None:
     ),
     instance=st.binary(min_size=16, max_size=16),
     name=st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,63}", fullmatch=True),
-    domain=st.integers(0, 0xFFFF),
+    domain=st.integers(0, 232),
     lease=st.integers(1, 2**32 - 1),
     expected=st.integers(1, 2**64 - 1),
     lane=st.integers(0, 255),

@@ -86,10 +86,9 @@ class Side(ConnectionProtocol):
         )
 
     def judge(self, hello: Hello) -> Refuse | None:
-        refuse = super().judge(hello) or self.verdict
-        if not self.dialled and refuse is None:  # a hello that is refused need not name a valid domain
+        if not self.dialled:
             self.events.append(("hello", hello.identity))
-        return refuse
+        return super().judge(hello) or self.verdict
 
     def opened(self) -> None:
         assert self.remote is not None

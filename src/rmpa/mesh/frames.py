@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import SERIAL_MASK, Guid, Identity, peer_name_problem
 from rmpa.core.outbox import ABORT, FIRST, LAST
@@ -333,6 +334,8 @@ class Hello:
         name = raw.decode("utf-8", "replace")
         if problem := peer_name_problem(name):
             return _malformed(problem)
+        if domain > core_limits.DOMAIN_MAX:
+            return _malformed(f"there is no domain {domain}")
         if lease_ms == 0:
             return _malformed("a lease of 0")
         if not Guid(guid).dialable:
@@ -355,7 +358,7 @@ class Hello:
 
     @property
     def identity(self) -> Identity:
-        """The sender's identity; only valid after its domain was checked."""
+        """The sender's identity."""
         return Identity(self.guid, self.instance, self.name, self.domain)
 
 
