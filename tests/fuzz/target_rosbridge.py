@@ -8,10 +8,10 @@ from typing import Any
 
 import cbor2
 
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.web.hub.requests import ReceivedMessage, ServeService, ServiceRequest, Subscribe
 from rmpa.web.rosbridge.protocol import encode_png
-from rmpa.web.values.values import codec_for
 from tests.web.rosbridge.hub import Client, decoded
 
 _SPLIT = b"\x1e"

@@ -33,7 +33,7 @@ from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import known_specifications, known_types
 from tests.interop import npm
 from tests.interop.web import PORT, Web
-from tests.web.values.filled import filled, filled_message
+from tests.ros.types.filled import filled, filled_message
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator

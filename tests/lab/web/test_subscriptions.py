@@ -13,9 +13,9 @@ import pytest
 from lab.nodes.node import HEAD
 from lab.web.subscriptions import How, head_of
 from lab.web.websocket import BINARY, TEXT, Frame
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.rosbridge.protocol import Compression, PublishFrames, encode_cbor_raw
-from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import Compression, OpError, PublishFrames, decode_png, encode_cbor_raw, encode_png
-from rmpa.web.values.values import codec_for
 
 pillow = pytest.importorskip("PIL.Image", reason="pillow, which checks pictures, comes with the extra lab")
 STRING = codec_for(MessageType("std_msgs/String"))

@@ -9,6 +9,7 @@ import cbor2
 import msgspec
 import pytest
 
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
@@ -30,7 +31,6 @@ from rmpa.web.hub.requests import (
 )
 from rmpa.web.rosbridge.protocol import decode_png
 from rmpa.web.rosbridge.rosapi import Rosapi
-from rmpa.web.values.values import codec_for
 from tests.web.rosbridge.hub import NOW_NS, Client, Types
 
 ADD = "rospy_tutorials/AddTwoInts"

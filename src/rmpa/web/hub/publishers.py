@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Final, cast
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.master.parameters import Parameters, leaves
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.web import limits
 from rmpa.web.hub.node_link import EndingRegistrations, Registration
-from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable

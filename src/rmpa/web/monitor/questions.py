@@ -20,8 +20,8 @@ from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.peers_section import PeerParams, parameters_in
 from rmpa.resource.run.reconfigure import SERVICE_TYPE
+from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
-from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable

@@ -20,11 +20,11 @@ from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.reconfigure import CONFIG_TYPE
 from rmpa.resource.run.runtime import LEVEL_FOR
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web import limits
 from rmpa.web.hub.node_link import OWN_CLIENT
 from rmpa.web.monitor.live import without_nulls
-from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

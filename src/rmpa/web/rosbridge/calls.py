@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core.errors import RmpaError
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.web import limits
 from rmpa.web.hub.requests import (
     AdvertiseTopic,
@@ -50,7 +51,6 @@ from rmpa.web.rosbridge.protocol import (
 )
 from rmpa.web.rosbridge.rosapi import DeleteParameter, FindType, FindTypes, Rosapi, SetParameter, Todo
 from rmpa.web.rosbridge.subscriptions import LEVELS, Assembler, SessionContext, Style, Subscriptions, check_count
-from rmpa.web.values.values import MessageCodec, codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

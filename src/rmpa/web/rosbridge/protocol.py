@@ -27,7 +27,7 @@ from rmpa.web import limits
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.web.values.values import MessageCodec
+    from rmpa.ros.types.codec import MessageCodec
 
 
 # The ops of rosbridge v2: reads a client's frames to ops, and writes the server's.

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
 from rmpa.core.errors import RmpaError
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
-from rmpa.web.values.values import codec_for
 
 if TYPE_CHECKING:
     from rmpa.ros.types.definitions import Field, Specification

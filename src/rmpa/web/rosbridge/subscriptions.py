@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RmpaError
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.web import limits
 from rmpa.web.hub.requests import Failed, ReceivedMessage, Subscribe, Unsubscribe
 from rmpa.web.rosbridge.protocol import (
@@ -30,7 +31,6 @@ from rmpa.web.rosbridge.protocol import (
     whole,
     write_op,
 )
-from rmpa.web.values.values import MessageCodec, codec_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

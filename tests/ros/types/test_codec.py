@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.limits import MIB
-from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types
+from rmpa.ros import limits
+from rmpa.ros.types.codec import MessageCodec, codec_for
+from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types, parse_definition
 from rmpa.ros.types.messages import MessageError, MessageType
-from rmpa.web import limits
-from rmpa.web.values.values import MessageCodec, codec_for
+from tests.ros.types.filled import filled
 from tests.ros.types.genmsg_cases import VALUES, VALUES_OF
-from tests.web.values.filled import filled
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +29,7 @@ NOW_NS = 5_000_000_007
 
 
 def _codec(text: str) -> MessageCodec:
-    return MessageCodec("t/T", text)
+    return MessageCodec("t/T", parse_definition("t/T", text))
 
 
 def _json(codec: MessageCodec, payload: bytes) -> Any:
@@ -236,7 +236,7 @@ def test_a_missing_header_or_stamp_is_now() -> None:
     codec = codec_for(MessageType("geometry_msgs/PoseStamped"))
     made = codec.write({}, NOW_NS)
     assert _json(codec, made.payload)["header"] == {"seq": 0, "stamp": {"secs": 5, "nsecs": 7}, "frame_id": ""}
-    assert made.missing == ("pose",)
+    assert made.missing == ["pose"]
     given = codec.write({"header": {"frame_id": "map"}, "pose": {"position": {}, "orientation": {}}}, NOW_NS)
     stamp = {"secs": 5, "nsecs": 7}
     assert _json(codec, given.payload)["header"] == {"seq": 0, "stamp": stamp, "frame_id": "map"}
@@ -290,7 +290,8 @@ def test_null_is_not_a_number() -> None:
         ({"a": [1, 2, 1e300]}, r"a\[2\]: does not fit float32"),
         ({"a": "AAAA"}, r"a: is a list \(float32\[3\]\), not 'AAAA'"),
         ({"b": "not base64!"}, r"b: is base64 \(uint8\[\]\)"),
-        ({"b": [256]}, r"b: has a number that does not fit uint8"),
+        ({"b": [256]}, r"b\[0\]: does not fit uint8: 256"),
+        ({"a": bytes(12)}, r"a: is a list \(float32\[3\]\), not 12 bytes"),
         ({"p": [{"y": 1}, {"y": []}]}, r"p\[1\].y: is a int16, not a list of 0"),
         ({"p": {}}, r"p: is a list \(t/P\[\]\), not an object of 0 fields"),
         ({"h": {"secs": "1"}}, "h: is a time, not '1'"),
