@@ -15,7 +15,7 @@ from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
 from rmpa.observe.control import GraphRevision, TopicRow
 from rmpa.observe.control_client import ControlClient
-from rmpa.observe.control_server import REPLIES
+from rmpa.observe.operations import REPLIES
 from rmpa.observe.peer_info import PeerAgent
 from rmpa.ros.environment import NodeFacts, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node

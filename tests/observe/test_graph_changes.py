@@ -7,7 +7,8 @@ import pytest
 
 from rmpa.observe import control as graph_changes
 from rmpa.observe import limits
-from rmpa.observe.control import GraphHistory, GraphRevision, GraphRows, ServiceRow, TopicRow
+from rmpa.observe.control import GraphRevision, GraphRows, ServiceRow, TopicRow
+from rmpa.observe.operations import GraphHistory
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 
@@ -73,16 +74,15 @@ def test_nothing_is_kept_without_a_client_and_no_more_when_it_is_far_behind(monk
     graph = _Graph()
     for number in range(20):
         graph.publish(f"/before{number}")
-    assert len(graph.history) == 0
+    assert not graph.history._changes
     graph.ask(None)
     known = graph.history.revision
     for number in range(8):
         graph.publish(f"/after{number}")
-    assert len(graph.history) == 8
     assert not graph.history.rows_since(known, graph.tables.state()).whole
     for number in range(20):
         graph.publish(f"/gone{number}")
-    assert len(graph.history) == 0
+    assert not graph.history._changes
     rows = graph.ask(known)
     assert rows.whole
     assert len(rows.topics) == 48

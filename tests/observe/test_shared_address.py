@@ -7,7 +7,7 @@ import pytest
 
 from rmpa.discovery import limits
 from rmpa.observe.peer_info import PeerInfo
-from rmpa.observe.peers_section import mark_shared_addresses
+from rmpa.observe.snapshot_builder import mark_shared_addresses
 
 
 def peer(name: str, guid: str, state: str = "linking", since: float = 30.0, beacon: float | None = 2.0) -> PeerInfo:

@@ -8,7 +8,6 @@ import errno
 import logging
 import os
 import random
-import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.network import Network
@@ -25,12 +24,11 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
-from rmpa.observe.control_server import ControlOperations, ControlServer, control_access
+from rmpa.observe.control_server import ControlServer, control_access
 from rmpa.observe.health import Diagnostics
+from rmpa.observe.operations import ControlOperations, GraphRevisions, SiteRequests
 from rmpa.observe.peer_info import INFO
-from rmpa.observe.peers_section import SiteRequests
-from rmpa.observe.snapshot_builder import GraphRevisions, SnapshotBuilder, SnapshotSources
-from rmpa.observe.topics_section import PeerClocks
+from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
@@ -215,25 +213,21 @@ class Agent:
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         """What else the snapshot's notes tell: of parts that the agent does not make itself."""
         counters = Counters()
-        # Memory that is locked stays; and what is returned would have to be read in again in the midst of data.
-        self._clocks = PeerClocks(self.bridge)
-        sources = SnapshotSources(
+        parts = AgentParts(
             core=self.core,
             bridge=self.bridge,
-            clocks=self._clocks,
             services=self.services,
             twins=twins,
             endpoint=lambda: self.network.endpoint,
-            counters=(counters,),
+            counters=counters,
             notes=self._notes,
-            started=time.time(),
             realtime=realtime,
             trust=self.trust.status if self.trust is not None else lambda: None,
         )
-        self.snapshots = SnapshotBuilder(settings, sources)
+        self.snapshots = SnapshotBuilder(settings, parts)
         needs = Needs((), "figures of the agent, none of the module's graph")
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
-        self.sites = SiteRequests(self.bridge.rpc, self.bridge.sessions.linked, self.bridge.gate)
+        self.sites = SiteRequests(self.bridge)
         """Answers questions about other sites; a gateway answers them itself."""
         self.why = WhyService(settings.name, self.core, self.bridge, self.services, self.snapshots, self.sites)
         self.operations = ControlOperations(
@@ -271,7 +265,7 @@ class Agent:
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
-            diagnostics = Diagnostics(self.core, self.bridge, self.snapshots, self._clocks)
+            diagnostics = Diagnostics(self.core, self.bridge, self.snapshots)
             diagnostics.start()
             undo.callback(diagnostics.close)
             loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)

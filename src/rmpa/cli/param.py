@@ -26,7 +26,7 @@ from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
-from rmpa.observe.peers_section import PeerParams, parameters_in
+from rmpa.observe.operations import PeerParams, parameters_in
 from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros import limits as ros_limits
 

@@ -16,8 +16,8 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
 from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.observe.operations import INFO, REPORT
 from rmpa.observe.peer_info import SitesReport
-from rmpa.observe.peers_section import INFO, REPORT
 
 if TYPE_CHECKING:
     from rmpa.observe.peer_info import SiteInfo

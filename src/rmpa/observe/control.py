@@ -14,25 +14,19 @@ the number of its bytes, and they follow the line.
 
 from __future__ import annotations
 
-import itertools
-from collections import deque
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
 import msgspec
 
 from rmpa.bridge.messages import without_text
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.observe import limits
-from rmpa.observe.peer_info import PeerInfo  # noqa: TC001 - msgspec reads the annotation
-from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo, UnreachableInfo
-from rmpa.ros.master.parameters import RegistrationKind
-from rmpa.trust.permissions import TrustStatus  # noqa: TC001 - msgspec reads the annotation
+from rmpa.observe.snapshot import ServiceInfo, Snapshot, TopicInfo
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from rmpa.core.counters import Yielder
-    from rmpa.ros.master.parameters import GraphChange, GraphState
 
 
 # The value of the control socket's operation ``reload``.
@@ -107,24 +101,14 @@ def _default(field: msgspec.structs.FieldInfo) -> object:
 # Decodes the snapshots of one agent, one after the other; what has not changed is not decoded again.
 
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 
-class _SnapshotParts(msgspec.Struct, kw_only=True, frozen=True):
+class _SnapshotParts(Snapshot, kw_only=True, frozen=True):
     """A ``Snapshot`` whose long lists are not decoded."""
 
-    agent: AgentInfo
-    taken: float
-    peers: tuple[PeerInfo, ...] = ()
-    topics: tuple[msgspec.Raw, ...] = ()
-    services: tuple[msgspec.Raw, ...] = ()
-    counters: dict[str, int] = {}
-    notes: tuple[str, ...] = ()
-    unreachable: tuple[UnreachableInfo, ...] = ()
-    trust: TrustStatus | None = None
-    topics_left: int = 0
-    services_left: int = 0
-    strangers: tuple[PeerInfo, ...] = ()
+    topics: tuple[msgspec.Raw, ...] = ()  # type: ignore[assignment]
+    services: tuple[msgspec.Raw, ...] = ()  # type: ignore[assignment]
 
 
 class _SnapshotReply(msgspec.Struct, frozen=True):
@@ -142,17 +126,9 @@ class _Entries(Generic[_T]):
         self._known: dict[bytes, _T] = {}
 
     def decode(self, raws: tuple[msgspec.Raw, ...]) -> tuple[_T, ...]:
-        before, known = self._known, {}
-        made: list[_T] = []
-        for raw in raws:
-            text = bytes(raw)
-            entry = before.get(text)
-            if entry is None:
-                entry = self._decode(text)
-            known[text] = entry
-            made.append(entry)
-        self._known = known
-        return tuple(made)
+        before, texts = self._known, list(map(bytes, raws))
+        self._known = {text: before.get(text) or self._decode(text) for text in texts}
+        return tuple(self._known[text] for text in texts)
 
 
 class SnapshotDecoder:
@@ -175,20 +151,10 @@ class SnapshotDecoder:
         """
         try:
             parts = self._reply.decode(line).value
-            return Snapshot(
-                agent=parts.agent,
-                taken=parts.taken,
-                peers=parts.peers,
-                topics=self._topics.decode(parts.topics),
-                services=self._services.decode(parts.services),
-                counters=parts.counters,
-                notes=parts.notes,
-                unreachable=parts.unreachable,
-                trust=parts.trust,
-                topics_left=parts.topics_left,
-                services_left=parts.services_left,
-                strangers=parts.strangers,
-            )
+            values = {name: getattr(parts, name) for name in parts.__struct_fields__}
+            values["topics"] = self._topics.decode(parts.topics)
+            values["services"] = self._services.decode(parts.services)
+            return Snapshot(**values)
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
             raise RemoteProtocolError(f"not a snapshot: {error}") from None
 
@@ -261,69 +227,6 @@ class GraphRevision(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=Tru
     rows: GraphRows | None = None
 
 
-class GraphHistory:
-    """Which topics and services have changed at the last ``limits.GRAPH_HISTORY`` revisions.
-
-    It is kept while clients ask for rows: without one, a change of the graph costs nothing.
-
-    Args:
-        revision: The first one.
-    """
-
-    def __init__(self, revision: int) -> None:
-        self.revision = revision
-        """The present one."""
-        self._changes: deque[tuple[RegistrationKind, str]] | None = None
-        self._asked = 0
-
-    def __len__(self) -> int:
-        """The number of revisions that are kept."""
-        return len(self._changes or ())
-
-    def add(self, change: GraphChange) -> None:
-        """The graph has changed, which makes a new revision."""
-        self.revision += 1
-        if self._changes is None:
-            return
-        if self.revision - self._asked > limits.GRAPH_HISTORY:
-            self._changes = None  # the client that asked last is too far behind by now, or has gone
-        else:
-            self._changes.append((change.kind, change.name))
-
-    def rows_since(self, known: object, state: GraphState) -> GraphRows:
-        """What has changed since a revision, or everything where the history does not reach back to it.
-
-        Args:
-            known: The revision that a client knows; ``None``, or anything that is not one of this agent: none.
-            state: The present graph.
-        """
-        self._asked = self.revision
-        if self._changes is None:
-            self._changes = deque(maxlen=limits.GRAPH_HISTORY)
-        behind = self.revision - known if type(known) is int else -1
-        if not 0 <= behind <= len(self._changes):
-            topics = state.publishers.keys() | state.subscribers.keys()
-            return GraphRows(
-                whole=True, topics=_topics(sorted(topics), state), services=_services(sorted(state.services), state)
-            )
-        recent = dict.fromkeys(itertools.islice(reversed(self._changes), behind))
-        topics_changed = dict.fromkeys(name for kind, name in recent if kind is not RegistrationKind.SERVICE)
-        services_changed = [name for kind, name in recent if kind is RegistrationKind.SERVICE]
-        return GraphRows(topics=_topics(topics_changed, state), services=_services(services_changed, state))
-
-
-def _topics(names: Iterable[str], state: GraphState) -> tuple[TopicRow, ...]:
-    publishers, subscribers, types = state.publishers, state.subscribers, state.types
-    return tuple(
-        TopicRow(name, types.get(name, ""), tuple(publishers.get(name, ())), tuple(subscribers.get(name, ())))
-        for name in names
-    )
-
-
-def _services(names: Iterable[str], state: GraphState) -> tuple[ServiceRow, ...]:
-    return tuple(ServiceRow(name, tuple(state.services.get(name, ()))) for name in names)
-
-
 ROLE: Final = "role"
 """The operation that only an agent with another role than a module's serves; its value names that."""
 GATEWAY_ROLE: Final = "gateway"
@@ -332,36 +235,41 @@ GATEWAY_REPORT: Final = "gateway"
 """The operation of a gateway that says what it joins; its ``problem`` is why it joins nothing."""
 
 
-def _parse(line: bytes, type_: type[_T], what: str, most: int) -> _T:
-    if len(line) > most:
-        raise LimitExceeded(f"a {what}", len(line), most)
-    try:
-        return msgspec.json.decode(line, type=type_)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        raise RemoteProtocolError(f"not a {what}: {error}") from None
+class _Line(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A line of the protocol."""
+
+    _NAME: ClassVar[str]
+    _MOST: ClassVar[int]
+
+    @classmethod
+    def parse(cls, line: bytes) -> Self:
+        """Parse one line, with or without its end.
+
+        Raises:
+            RemoteProtocolError: It is none.
+        """
+        if len(line) > cls._MOST:
+            raise LimitExceeded(f"a {cls._NAME}", len(line), cls._MOST)
+        try:
+            return msgspec.json.decode(line, type=cls)
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            raise RemoteProtocolError(f"not a {cls._NAME}: {error}") from None
 
 
-class ControlRequest(msgspec.Struct, frozen=True, omit_defaults=True):
+class ControlRequest(_Line, frozen=True, omit_defaults=True):
     """A client's request.
 
     Attributes:
-        op: The name of an operation (``control_operations.REPLIES``).
+        op: The name of an operation (``observe.operations.REPLIES``).
         args: Its arguments, by name.
         follows: Bytes of the argument ``text`` that follow the line.
     """
 
+    _NAME = "control request"
+    _MOST = limits.CONTROL_REQUEST_MAX
     op: str
     args: dict[str, object] = {}
     follows: int = 0
-
-    @classmethod
-    def parse(cls, line: bytes) -> ControlRequest:
-        """Parse one line, with or without its end.
-
-        Raises:
-            RemoteProtocolError: It is not a request.
-        """
-        return _parse(line, cls, "control request", limits.CONTROL_REQUEST_MAX)
 
     def serialize(self) -> bytes:
         """One line."""
@@ -374,7 +282,7 @@ class ControlRequest(msgspec.Struct, frozen=True, omit_defaults=True):
         return shown[:200].encode("unicode_escape").decode("ascii")
 
 
-class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
+class ControlReply(_Line, frozen=True, omit_defaults=True):
     """The agent's reply.
 
     Attributes:
@@ -385,20 +293,13 @@ class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
         follows: Bytes of the value's ``text`` that follow the line.
     """
 
+    _NAME = "control reply"
+    _MOST = limits.CONTROL_REPLY_MAX
     ok: bool
     value: Any = None  # the edge: each operation has its own type, and its caller converts the value
     error: str = ""
     remedy: str = ""
     follows: int = 0
-
-    @classmethod
-    def parse(cls, line: bytes) -> ControlReply:
-        """Parse one line, with or without its end.
-
-        Raises:
-            RemoteProtocolError: It is not a reply.
-        """
-        return _parse(line, cls, "control reply", limits.CONTROL_REPLY_MAX)
 
     def serialize(self, yielder: Yielder = iter) -> bytes:
         """One line.

@@ -209,7 +209,7 @@ class ControlClient:
         """Send a request, and wait for the reply.
 
         Args:
-            op: The name of the operation (``control_operations.REPLIES``).
+            op: The name of the operation (``observe.operations.REPLIES``).
             type: The type of its value.
             args: Its arguments.
 

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import CheckLevel, PeerInfo
     from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.observe.topics_section import PeerClocks
     from rmpa.ros.core.external import Core
 
 
@@ -433,14 +432,12 @@ class Diagnostics(PublicationEvents):
         core: The local core.
         bridge: Has the node that publishes; started before.
         snapshots: Builds what is judged.
-        clocks: The clocks of the peers.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder, clocks: PeerClocks) -> None:
+    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
         self._core = core
         self._bridge = bridge
         self._snapshots = snapshots
-        self._clocks = clocks
         self._clock = SystemClock()
         self._health = Health()
         self._sequence = 0
@@ -482,7 +479,7 @@ class Diagnostics(PublicationEvents):
 
     def _look(self) -> None:
         self._again()
-        self._clocks.follow(self._clock.now())
+        self._snapshots.topics.follow_clocks()
         if self._publication.subscribers:
             self._publish()
 

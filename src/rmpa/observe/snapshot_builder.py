@@ -1,276 +1,88 @@
-"""Builds the snapshot from its sections; the section of services.
+"""Builds the snapshot that the control socket and ``/diagnostics`` show: the agent, its peers and their services.
 
-Builds the snapshot that the control socket and ``/diagnostics`` show.
+The topics are those of ``observe.topics``.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
-import secrets
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
+import msgspec
 import psutil
 
 import rmpa
 from rmpa.core.counters import SampleSummary
-from rmpa.core.errors import ConfigError
+from rmpa.discovery import limits as discovery_limits
 from rmpa.observe import limits
-from rmpa.observe.control import GraphHistory, GraphRevision
-from rmpa.observe.peer_info import FOREIGN, PeerAgent
-from rmpa.observe.peers_section import PeersSection, own_bounds
+from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerAgent, PeerInfo
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, SampleSpread, ServiceInfo, Snapshot
-from rmpa.observe.topics_section import DirectSection, TopicsSection, unreachable_infos
+from rmpa.observe.topics import TopicFacts, first_names
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
-from rmpa.runtime.loop import sorted_yielding, yield_to_data, yielding_to_data
+from rmpa.runtime.loop import yield_to_data, yielding_to_data
+from rmpa.trust.permissions import not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
     from rmpa.bridge.services.bodies import LocalService
     from rmpa.bridge.services.calls import CallStats
     from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.services.part import Services
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
-    from rmpa.observe.peer_info import ContractTerm
-    from rmpa.observe.peers_section import EndpointView
-    from rmpa.observe.topics_section import PeerClocks
+    from rmpa.core.identity import Identity
+    from rmpa.discovery.discovery import Discovery
+    from rmpa.discovery.endpoints import PeerView
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.mesh import Mesh
+    from rmpa.mesh.peering import Peer
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange
+    from rmpa.runtime.stream import Stream
     from rmpa.trust.permissions import TrustStatus
 
 
-# The services in the snapshot: those of this module and of its peers, with the figures of their calls.
+class EndpointView(Protocol):
+    """What the snapshot needs of the agent's place in the network (``agent.network.NetworkEndpoint``)."""
 
-
-class ServicesSection:
-    """Reads what the bridge knows of services; changes nothing.
-
-    Args:
-        bridge: The agent's.
-        services: Its part for services.
-    """
-
-    def __init__(self, bridge: Bridge, services: Services) -> None:
-        self._bridge = bridge
-        self._services = services
-
-    def used(self, most: int) -> tuple[Collection[str] | None, int]:
-        """The names to show where at most so many services can be shown, and the number of the other services.
-
-        First the services of this module and those that are or were called, all of them; then the others that are
-        shown, then the hidden ones. A name stands for all services of that name.
-
-        Returns:
-            The names, ``None`` for all, and how many services are left out.
-        """
-        first, shown, hidden = set(self._services.exports.seen), Counter[str](), Counter[str]()
-        for _, remote in yielding_to_data(list(self._services.imports)):
-            known = self._services.shown(remote)
-            if remote.route or remote.problem or (known is not None and (known.stats.calls or known.mismatch)):
-                first.add(remote.name)
-            (shown if remote.shown else hidden)[remote.name] += 1
-        counts = shown + hidden
-        room = most - sum(counts[name] or 1 for name in first)
-        left = 0
-        for name in (*sorted_yielding(shown), *sorted_yielding(hidden.keys() - shown.keys())):
-            if name in first:
-                continue
-            if room >= counts[name] and not left:
-                first.add(name)
-                room -= counts[name]
-            else:
-                left += counts[name]
-        return (first, left) if left else (None, 0)
-
-    def infos(self, wanted: Collection[str] | None = None) -> tuple[ServiceInfo, ...]:
-        """The services of the local graph, without the agent's own, and of the peers: all, or those of some names."""
-        if wanted is not None and not wanted:
-            return ()
-        found = [*self._local(wanted), *self._remote(wanted)]
-        return tuple(sorted(found, key=lambda info: (info.name, info.direction == "in", info.peer)))
-
-    def _local(self, wanted: Collection[str] | None) -> Iterator[ServiceInfo]:
-        for service, server in list(self._services.exports.seen.items()):
-            if wanted is not None and service not in wanted:
-                continue
-            yield_to_data()
-            yield self._export(service, server)
-
-    def _export(self, service: str, server: LocalService) -> ServiceInfo:
-        exports = self._services.exports
-        about = exports.about.get(service)
-        decision = exports.judge(service, server)
-        callers = tuple(sorted(self._services.imports.peer_name(peer) for peer in exports.callers(service)))
-        return ServiceInfo(
-            name=service,
-            node=server.node,
-            direction="out",
-            state="home" if service not in exports.offered else "open" if callers else "idle",
-            type=about.type if about else "",
-            md5=about.md5sum if about else "",
-            callers=callers,
-            wanted=self._bridge.context.services.transport(service).value,
-            direct_callers=tuple(
-                sorted(
-                    self._services.imports.peer_name(peer)
-                    for peer, _, _ in self._services.direct_exports.of(service, server.node)
-                )
-            ),
-            crosses=decision.allowed,
-            policy=decision.rule,
-            **_figures(self._services.serving.stats.get(service)),
-        )
-
-    def _remote(self, wanted: Collection[str] | None) -> Iterator[ServiceInfo]:
-        for peer, remote in yielding_to_data(list(self._services.imports)):
-            if wanted is not None and remote.name not in wanted:
-                continue
-            yield_to_data()
-            yield self._import(peer, remote)
-
-    def _import(self, peer: int, remote: RemoteService) -> ServiceInfo:
-        shown = self._services.shown(remote)
-        decision = self._bridge.context.services.judge(remote.name, remote.node)
-        figures = _figures(shown.stats if shown else None)
-        figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem
-        return ServiceInfo(
-            name=remote.name,
-            node=remote.node,
-            direction="in",
-            peer=self._services.imports.peer_name(peer),
-            state=remote.state if remote.shown else "hidden",
-            wire=remote.wire if remote.wire != remote.name else "",
-            type=remote.about.type if remote.about else "",
-            md5=remote.about.md5sum if remote.about else "",
-            crosses=decision.allowed,
-            policy=decision.rule,
-            hidden=self._services.imports.why_hidden(remote)[0],
-            **self._transport(peer, remote),
-            **figures,
-        )
-
-    def _transport(self, peer: int, remote: RemoteService) -> dict[str, Any]:
-        """The fields of a peer's service that say by which transport it is called."""
-        wanted = self._bridge.context.services.transport(remote.name).value
-        if not remote.shown:
-            return {"wanted": wanted}
-        direct = self._services.direct_imports
-        if address := direct.address(peer, remote.name):
-            lookups = direct.lookups[remote.name]
-            return {"wanted": wanted, "transport": "direct", "address": address, "lookups": lookups}
-        found = {"wanted": wanted, "transport": "relay"}
-        unmet = direct.unmet(remote)
-        return found if unmet is None else found | {"condition": unmet.condition.value, "relayed_because": unmet.text}
-
-
-def _figures(stats: CallStats | None) -> dict[str, Any]:
-    """The fields of a service that its calls give."""
-    if stats is None:
-        return {}
-    return {
-        "calls": stats.calls,
-        "failed": stats.failed,
-        "active": stats.active,
-        "latency": SampleSpread.of(SampleSummary.of(stats.latencies)) if stats.latencies else None,
-        "problem": stats.problem,
-    }
-
-
-# Lets clients of the control socket wait for the next change of the local graph, and tells them what has changed.
-
-
-_REVISION_BITS = 52
-"""Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other."""
-
-
-class GraphRevisions:
-    """The revision of a core's graph: a number that every change of the graph replaces.
-
-    Args:
-        core: Tells the changes.
-        rows: Whether clients get the changes themselves. Those of a core that is another program are known here later
-            than there.
-    """
-
-    def __init__(self, core: Core, *, rows: bool) -> None:
-        self._core = core
-        self._rows = rows
-        # Begins anywhere, so that a client takes the graph of an agent that was started anew for another one.
-        self._history = GraphHistory(secrets.randbits(_REVISION_BITS))
-        self._changed = asyncio.Event()
-        self._waiting = 0
-        core.on_change(self._add)
-
-    def _add(self, change: GraphChange) -> None:
-        self._history.add(change)
-        if self._waiting:
-            self._changed.set()
-            self._changed = asyncio.Event()
-
-    async def after(self, args: dict[str, object]) -> GraphRevision:
-        """The revision, as soon as it differs from the one that the client knows.
-
-        Args:
-            args: ``after``: the known revision; ``wait``: the most seconds to wait for another one, 0 by default;
-                ``rows``: true for what has changed since ``after``.
-
-        Raises:
-            ConfigError: An argument is out of range.
-        """
-        known, wait = args.get("after"), args.get("wait", 0)
-        if not isinstance(wait, int | float) or not 0 <= wait <= limits.CONTROL_WAIT_MAX:
-            raise ConfigError("wait", f"{wait!r} is not between 0 and {limits.CONTROL_WAIT_MAX:g} s")
-        if known == self._history.revision:
-            self._waiting += 1
-            try:
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(wait):
-                        await self._changed.wait()
-            finally:
-                self._waiting -= 1
-        if not self._rows or args.get("rows") is not True:
-            return GraphRevision(revision=self._history.revision)
-        rows = self._history.rows_since(known, self._core.state())
-        return GraphRevision(revision=self._history.revision, core_uri=self._core.uri, rows=rows)
+    identity: Identity
+    mesh: Mesh
+    discovery: Discovery
 
 
 @dataclass(frozen=True, slots=True)
-class SnapshotSources:
-    """What the snapshot is built from.
+class AgentParts:
+    """What an agent is observed by.
 
     Args:
         core: The agent's ROS core.
         bridge: Its bridge.
-        clocks: The clocks of its peers.
         services: The bridge's part for services.
         twins: The bridge's part for peers of this module's kind.
         endpoint: Its place in the network now; ``None`` while it has none.
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
-        started: When the agent started, seconds since the epoch.
         realtime: The outcomes of ``--realtime``, ready to read; those that were refused begin with ``no``.
         trust: The state of trust; ``None``: it is off.
     """
 
     core: Core
     bridge: Bridge
-    clocks: PeerClocks
     services: Services
     twins: TwinWatch
     endpoint: Callable[[], EndpointView | None]
-    counters: tuple[Counters, ...]
+    counters: Counters
     notes: Callable[[], Iterable[str]]
-    started: float
-    realtime: tuple[str, ...] = ()
-    trust: Callable[[], TrustStatus | None] = lambda: None
+    realtime: tuple[str, ...]
+    trust: Callable[[], TrustStatus | None]
 
 
 class SnapshotBuilder:
@@ -278,48 +90,29 @@ class SnapshotBuilder:
 
     Args:
         settings: The agent's settings.
-        sources: The parts of the agent.
+        parts: The parts of the agent.
     """
 
-    def __init__(self, settings: Settings, sources: SnapshotSources) -> None:
+    def __init__(self, settings: Settings, parts: AgentParts) -> None:
         self._settings = settings
-        self._sources = sources
+        self._parts = parts
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
         self._cpu_known = self._began = time.monotonic()
-        self._peers = PeersSection(sources.bridge, sources.services, sources.twins)
-        self.direct = DirectSection(sources.bridge)
-        """What is known of direct transport."""
-        self._topics = TopicsSection(sources.core, sources.bridge, sources.clocks, self.direct)
-        self._services = ServicesSection(sources.bridge, sources.services)
-
-    @property
-    def endpoint(self) -> EndpointView | None:
-        """The agent's place in the network now."""
-        return self._sources.endpoint()
+        self._started = time.time()
+        self.topics = TopicFacts(parts.core, parts.bridge)
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
         self._settings = settings
 
-    def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
-        """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""
-        return self._topics.contract(topic, type_name)
-
     def peer_agent(self) -> PeerAgent:
         """What this agent tells its peers of itself."""
-        agent = self._agent(self.endpoint)
-        return PeerAgent(
-            version=agent.version,
-            uptime=agent.uptime,
-            core_uri=agent.core_uri,
-            cpu=agent.cpu,
-            rss=agent.rss,
-            files_open=agent.files.open if agent.files is not None else None,
-            files_limit=agent.files.limit if agent.files is not None else None,
-            proxies=agent.proxies,
-        )
+        agent = self.agent()
+        told = {name: getattr(agent, name) for name in ("version", "uptime", "core_uri", "cpu", "rss", "proxies")}
+        assert agent.files is not None  # noqa: S101 - for mypy
+        return PeerAgent(**told, files_open=agent.files.open, files_limit=agent.files.limit)
 
     def build(
         self,
@@ -338,59 +131,66 @@ class SnapshotBuilder:
             most: Topics, and services, beyond which those are left out that nothing here uses; ``None``: all are in
                 it. The snapshot says how many are left out.
         """
-        endpoint = self.endpoint
+        parts, endpoint = self._parts, self._parts.endpoint()
         counters: Counter[str] = Counter()
-        for each in self._counters(endpoint):  # counters of one name add up: core and proxies have the same servers
+        several = [parts.bridge.counters, parts.core.counters, DESCRIPTORS.counters, parts.counters]
+        notes: list[str] = []
+        if endpoint is not None:
+            several += [endpoint.mesh.counters, endpoint.discovery.counters]
+            notes += [*endpoint.discovery.notes(), *endpoint.mesh.notes()]
+        for each in several:  # counters of one name add up: core and proxies have the same servers
             counters.update(each.as_dict())
         yield_to_data()
         topics_left = services_left = 0
         if services is None or isinstance(services, bool):
             services = None if services or (services is None and topics is None) else ()
         if most is not None and topics is None:
-            topics, topics_left = self._topics.used(most)
+            topics, topics_left = self.topics.used(most)
         if most is not None and services is None:
-            services, services_left = self._services.used(most)
-        known = self._peers.infos(endpoint) if endpoint is not None and peers else ()
+            services, services_left = self._services_used(most)
+        known = self._peers(endpoint) if endpoint is not None and peers else ()
         return Snapshot(
-            agent=self._agent(endpoint),
+            agent=self.agent(),
             taken=time.time(),
             peers=tuple(info for info in known if info.state != FOREIGN),
             strangers=tuple(info for info in known if info.state == FOREIGN),
-            topics=self._topics.infos(topics),
-            services=self._services.infos(services),
+            topics=self.topics.infos(topics),
+            services=self._services(services),
             topics_left=topics_left,
             services_left=services_left,
             counters=dict(sorted(counters.items())),
-            notes=self._notes(endpoint),
-            unreachable=unreachable_infos(self._sources.core, time.monotonic()),
-            trust=self._sources.trust(),
+            notes=(*notes, *self._notes()),
+            unreachable=self.topics.unreachable(),
+            trust=parts.trust(),
         )
 
-    def _counters(self, endpoint: EndpointView | None) -> Iterator[Counters]:
-        yield from (
-            self._sources.bridge.counters,
-            self._sources.core.counters,
-            DESCRIPTORS.counters,
-            *self._sources.counters,
-        )
-        if endpoint is not None:
-            yield from (endpoint.mesh.counters, endpoint.discovery.counters)
-
-    def _notes(self, endpoint: EndpointView | None) -> tuple[str, ...]:
-        notes = [] if endpoint is None else [*endpoint.discovery.notes(), *endpoint.mesh.notes()]
-        notes += self._sources.core.notes()
+    def _notes(self) -> Iterator[str]:
+        yield from self._parts.core.notes()
         if DESCRIPTORS.problem:
-            notes.append(DESCRIPTORS.problem)
-        notes += self._sources.notes()
-        notes += own_bounds(self._sources.bridge, self._sources.services)
-        refused = (outcome for outcome in self._sources.realtime if outcome.startswith("no "))
-        notes += (f"realtime: {outcome}; the agent's log says what would grant it" for outcome in refused)
-        return tuple(notes)
+            yield DESCRIPTORS.problem
+        yield from self._parts.notes()
+        most = self._settings.limits
+        for beyond, kind, limit in (
+            (self._parts.bridge.topics.exports.beyond, "topics", most.topics),
+            (self._parts.services.exports.beyond, "services", most.services),
+        ):
+            if beyond:
+                which = f"{_count(len(beyond), kind)} of this module are offered to no peer"
+                yield f"{which}: more than limits.{kind} = {limit}; {_raise_limit(kind)}"
+        for outcome in self._parts.realtime:
+            if outcome.startswith("no "):
+                yield f"realtime: {outcome}; the agent's log says what would grant it"
 
-    def _agent(self, endpoint: EndpointView | None) -> AgentInfo:
+    def agent(self) -> AgentInfo:
+        """The agent itself."""
+        endpoint, bridge, core = self._parts.endpoint(), self._parts.bridge, self._parts.core
         identity = endpoint.identity if endpoint is not None else None
-        bridge, core = self._sources.bridge, self._sources.core
         proxies = sum(len(session.proxies) for session in bridge.sessions)
+        now, rss = time.monotonic(), None
+        with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
+            if now - self._cpu_known >= limits.CPU_INTERVAL:
+                self._cpu, self._cpu_known = self._process.cpu_percent(), now
+            rss = self._process.memory_info().rss
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",
@@ -399,14 +199,14 @@ class SnapshotBuilder:
             core_uri=core.uri,
             version=rmpa.__version__,
             pid=os.getpid(),
-            started=self._sources.started,
-            uptime=time.monotonic() - self._began,
-            cpu=self._cpu_share(),
-            rss=self._memory(),
+            started=self._started,
+            uptime=now - self._began,
+            cpu=self._cpu,
+            rss=rss,
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
             config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
-            realtime=self._sources.realtime,
+            realtime=self._parts.realtime,
             files=_files(),
             proxies=proxies,
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
@@ -414,20 +214,204 @@ class SnapshotBuilder:
             core_memory=core.restored(),
         )
 
-    def _cpu_share(self) -> float | None:
-        """Percent of one core, measured over ``limits.CPU_INTERVAL`` or longer."""
-        now = time.monotonic()
-        if now - self._cpu_known >= limits.CPU_INTERVAL:
-            with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
-                self._cpu, self._cpu_known = self._process.cpu_percent(), now
-        return self._cpu
+    # --- peers --------------------------------------------------------------------------------------------------
 
-    def _memory(self) -> int | None:
-        try:
-            rss: int = self._process.memory_info().rss
-        except OSError:
-            return None
-        return rss
+    def _peers(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
+        """Every peer that is known, by name, and behind them the modules that are not of this mesh."""
+        now, imports = time.monotonic(), self._parts.bridge.topics.imports
+        links = {session.link.guid: session for session in self._parts.bridge.sessions.linked()}
+        yield_to_data()  # a millisecond each with a full roster
+        roster = {view.run.identity.guid: view for view in endpoint.discovery.peers()}
+        yield_to_data()
+        statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
+        infos = []
+        for guid in {*roster, *statuses, *links}:
+            yield_to_data()
+            infos.append(self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now))
+        shown = {
+            (entry.origin.instance, entry.topic)
+            for _, _, entry in yielding_to_data(list(imports))
+            if entry.origin is not None and entry.shown
+        }
+        counts, known = Counter(instance for instance, _ in shown), {info.instance: info for info in infos}
+        relayed = {}  # modules without a link, of which the membership may know too
+        for origin, via in imports.ways:
+            blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
+            changes = {"state": "relayed", "via": via, "topics_in": counts[origin.instance]}
+            relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
+        strangers = [
+            PeerInfo(
+                name=one.identity.name,
+                guid=str(one.identity.guid),
+                instance=one.identity.instance.hex(),
+                state=FOREIGN,
+                since_ago=now - one.since,
+                addresses=_endpoints(one.identity),
+                found_ago=now - one.since,
+                beacon_ago=now - one.heard,
+                last_error=one.problem,
+            )
+            for one in endpoint.discovery.strangers()
+            if one.identity.guid not in {*roster, *statuses, *links}
+        ]
+        own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
+        infos = [info for info in infos if info.instance not in relayed]
+        infos += [*relayed.values(), *strangers]
+        infos.sort(key=lambda info: (info.state == FOREIGN, info.name, info.guid))
+        return mark_shared_addresses(infos, own)
+
+    def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
+        run = view.run if view is not None else None
+        identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
+        since = status.since if status is not None and status.since is not None else run.since if run else now
+        state = "linking"
+        if session is not None:
+            state, since = "linked", session.link.since or now
+        elif status is not None and status.foreign is not None:
+            state = FOREIGN
+        elif run is not None and view is not None and not view.present:
+            state, since = "conflict", run.since
+        elif status is not None and status.state == "refused":
+            state = "refused"
+        next_attempt = status.next_attempt if status is not None else None
+        last_error = status.last_error if status is not None else ""
+        if status is not None and status.foreign is not None:
+            last_error, next_attempt = not_of_this_mesh(status.foreign), None
+        return PeerInfo(
+            name=identity.name,
+            guid=str(identity.guid),
+            instance=identity.instance.hex(),
+            state=state,
+            since_ago=max(0.0, now - since),
+            addresses=_endpoints(identity),
+            found_ago=now - run.since if run else None,
+            beacon_ago=now - run.heard if run else None,
+            source=run.found_by if run else "link",
+            last_error=last_error,
+            next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
+            **self._linked(session, view.conflicts if view is not None else (), now),
+        )
+
+    def _linked(self, session: PeerSession | None, conflicts: tuple[str, ...], now: float) -> dict[str, Any]:
+        """The fields of a peer that its link gives, and its conflicts."""
+        if session is None:
+            return {"conflicts": conflicts}
+        topics, peer = self._parts.bridge.topics, session.peer
+        twins = self._parts.twins.problem(session)
+        fields = {
+            "link": _link(session.link, now),
+            "topics_in": len(topics.imports.offered_by(peer)),
+            "topics_out": topics.exports.topics_for(peer),
+            "conflicts": (*conflicts, twins) if twins else conflicts,
+        }
+        yield_to_data()
+        return fields | {
+            "beyond": tuple(self._beyond(session)),
+            "direct_in": sum(
+                path.session.peer == peer and path.endpoint is not None for path in topics.direct_imports
+            ),
+            "direct_out": sum(owner == peer for owner, _, _ in topics.direct_exports),
+        }
+
+    def _beyond(self, session: PeerSession) -> Iterator[BoundInfo]:
+        """What of a peer this module refuses because of its limits."""
+        topics, services = self._parts.bridge.topics.imports, self._parts.services.imports
+        most, peer, name = self._settings.limits, session.peer, session.link.name
+        nodes = {"topics": topics.refused_nodes(peer), "services": services.refused_nodes(peer)}
+        further = [f"{count} {kind}" for kind, of in nodes.items() if (count := sum(map(len, of.values())))]
+        for hidden, kind, limit in (
+            (len(nodes["topics"].keys() | nodes["services"].keys()), "nodes", most.nodes),
+            (topics.refused(peer), "topics", most.topics),
+            (services.refused(peer), "services", most.services),
+        ):
+            if hidden:
+                what = _count(hidden, kind) + (f" with {' and '.join(further)}" if kind == "nodes" else "")
+                text = f"{what} of {name} stay hidden here: it has more than limits.{kind} = {limit} of this module; "
+                yield BoundInfo(kind=kind, limit=limit, hidden=hidden, text=text + _raise_limit(kind))
+
+    # --- services -----------------------------------------------------------------------------------------------
+
+    def _services_used(self, most: int) -> tuple[Collection[str] | None, int]:
+        """The names to show where at most so many services can be shown, and the number of the other services.
+
+        First the services of this module and those that are or were called, all of them; then the others that are
+        shown, then the hidden ones. A name stands for all services of that name.
+        """
+        services = self._parts.services
+        first, shown, hidden = set(services.exports.seen), Counter[str](), Counter[str]()
+        for _, remote in yielding_to_data(list(services.imports)):
+            known = services.shown(remote)
+            if remote.route or remote.problem or (known is not None and (known.stats.calls or known.mismatch)):
+                first.add(remote.name)
+            (shown if remote.shown else hidden)[remote.name] += 1
+        return first_names(most, first, shown + hidden, (shown.keys() - first, hidden.keys() - shown.keys() - first))
+
+    def _services(self, wanted: Collection[str] | None) -> tuple[ServiceInfo, ...]:
+        """The services of the local graph, without the agent's own, and of the peers: all, or those of some names."""
+        if wanted is not None and not wanted:
+            return ()
+        found = []
+        for service, server in list(self._parts.services.exports.seen.items()):
+            if wanted is None or service in wanted:
+                yield_to_data()
+                found.append(self._own_service(service, server))
+        for peer, remote in yielding_to_data(list(self._parts.services.imports)):
+            if wanted is None or remote.name in wanted:
+                yield_to_data()
+                found.append(self.peers_service(peer, remote))
+        return tuple(sorted(found, key=lambda info: (info.name, info.direction == "in", info.peer)))
+
+    def _own_service(self, service: str, server: LocalService) -> ServiceInfo:
+        services = self._parts.services
+        exports, peer_name = services.exports, services.imports.peer_name
+        about, decision = exports.about.get(service), exports.judge(service, server)
+        callers = tuple(sorted(map(peer_name, exports.callers(service))))
+        direct = services.direct_exports.of(service, server.node)
+        return ServiceInfo(
+            name=service,
+            node=server.node,
+            direction="out",
+            state="home" if service not in exports.offered else "open" if callers else "idle",
+            type=about.type if about else "",
+            md5=about.md5sum if about else "",
+            callers=callers,
+            wanted=self._parts.bridge.context.services.transport(service).value,
+            direct_callers=tuple(sorted(peer_name(peer) for peer, _, _ in direct)),
+            crosses=decision.allowed,
+            policy=decision.rule,
+            **_figures(services.serving.stats.get(service)),
+        )
+
+    def peers_service(self, peer: int, remote: RemoteService) -> ServiceInfo:
+        """A service of a peer, by the number of its session."""
+        services, rules = self._parts.services, self._parts.bridge.context.services
+        shown, decision = services.shown(remote), rules.judge(remote.name, remote.node)
+        figures = _figures(shown.stats if shown else None)
+        figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem
+        direct = services.direct_imports
+        transport: dict[str, Any] = {}
+        if remote.shown and (address := direct.address(peer, remote.name)):
+            transport = {"transport": "direct", "address": address, "lookups": direct.lookups[remote.name]}
+        elif remote.shown:
+            transport = {"transport": "relay"}
+            if (unmet := direct.unmet(remote)) is not None:
+                transport |= {"condition": unmet.condition.value, "relayed_because": unmet.text}
+        return ServiceInfo(
+            name=remote.name,
+            node=remote.node,
+            direction="in",
+            peer=services.imports.peer_name(peer),
+            state=remote.state if remote.shown else "hidden",
+            wire=remote.wire if remote.wire != remote.name else "",
+            type=remote.about.type if remote.about else "",
+            md5=remote.about.md5sum if remote.about else "",
+            wanted=rules.transport(remote.name).value,
+            crosses=decision.allowed,
+            policy=decision.rule,
+            hidden=services.imports.why_hidden(remote)[0],
+            **transport,
+            **figures,
+        )
 
 
 def _files() -> FilesInfo:
@@ -442,3 +426,119 @@ def _files() -> FilesInfo:
         refused=sum(count for name, count in counts.items() if name.startswith("descriptors.refused.")),
         problem=DESCRIPTORS.problem,
     )
+
+
+def _figures(stats: CallStats | None) -> dict[str, Any]:
+    """The fields of a service that its calls give."""
+    if stats is None:
+        return {}
+    known = {name: getattr(stats, name) for name in ("calls", "failed", "active", "problem")}
+    return known | {"latency": SampleSpread.of(SampleSummary.of(stats.latencies)) if stats.latencies else None}
+
+
+def _endpoints(identity: Identity) -> tuple[str, ...]:
+    return tuple(f"{host}:{port}" for host, port in identity.endpoints)
+
+
+def _link(link: PeerLink, now: float) -> LinkInfo:
+    host, port = link.remote_endpoint
+    return LinkInfo(
+        remote=f"{host}:{port}",
+        dialled=link.dialled,
+        up_ago=now - (link.since or now),
+        rtt=link.connection.clock.rtt,
+        clock_offset=link.clock_offset,
+        clock_error=link.clock_error,
+        bytes_in=link.bytes_in,
+        bytes_out=link.bytes_out,
+        queued=link.queue_bytes,
+        dropped=link.dropped,
+        heard_ago=now - link.heard_at,
+        rests=link.rests,
+        lease=link.connection.keepalive.remote_lease,
+        lanes=(
+            _lane(link.express, link.connection.stream),
+            _lane(
+                link.bulk,
+                link.bulk_connection.stream if link.bulk_connection is not None else None,
+                unneeded=not link.bulk_wanted,
+            ),
+        ),
+    )
+
+
+def _lane(lane: LaneSender, stream: Stream | None, *, unneeded: bool = False) -> LaneInfo:
+    """A lane of a link; ``stream`` is that of its connection, while it has one."""
+    return LaneInfo(
+        name=lane.name,
+        connected=stream is not None,
+        unneeded=unneeded,
+        bytes_in=stream.bytes_in if stream is not None else 0,
+        bytes_out=stream.bytes_out if stream is not None else 0,
+        queued=stream.pending_bytes if stream is not None else lane.outbox.pending_bytes,
+        dropped=lane.outbox.dropped.total(),
+    )
+
+
+def _count(hidden: int, kind: str) -> str:
+    return f"{hidden} {kind if hidden > 1 else kind[:-1]}"
+
+
+def _raise_limit(kind: str) -> str:
+    setting = "services.deny" if kind == "services" else "bridge.deny"
+    return f"raise it in rmpa.toml and `rmpa reload`, or deny some by {setting}"
+
+
+# Finds peers that share an IP address with another machine.
+#
+# Each agent has a mesh port of its own, so the GUIDs of two machines with one address differ, and the roster takes
+# them for two agents of one machine. TCP shows the difference: the beacons of both arrive, because multicast needs no
+# reply, but connections to the address reach only one machine, and it refuses the other machine's port.
+
+
+def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tuple[PeerInfo, ...]:
+    """Set the state ``conflict`` for peers whose address seems to be another machine's too.
+
+    Args:
+        peers: All peers.
+        own: This machine's addresses.
+
+    Returns:
+        The same peers in the same order.
+    """
+    holders: dict[str, list[PeerInfo]] = {}
+    for peer in peers:
+        holders.setdefault(_address(peer), []).append(peer)
+    return tuple(_marked(peer, holders[_address(peer)], own) if _unreachable_by_tcp(peer) else peer for peer in peers)
+
+
+def _address(peer: PeerInfo) -> str:
+    return peer.guid.rpartition(":")[0]
+
+
+def _unreachable_by_tcp(peer: PeerInfo) -> bool:
+    """Whether its beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``."""
+    return (
+        peer.state == "linking"
+        and peer.since_ago >= discovery_limits.ADDRESS_SHARED_AFTER
+        and peer.beacon_ago is not None
+        # An agent that was killed sends no beacons after its link has fallen.
+        and peer.beacon_ago < peer.since_ago - discovery_limits.ADDRESS_SHARED_MARGIN
+        and not _address(peer).startswith("127.")
+    )
+
+
+def _marked(peer: PeerInfo, holders: Sequence[PeerInfo], own: Collection[str]) -> PeerInfo:
+    address = _address(peer)
+    others = [f"peer {other.name}" for other in holders if other is not peer]
+    if address in own:
+        others.append("this machine")
+    if not others:
+        return peer
+    port = peer.guid.partition("#")[0].rpartition(":")[2]
+    text = (
+        f"its address {address} is also that of {' and '.join(others)}, and its port {port} does not answer there: "
+        "two machines seem to have one address; give one of them another (was an image copied with its address?), "
+        f"or, if both run on one machine, open port {port} in its firewall"
+    )
+    return msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text))

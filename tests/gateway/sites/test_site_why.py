@@ -27,8 +27,8 @@ from rmpa.gateway.sites.why import (
     parse_ways,
     sent_stages,
 )
+from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
-from rmpa.observe.peers_section import INFO, PARAM, REPORT, WHY
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.trust.permissions import Permissions

@@ -8,8 +8,9 @@ from typing import Any, cast
 
 import pytest
 
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
-from rmpa.observe.peers_section import INFO, PARAM, REPORT, SiteRequests
+from rmpa.observe.operations import INFO, PARAM, REPORT, SiteRequests
 
 
 def peer(name: str) -> Any:
@@ -55,8 +56,8 @@ class Gateway:
 
 
 def requests(rpc: Rpc, *peers: str, gate: Gate | None = None) -> SiteRequests:
-    gates = (cast("Any", gate),) if gate is not None else ()
-    return SiteRequests(cast("Any", rpc), lambda: [peer(name) for name in peers], *gates)
+    sessions = SimpleNamespace(linked=lambda: [peer(name) for name in peers])
+    return SiteRequests(cast("Any", SimpleNamespace(rpc=rpc, sessions=sessions, gate=gate or OPEN_GATE)))
 
 
 NO_GATEWAY = PeerRefused("arm", "this agent does not know the question 'site.info'")

@@ -8,7 +8,7 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 from rmpa.observe.control_server import ControlServer
-from rmpa.observe.snapshot_builder import GraphRevisions
+from rmpa.observe.operations import GraphRevisions
 from rmpa.web.server.agent_watch import GraphSignal
 from tests.ros.node.peers import DEADLINE, LATCHED, until
 from tests.web.hub.client import local_core, node, running_hub

@@ -23,8 +23,8 @@ from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
+from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SiteSourceInfo, SitesReport
-from rmpa.observe.peers_section import INFO, REPORT, WHY
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.services import Ros2Part
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
-    from rmpa.observe.peers_section import SiteAnswerer
+    from rmpa.observe.operations import SiteAnswerer
     from rmpa.observe.why.diagnosis import Diagnosis
 
 
@@ -243,7 +243,7 @@ class Ros2Answers:
         self._may = may
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
-        """The reply to one question of ``observe.peers_section``; raises as that says."""
+        """The reply to one question of ``observe.operations``; raises as that says."""
         site = str(args.get("site") or "")
         if what == WHY:
             name, module = (str(args.get(key) or "") for key in ("name", "module"))

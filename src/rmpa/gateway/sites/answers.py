@@ -21,8 +21,8 @@ from rmpa.gateway.sites.plans import SitePart
 from rmpa.gateway.sites.services import SiteActions, SiteServiceExports, SiteServiceImports
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.why import ACCESS, SiteWhy
+from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
-from rmpa.observe.peers_section import INFO, PARAM, REPORT, WHY
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust.permissions import refusal
 
@@ -86,7 +86,7 @@ class SiteAnswers(SitePart):
         self._why.close()
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
-        """The reply to one question of ``observe.peers_section``; raises as that says."""
+        """The reply to one question of ``observe.operations``; raises as that says."""
         if what == REPORT:
             return self._report(self._site_names(), asker, sources=False)
         if what == WHY:

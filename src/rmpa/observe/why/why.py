@@ -17,9 +17,9 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.doctor.machine import judge_peer_clock
+from rmpa.observe.operations import WHY as WHY_SITES
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, PeerAgent
 from rmpa.observe.peer_info import INFO as AGENT_INFO
-from rmpa.observe.peers_section import WHY as WHY_SITES
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     BothEnds,
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.observe.operations import SiteRequests
     from rmpa.observe.peer_info import LinkInfo, PeerInfo
-    from rmpa.observe.peers_section import SiteRequests
     from rmpa.observe.snapshot import Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.external import Core

@@ -8,8 +8,8 @@ import pytest
 
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway.ros2.ros2 import Ros2Answers
+from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SitesReport
-from rmpa.observe.peers_section import INFO, PARAM, REPORT, WHY
 from tests.gateway.memory_zenoh import eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, topic_bed
 

@@ -1,0 +1,418 @@
+"""The facts of the topics of an agent: the local graph, the routes across the mesh, their figures and transports.
+
+The snapshot, ``/diagnostics``, ``rmpa why``, ``/metrics`` and the page are views of what is collected here.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import chain
+from typing import TYPE_CHECKING, Any, cast
+
+from rmpa.bridge.data.export import ReliableRouteSender
+from rmpa.bridge.data.quality import PeerClockHistory, QosEventKind, shown_seconds
+from rmpa.bridge.direct.conditions import Condition, Want, unmet_by_contract
+from rmpa.bridge.direct.paths import AGENTS
+from rmpa.bridge.peer_offers import CONFLICT, CROWDED
+from rmpa.bridge.policy import PolicyDecision
+from rmpa.config.rules import CLOCK
+from rmpa.core import limits
+from rmpa.core.contract import KEYS, Contract, Transport
+from rmpa.core.identity import is_own
+from rmpa.observe.peer_info import ContractTerm
+from rmpa.observe.snapshot import (
+    EventInfo,
+    LatencyInfo,
+    RouteInfo,
+    SampleSpread,
+    SubscriberTransport,
+    TopicInfo,
+    UnreachableInfo,
+)
+from rmpa.ros.wire.tcpros import LENGTH
+from rmpa.runtime.loop import SystemClock, sorted_yielding, yield_to_data, yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.bridge.data.quality import QosWatch, QualitySummary
+    from rmpa.bridge.messages import Source
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.exports import LocalSource
+    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.ros.core.external import Core
+
+_DEFAULT = Contract()
+
+
+class TopicFacts:
+    """Reads what core and bridge know of topics; changes nothing.
+
+    It yields to data between two topics. What it iterates over is a copy, because data may change the routes.
+
+    Args:
+        core: The agent's ROS core.
+        bridge: Its bridge.
+    """
+
+    def __init__(self, core: Core, bridge: Bridge) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._clock = SystemClock()
+        self._peer_clocks: dict[int, PeerClockHistory] = {}
+        """Over the last minute, by the session's number; those of peers that are away for a moment are kept."""
+
+    def follow_clocks(self) -> None:
+        """Record each link's estimate of its peer's clock, once a second; forget peers that are gone."""
+        before, self._peer_clocks = self._peer_clocks, {}
+        for session in self._bridge.sessions:
+            clock = self._peer_clocks[session.peer] = before.get(session.peer) or PeerClockHistory()
+            offset, error = session.link.clock_offset, session.link.clock_error
+            if offset is not None and error is not None and session.linked:
+                clock.add(offset, error, self._clock.now())
+
+    def contract(self, topic: str, type_name: str) -> dict[str, ContractTerm]:
+        """The terms of a topic's contract by the settings, by key; ``type_name`` may be empty."""
+        return {
+            key: ContractTerm(value=cast("str | float | None", value), rule=rule)
+            for key, (value, rule) in self._bridge.context.contracts.explain(topic, type_name).items()
+        }
+
+    def unreachable(self) -> tuple[UnreachableInfo, ...]:
+        """The nodes of the local graph to which no connection can be made, by name."""
+        now = self._clock.now()
+        return tuple(
+            UnreachableInfo(
+                node=node, uri=found.api, problem=found.problem, ago=now - found.since, withdrawn=found.withdrawn
+            )
+            for node, found in sorted(self._core.unreachable().items())
+        )
+
+    def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
+        """All topics of the local graph and of the peers, by name; or those that are wanted."""
+        if wanted is not None and not wanted:
+            return ()
+        state = self._core.state()
+        routes: dict[str, list[RouteInfo]] = {}
+        mismatches: dict[str, list[str]] = {}
+        self.follow_clocks()
+        for topic, info, texts in chain(self._incoming(wanted), self._outgoing(wanted)):
+            if info is not None:
+                routes.setdefault(topic, []).append(info)
+            mismatches.setdefault(topic, []).extend(texts)
+        tables = (state.publishers, state.subscribers, routes)
+        names: Iterable[str] = chain(*tables) if wanted is None else wanted
+        known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
+        unreachable = {info.node: str(info) for info in self.unreachable()}
+        found = []
+        for name in sorted_yielding(known):
+            yield_to_data()
+            nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
+            own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
+            decision = self._decision(name, type_name, own[0] if own else "/")
+            topic_info = TopicInfo(
+                name=name,
+                type=type_name or next((route.type for route in crossing), ""),
+                md5=next((route.md5 for route in crossing if route.md5), ""),
+                publishers=own,
+                subscribers=tuple(node for node in state.subscribers.get(name, ()) if not is_own(node)),
+                routes=crossing,
+                crosses=decision.allowed,
+                policy=decision.rule,
+                mismatches=tuple(mismatches.get(name, ())),
+                unreachable=tuple(unreachable[node] for node in nodes if node in unreachable),
+            )
+            found.append(topic_info)
+        return tuple(found)
+
+    def used(self, most: int) -> tuple[Collection[str] | None, int]:
+        """The topics to show where at most so many can be shown, and the number of the others.
+
+        First those with a node of this module or an open route, all of them, then those with a problem, then others.
+
+        Returns:
+            The topics, ``None`` for all, and how many are left out.
+        """
+        state, topics = self._core.state(), self._bridge.topics
+        idle: set[str] = set()
+        first, problems = set(state.subscribers), set()
+        for _, source, entry in yielding_to_data(list(topics.imports)):
+            if entry.state != "idle" or entry.direct:
+                first.add(entry.topic)
+            elif not entry.shown or entry.problem or topics.mismatches(source):
+                problems.add(entry.topic)
+            else:
+                idle.add(entry.topic)
+        first.update(source.topic for source in yielding_to_data(topics.exports.offered))
+        others = idle | problems
+        first.update(name for name in yielding_to_data(state.publishers) if name not in others)
+        return first_names(most, first, {}, (problems - first, idle - problems - first))
+
+    def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
+        """Whether a topic of this module may cross."""
+        decision = self._bridge.context.policy.judge(name, type_name, node)
+        follow = self._bridge.context.settings.time.follow
+        if name == CLOCK and follow and not decision.allowed:
+            text = f'time.follow = "{follow}": that module\'s comes here; one of this module stays home'
+            return PolicyDecision(True, text)
+        return decision
+
+    def _incoming(self, wanted: Collection[str] | None) -> Iterator[tuple[str, RouteInfo, list[str]]]:
+        """The topic of each source of a peer with its route, and its mismatches."""
+        sessions = {session.peer: session for session in self._bridge.sessions}
+        for peer, source, entry in yielding_to_data(list(self._bridge.topics.imports)):
+            if wanted is not None and entry.topic not in wanted:
+                continue
+            yield_to_data()
+            texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
+            texts += self._bridge.topics.mismatches(source)
+            yield entry.topic, self.incoming(sessions[peer], source, entry), texts
+
+    def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
+        """The route of a peer's source; ``source`` has its wire name. ``follow_clocks`` was called before."""
+        topics, contracts = self._bridge.topics.of(session), self._bridge.context.contracts
+        flow, publication = topics.flow(source), topics.publication(source)
+        about, now = entry.description, self._clock.now()
+        latched = about.latching if about is not None else False
+        problem = session.proxies.problems.get(source.node, "")
+        if not problem and entry.state != "open":
+            problem = entry.problem
+        figures = {}
+        if flow is not None:
+            figures = {
+                "oversized": flow.oversized,
+                "oversized_bytes": flow.oversized_bytes,
+                "late": flow.counts["late"] + flow.counts["stale"],
+                "expired": flow.counts["expired"],
+                "lane": flow.lane,
+                **_quality(flow.quality.summary(self._peer_clocks[session.peer], now, latching=latched)),
+            }
+        return RouteInfo(
+            peer=session.link.name,
+            node=source.node,
+            direction="in",
+            wire=source.topic if source.topic != entry.topic else "",
+            state="hidden" if not entry.shown else entry.state,
+            type=entry.type,
+            md5=about.md5 if about is not None else "",
+            dropped=publication.dropped if publication is not None else 0,
+            latched=latched,
+            contract=_terms(entry.contract or contracts.of(source.topic, entry.type)),
+            problem=entry.hidden or problem,
+            limit="nodes" if entry.cause == CROWDED else "",
+            **_events(topics.watch(source), now),
+            **self._transport(session, source, contracts.of(entry.topic, entry.type), now),
+            **figures,
+        )
+
+    def _transport(self, session: PeerSession, source: Source, contract: Contract, now: float) -> dict[str, Any]:
+        """The fields of a peer's route that say which subscribers are direct, and why others are relayed.
+
+        Args:
+            session: The peer.
+            source: The source, by its wire name.
+            contract: This module's for the topic.
+            now: Monotonic seconds.
+        """
+        paths = self._bridge.topics.direct_imports
+        subscribers = []
+        for path in paths.of(session.peer, source.topic, source.node):
+            endpoint, unmet = path.endpoint, path.unmet
+            one = SubscriberTransport(
+                node=path.want.user,
+                transport="direct" if endpoint is not None else "relay" if path.place == AGENTS else "",
+                state=path.state,
+                since_ago=now - (path.placed_at if endpoint is not None else path.since),
+                wanted=path.contract.transport.value,
+                endpoint=f"{endpoint[0]}:{endpoint[1]}" if endpoint is not None else "",
+                condition=unmet.condition.value if unmet is not None else "",
+                text=unmet.text if unmet is not None else "",
+                **_interruptions(paths.interruptions.get((session.link.name, path.want)), now),
+            )
+            subscribers.append(one)
+        # RMPA's own tools count only if no other subscriber is relayed.
+        relayed = [one for one in subscribers if one.state == "relayed"]
+        reason = min(relayed, key=lambda one: one.condition == Condition.MEASURES, default=None)
+        condition, text = (reason.condition, reason.text) if reason is not None else ("", "")
+        publication = self._bridge.topics.of(session).publication(source)
+        carried = publication is not None and publication.subscribers > 0
+        if (
+            carried
+            and not condition
+            and contract.transport is Transport.RELAY
+            and (unmet_here := unmet_by_contract(contract, "this module")) is not None
+        ):
+            condition, text = unmet_here.condition.value, unmet_here.text
+        return {
+            "transport": _transport_name(
+                direct=any(one.transport == "direct" for one in subscribers), relayed=carried
+            ),
+            "condition": condition,
+            "condition_text": text,
+            "subscribers": tuple(subscribers),
+        }
+
+    def _outgoing(self, wanted: Collection[str] | None) -> Iterator[tuple[str, RouteInfo | None, list[str]]]:
+        """The topic of each source of this module with its mismatches, then with its route to each peer that uses it.
+
+        A route is ``open``, ``idle`` (the peer's subscribers are connected directly) or ``away``.
+        """
+        exports, sessions = self._bridge.topics.exports, self._bridge.sessions
+        names = {session.peer: session.link.name for session in sessions.linked()}
+        for source, local in yielding_to_data(list(exports.offered.items())):
+            if wanted is not None and source.topic not in wanted:
+                continue
+            yield_to_data()
+            yield source.topic, None, list(self._bridge.topics.mismatches(source))
+            flowing = list(exports.flowing(source))
+            for peer in flowing:
+                route = self._route_to(
+                    peer, names.get(peer, ""), source, local, "open", exports.contract(source, peer)
+                )
+                yield source.topic, route, []
+            grants = self._bridge.topics.direct_exports.of(source.topic, source.node)
+            for peer in dict.fromkeys(peer for peer, _, _ in grants):
+                session = sessions.get(peer)
+                if peer not in flowing and session is not None:
+                    yield source.topic, self._route_to(peer, session.link.name, source, local, "idle"), []
+            for peer, contract in exports.absent(source).items():
+                if peer not in names or exports.contract(source, peer) is None:
+                    name, seconds = self._bridge.topics.losses.away(peer)
+                    kept = shown_seconds(float(contract.outage or limits.RESUME_WINDOW))
+                    text = f"{name} is away for {shown_seconds(seconds)}; messages are kept for {kept}"
+                    yield source.topic, self._route_to(peer, name, source, local, "away", contract, text), []
+
+    def _route_to(
+        self,
+        peer: int,
+        name: str,
+        source: Source,
+        local: LocalSource,
+        state: str,
+        contract: Contract | None = None,
+        problem: str = "",
+    ) -> RouteInfo:
+        topics = self._bridge.topics
+        about, offer = topics.exports.description(source), topics.exports.offer(peer, source)
+        flow = topics.outbound.flows.get(source)
+        route = flow.by_peer.get(peer) if flow is not None else None
+        kept = route.sender if isinstance(route, ReliableRouteSender) else None
+        subscribers = self._granted(peer, source) if state != "away" else ()
+        figures = {}
+        if flow is not None:
+            figures = {name: getattr(flow, name) for name in ("messages", "dropped", "oversized", "oversized_bytes")}
+            figures["bytes"] = flow.bytes - LENGTH.size * flow.messages
+        return RouteInfo(
+            peer=name,
+            node=source.node,
+            direction="out",
+            state=state,
+            type=local.type,
+            md5=about.md5 if about is not None else "",
+            lost=kept.lost if kept is not None else 0,
+            kept=kept.pending if kept is not None else 0,
+            latched=about.latching if about is not None else False,
+            wire=offer.topic if offer is not None and offer.topic != source.topic else "",
+            lane=route.lane if route is not None else "",
+            contract=_terms(contract or self._bridge.context.contracts.of(source.topic, local.type)),
+            problem=problem,
+            transport=_transport_name(direct=bool(subscribers), relayed=state == "open"),
+            subscribers=subscribers,
+            **figures,
+        )
+
+    def _granted(self, peer: int, source: Source) -> tuple[SubscriberTransport, ...]:
+        """A peer's subscribers that may connect to a local source directly, by name."""
+        exports, session = self._bridge.topics.direct_exports, self._bridge.sessions.get(peer)
+        known = exports.interruptions if session is not None else {}
+        link = session.link.name if session is not None else ""
+        return tuple(
+            SubscriberTransport(
+                node=name,
+                transport="direct",
+                state="granted",
+                endpoint=str(grant.port),
+                **_interruptions(known.get((link, Want(source.topic, source.node, name))), self._clock.now()),
+            )
+            for owner, name, grant in exports.of(source.topic, source.node)
+            if owner == peer
+        )
+
+
+def first_names(
+    most: int, first: set[str], counts: Mapping[str, int], groups: Iterable[Collection[str]]
+) -> tuple[Collection[str] | None, int]:
+    """The names to show where at most so many entries can be shown.
+
+    Args:
+        most: How many entries.
+        first: The names that are all shown; added to.
+        counts: How many entries a name stands for; one where it is not there.
+        groups: Further names, the more important ones first.
+
+    Returns:
+        The names, ``None`` for all, and how many entries are left out.
+    """
+    room, left = most - sum(counts.get(name) or 1 for name in first), 0
+    for name in chain(*map(sorted_yielding, groups)):
+        count = counts.get(name, 1)
+        if room >= count and not left:
+            first.add(name)
+            room -= count
+        else:
+            left += count
+    return (first, left) if left else (None, 0)
+
+
+def _interruptions(found: tuple[int, float, float | None] | None, now: float) -> dict[str, Any]:
+    """The fields of a subscriber that say when it was without its path."""
+    if found is None:
+        return {}
+    count, began, ended = found
+    over = {} if ended is None else {"interrupted_ago": now - ended}
+    return {"interruptions": count, "interrupted": (now if ended is None else ended) - began, **over}
+
+
+def _transport_name(*, direct: bool, relayed: bool) -> str:
+    if direct:
+        return "both" if relayed else "direct"
+    return "relay" if relayed else ""
+
+
+def _known(figure: float) -> float | None:
+    return None if math.isnan(figure) else figure
+
+
+def _quality(quality: QualitySummary) -> dict[str, Any]:
+    """The fields of a route that its quality gives."""
+    latency = None
+    if quality.latency is not None and quality.latency_last is not None and quality.latency_error is not None:
+        latency = LatencyInfo.of(quality.latency, last=quality.latency_last, error=quality.latency_error)
+    return {
+        "messages": quality.messages,
+        "bytes": quality.bytes - LENGTH.size * quality.messages,
+        "age": quality.age,
+        "rate": _known(quality.rate),
+        "bandwidth": _known(quality.bandwidth - LENGTH.size * quality.rate),
+        "period": SampleSpread.of(quality.period) if quality.period.count else None,
+        "jitter": _known(quality.jitter),
+        "latency": latency,
+    }
+
+
+def _events(watch: QosWatch | None, now: float) -> dict[str, Any]:
+    """The fields of a route that its contract's events give."""
+    if watch is None:
+        return {}
+    recent = tuple(
+        EventInfo(kind=event.kind.value, count=event.count, text=event.text, ago=now - event.now)
+        for event in watch.recent
+    )
+    events = {kind.value: count for kind, count in watch.counts.items()}
+    return {"events": events, "recent": recent, "lost": watch.counts[QosEventKind.MESSAGES_LOST]}
+
+
+def _terms(contract: Contract) -> dict[str, str | float | None]:
+    """The terms of a contract that differ from the default."""
+    return {key: getattr(contract, key) for key in KEYS if getattr(contract, key) != getattr(_DEFAULT, key)}
