@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -12,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pandas.testing import assert_frame_equal
 
-from lab.frames import counting_from, frame, kinds, latencies, lost, pairs, read, source_periods, write
-from lab.words import counted
+from lab.frames import frame, kinds, lost, read, write
 
 if TYPE_CHECKING:
     from lab.experiments.model import Value
@@ -30,11 +28,6 @@ def test_the_file_is_plain_csv() -> None:
     file = io.StringIO()
     write(file, frame(("topic", "due_ns", "late", "first"), [("/cmd", 12, 0.5, True), ('/a "b"', 13, 1e-9, False)]))
     assert file.getvalue() == 'topic,due_ns,late,first\n/cmd,12,0.5,True\n"/a ""b""",13,1e-09,False\n'
-
-
-def test_what_columns_hold() -> None:
-    table = frame(tuple("abcdef"), [(1, 1.0, "x", True, None, None), (2, 2.0, "", False, None, 7.5)])
-    assert list(kinds(table).values()) == ["int", "float", "str", "bool", "none", "float?"]
 
 
 COLUMNS = st.one_of(
@@ -56,17 +49,6 @@ COLUMNS = st.one_of(
 def test_each_value_comes_back_as_it_was(columns: list[list[Value]]) -> None:
     table = frame([f"c{number}" for number in range(len(columns))], list(zip(*columns, strict=True)))
     assert_frame_equal(there_and_back(table), table, check_dtype=False, check_exact=True)
-
-
-def test_figures_that_are_not_numbers_come_back() -> None:
-    values = there_and_back(frame(("x",), [(math.inf,), (-math.inf,), (math.nan,)]))["x"].tolist()
-    assert values[:2] == [math.inf, -math.inf]
-    assert math.isnan(values[2])
-
-
-def test_a_table_without_rows_keeps_its_columns() -> None:
-    back = there_and_back(frame(("a", "b"), []))
-    assert (list(back.columns), len(back)) == (["a", "b"], 0)
 
 
 def test_tables_of_older_runs_are_read() -> None:
@@ -106,28 +88,6 @@ CAME = frame(
 SENT = frame(("rate", "sequence", "late_ns"), [(10, 1, 500), (10, 0, 100), (10, 2, 0), (20, 0, 5)])
 
 
-def test_rows_are_chosen_by_what_stands_in_a_column() -> None:
-    assert pairs(CAME, rate=10) == [(0, 1_500_000), (2, 3_250_000)]
-    assert pairs(CAME, rate=30) == []
-    assert latencies(CAME, rate=10) == [0.5, 0.25]
-    assert latencies(CAME) == [0.5, 0.25, 2.0]
-
-
 def test_what_was_sent_and_never_came_is_lost_whatever_came_twice() -> None:
     assert lost(CAME, SENT, rate=10) == 1
     assert lost(pd.concat([CAME, CAME[2:]]), SENT, rate=20) == 0
-
-
-def test_the_sources_periods_are_in_the_order_of_the_sequence() -> None:
-    assert source_periods(SENT, 10.0, rate=10) == pytest.approx([0.1 + 400e-9, 0.1 - 500e-9], abs=1e-12)
-
-
-def test_messages_before_a_number_are_left_out() -> None:
-    assert pairs(counting_from(CAME, 1)) == [(2, 3_250_000)]
-
-
-@pytest.mark.parametrize(
-    ("value", "factor", "text"), [(None, 2.0, "-"), (0.0012345, 1e3, "1.23"), (12.345678, 1e3, "12,346")]
-)
-def test_figures_for_tables(value: float | None, factor: float, text: str) -> None:
-    assert counted(value, factor=factor) == text

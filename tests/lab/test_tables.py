@@ -12,7 +12,7 @@ from rich.console import Console
 from lab import results
 from lab.figures import shapes
 from lab.findings import Claim
-from lab.tables import dash, ratio, size, us
+from lab.tables import dash, size, us
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,10 +47,6 @@ def test_a_measurement_ends_with_verdicts_a_file_and_a_picture(
     assert [row["reached"] for row in document["result"]["targets"]] == [False, None]
     assert (document["measurement"], document["settings"]) == ("short", {"hz": 1})
     assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".json", ".png", ".svg"]
-
-
-def test_there_is_no_ratio_without_both() -> None:
-    assert [ratio(3.0, 2.0), ratio(None, 2.0), ratio(1.0, None), ratio(1.0, 0.0)] == [1.5, None, None, None]
 
 
 def test_numbers_as_text() -> None:

@@ -55,16 +55,6 @@ def test_lost_and_doubled_are_counted() -> None:
     assert (arrivals.lost, arrivals.doubled) == (2, 1)
 
 
-def test_nothing_that_came_is_nothing() -> None:
-    arrivals = parse(frame(COLUMNS, []), [0, 0, 0], 1)
-    assert (arrivals.lost, arrivals.periods(), arrivals.step, arrivals.bytes_per_second(64, 0, 99)) == (
-        2,
-        [],
-        0.0,
-        0.0,
-    )
-
-
 def test_throughput_counts_what_came_between_two_moments() -> None:
     arrivals = made(dict.fromkeys(range(11), 0.0), sent=11)
     assert arrivals.bytes_per_second(1000, 0, 1000 * MS) == pytest.approx(100_000)

@@ -25,10 +25,6 @@ def no_root(plan: Plan) -> str:
     return "network namespaces need root" if plan.bed == "namespaces" else ""
 
 
-def no_ros(plan: Plan) -> str:
-    return "ROS 1 is not installed" if plan.bed == "namespaces" or plan.clients != ("own",) else ""
-
-
 def test_nothing_asked_is_the_whole_evaluation_where_that_can_be() -> None:
     assert choose(Asked(), everything) == (Plan("full", "namespaces", ("rospy", "roscpp"), "100mbit", 1), "")
 
@@ -37,14 +33,6 @@ def test_without_root_all_is_on_loopback_and_that_is_said() -> None:
     plan, note = choose(Asked(), no_root)
     assert plan == Plan("full", "loopback", ("own",), "", 1)
     assert note == "network namespaces need root: all on loopback, with our own nodes and core"
-
-
-def test_without_root_ros_nodes_may_be_asked_for_on_loopback() -> None:
-    plan, note = choose(Asked(clients=("roscpp",)), no_root)
-    assert (plan.bed, plan.clients) == ("loopback", ("roscpp",))
-    assert note.endswith("all on loopback, with our own core")
-    with pytest.raises(StartError, match="everything on loopback: ROS 1 is not installed"):
-        choose(Asked(clients=("roscpp",)), no_ros)
 
 
 @pytest.mark.parametrize(

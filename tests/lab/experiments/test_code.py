@@ -45,21 +45,6 @@ def test_the_digest_changes_with_what_measures_and_not_with_what_shows(tmp_path:
 
 
 @pytest.mark.git
-def test_a_clone_knows_its_commit_and_whether_it_was_changed(tmp_path: Path) -> None:
-    where = package(tmp_path)
-    assert (code_here(where).commit, code_here(where).changed) == ("", False)
-    git(tmp_path, "init", "-q")
-    assert (code_here(where).commit, code_here(where).changed) == ("", False)  # within a clone, and not part of it
-    git(tmp_path, "add", "rmpa")
-    git(tmp_path, "commit", "-q", "-m", "x")
-    commit = git(tmp_path, "rev-parse", "--short", "HEAD")
-    (tmp_path / "notes.txt").write_text("not of the package")
-    assert (code_here(where).commit, code_here(where).changed) == (commit, False)
-    (where / "mesh.py").write_text("x = 2\n")
-    assert (code_here(where).commit, code_here(where).changed) == (commit, True)
-
-
-@pytest.mark.git
 def test_what_is_measured_counts_as_what_measures_does(tmp_path: Path) -> None:
     measures, measured = package(tmp_path / "lab"), package(tmp_path / "src")
     git(tmp_path, "init", "-q")

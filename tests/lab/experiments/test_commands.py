@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import signal
 import subprocess
@@ -16,9 +15,6 @@ from lab.__main__ import main
 from lab.bed import stage
 from lab.bed.processes import BedError
 from lab.experiments import code, runner
-from lab.experiments.estimate import Estimate
-from lab.experiments.model import Cell
-from lab.experiments.progress import Bars, Lines
 from lab.experiments.registry import EXPERIMENTS
 from lab.experiments.store import Store
 from tests.lab.experiments import fakes
@@ -28,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from lab.bed.plan import Plan
+    from lab.experiments.model import Cell
 
 DEADLINE = 60.0
 ROOT = Path(__file__).parents[3]
@@ -59,20 +56,6 @@ def lab(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]
     code = main(["experiment", *words])
     out, err = capsys.readouterr()
     return code, out, err
-
-
-def test_list_says_what_there_is_and_where_it_would_run(
-    fake: FakeExperiment, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = lab(capsys, "list")
-    assert code == 0
-    assert out.splitlines() == [
-        "NAME  CELLS    TIME  SHORT  WHAT IT MEASURES",
-        "fake      4  16.0 s  4.0 s  nothing at all",
-        "",
-        "here: all on loopback, our own nodes, full",
-    ]
-    assert err == "! network namespaces need root: all on loopback, with our own nodes and core\n"
 
 
 def test_list_as_json(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,14 +103,6 @@ def test_a_run_as_json_is_one_document(fake: FakeExperiment, capsys: pytest.Capt
         }
     ]
     assert Path(said["html"]).exists()
-
-
-def test_without_out_each_run_has_a_directory_of_its_date(
-    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert lab(capsys, "run", "--short")[0] == 0
-    (made,) = (tmp_path / "rmpa-experiments").iterdir()
-    assert Store.load(made).names == ["fake"]
 
 
 def test_a_run_goes_on_with_what_is_missing_as_it_was_begun(
@@ -178,11 +153,6 @@ def test_what_cannot_be_is_said_and_leaves_nothing_behind(
     assert (code, out) == (2, "")
     assert said in err
     assert not list(tmp_path.iterdir())
-
-
-def test_hosts_that_cannot_be_are_said(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = lab(capsys, "run", "--bed", "namespaces")
-    assert (code, err) == (1, "lab: hosts as network namespaces: network namespaces need root\n")
 
 
 def test_the_report_can_be_written_again(
@@ -261,61 +231,3 @@ def test_a_signal_leaves_a_run_to_go_on_with(
     assert code == 0
     assert "short; 2 cells" in out
     assert set(fake.tried) == {"system-classic_rate-20_round-1", "system-rmpa_rate-20_round-1"}
-
-
-def test_who_may_write_nothing_is_told(
-    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "file").write_text("")
-    code, _, err = lab(capsys, "run", "--out", "file/run")
-    assert code == 1
-    assert err.splitlines()[-1].startswith("lab: file/run: cannot be written to")
-
-
-CELLS = [Cell("rates", {"system": "rmpa", "rate": rate}, seconds=10.0) for rate in (10, 20)]
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def test_one_line_a_cell_where_nobody_looks() -> None:
-    clock, lines = Clock(), list[str]()
-    watcher = Lines(Estimate([10.0, 10.0]), lines.append, clock)
-    watcher.cell_begins(CELLS[0], 1)
-    clock.now += 20
-    watcher.cell_ends(CELLS[0], 20.0)
-    watcher.cell_begins(CELLS[1], 1)
-    watcher.cell_fails(CELLS[1], "BedError: it is gone\n    log", again=True)
-    watcher.cell_begins(CELLS[1], 2)
-    watcher.cell_fails(CELLS[1], "Traceback (most recent call last):\n  File\nKeyError: 'x'", again=False)
-    assert lines == [
-        "[1/2] rates system=rmpa rate=10: 20.0 s, about 20.0 s left",
-        "[1/2] rates system=rmpa rate=20 failed, and is tried again: BedError: it is gone",
-        "[2/2] rates system=rmpa rate=20 failed: KeyError: 'x'",
-    ]
-
-
-def test_two_bars_on_a_terminal() -> None:
-    from rich.console import Console
-
-    clock, console = Clock(), Console(width=120, record=True, file=io.StringIO())
-    bars = Bars(Estimate([10.0, 10.0]), console, clock)
-    bars.cell_begins(CELLS[0], 1)
-    clock.now += 5
-    console.print(bars.render())
-    bars.cell_fails(CELLS[0], "BedError: [red]gone", again=True)
-    bars.cell_begins(CELLS[0], 2)
-    console.print(bars.render())
-    bars.cell_ends(CELLS[0], 5.0)
-    console.print(bars.render())
-    text = console.export_text()
-    assert "0 of 2 cells, 5.0 s, about 15.0 s left" in text
-    assert "5.0 s of about 10.0 s: system=rmpa rate=10" in text
-    assert "! rates system=rmpa rate=10 failed, and is tried again: BedError: [red]gone" in text
-    assert "5.0 s of about 10.0 s, second attempt: system=rmpa rate=10" in text
-    assert "1 of 2 cells, 5.0 s, about 5.0 s left" in text

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.contenders import CLASSIC, DEFAULTS, DIRECT, RMPA, contender_of
-from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate, phases, rounds
+from lab.experiments.contenders import DIRECT, contender_of
+from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate
 from lab.experiments.model import Cell, Measured, Results
 from lab.frames import frame
 
@@ -53,22 +53,15 @@ def claim(claims: tuple[Claim, ...], words: str) -> Claim:
     return found
 
 
+# --- cells ----------------------------------------------------------------------------------------------------------
+
+
 def by_system(cell: Cell) -> Measured:
     if contender_of(cell) == DIRECT:
         return made(0.315, 1.05, 60.0 if cell.settings["mode"] == "polled" else 0.46)
     if cell.settings["system"] == "rmpa":
         return made(0.6, 0.9, 60.3 if cell.settings["mode"] == "polled" else 0.5)
     return made(0.3, 1.0, 60.0 if cell.settings["mode"] == "polled" else 0.4)
-
-
-# --- cells ----------------------------------------------------------------------------------------------------------
-
-
-def test_systems_take_turns_and_another_one_begins_each_round() -> None:
-    cells = [contender_of(cell) for cell in EXPERIMENT.cells(FULL) if cell.settings["round"] == 4]
-    turns = [tuple(cells[at : at + 3]) for at in range(0, len(cells), 3)]
-    assert all({*one} == {CLASSIC, RMPA, DIRECT} for one in turns)
-    assert len({one[0] for one in turns}) == len(turns)
 
 
 def test_both_systems_get_the_same_phase_in_a_round() -> None:
@@ -80,26 +73,6 @@ def test_both_systems_get_the_same_phase_in_a_round() -> None:
             assert "phase_ms" not in cell.settings
     assert all(len(phase) == 1 for phase in given.values())
     assert len(set.union(*given.values())) == len(given) > 1
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_phases_cover_the_period_evenly_and_keep_away_from_its_ends(seed: int) -> None:
-    found = phases(seed, 4)
-    assert [int((phase - 10) // 20) for phase in sorted(found)] == [0, 1, 2, 3]
-    assert found == phases(seed, 4)
-
-
-def test_relays_stand_beside_the_event_driven_node_only() -> None:
-    relayed = [cell.settings for cell in EXPERIMENT.cells(FULL) if cell.settings.get("relays")]
-    assert [(cell["mode"], cell["round"]) for cell in relayed] == [("event", 1), ("event", 2), ("event", 3)]
-
-
-def test_classic_without_nodelay_stands_beside_the_full_run_only() -> None:
-    def without(plan: Plan) -> int:
-        return sum(cell.settings.get("nodelay") is False for cell in EXPERIMENT.cells(plan))
-
-    assert without(Plan()) > 0
-    assert without(Plan(size="short")) == 0
 
 
 # --- findings -------------------------------------------------------------------------------------------------------
@@ -131,17 +104,6 @@ def test_the_claims_hold_each_round_against_its_neighbour() -> None:
     assert polled.paper == pytest.approx(0.59)
 
 
-def test_relays_are_the_bound_that_rmpa_must_not_exceed() -> None:
-    def measure(cell: Cell) -> Measured:
-        if cell.settings.get("relays"):
-            return made(0.3, 0.3, 0.8)
-        return made(0.3, 0.3, 0.6 if cell.settings["system"] == "rmpa" else 0.2)
-
-    claims = EXPERIMENT.findings(run(FULL, measure)).claims
-    assert claim(claims, "through relays").value == pytest.approx(0.75)
-    assert claim(claims, "event, roscpp: RMPA less classic").value == pytest.approx(0.4)
-
-
 def test_one_bad_round_does_not_decide_a_ratio() -> None:
     def measure(cell: Cell) -> Measured:
         bad = cell.settings["round"] == 2 and cell.settings["system"] == "rmpa"
@@ -171,21 +133,6 @@ def test_the_direct_transport_is_held_against_classic_ros_more_strictly() -> Non
     assert (later.limit, later.reached) == (0.05, False)
 
 
-def test_a_run_from_before_there_was_a_direct_transport_says_nothing_of_it() -> None:
-    old = run(FULL, lambda cell: None if contender_of(cell) == DIRECT else by_system(cell))
-    found = EXPERIMENT.findings(old)
-    assert not [one.text for one in found.claims if "direct" in one.text]
-    assert claim(found.claims, "CMD at the pc, polled").value == pytest.approx(2.0)
-    assert found.grids[0].columns[-1] == "sd, RMPA / classic"
-
-
-def test_two_rounds_say_nothing() -> None:
-    def measure(cell: Cell) -> Measured | None:
-        return by_system(cell) if cell.settings["round"] in {1, 2} else None
-
-    assert {one.reached for one in EXPERIMENT.findings(run(FULL, measure)).claims} == {None}
-
-
 def test_table_1_has_the_papers_figures_beside_ours() -> None:
     grids = EXPERIMENT.findings(run(FULL, by_system)).grids
     polled, event = grids
@@ -199,25 +146,3 @@ def test_table_1_has_the_papers_figures_beside_ours() -> None:
     assert rows["Control Computation Delay, in the paper"][:3] == ("61.3", "", "103.8")
     assert all("paper" not in row[0] for row in event.rows)
     assert all(len(row) == len(grid.columns) for grid in grids for row in grid.rows)
-
-
-def test_the_figures_show_each_round_after_the_other() -> None:
-    polled, event = EXPERIMENT.findings(run(FULL, by_system)).figures
-    assert polled.name != event.name
-    cmd, _, delay = polled.panels
-    assert [series.system for series in cmd.series] == ["classic", "rmpa", "direct"]
-    assert [len(series.x) for series in cmd.series] == [400, 400, 400]
-    assert delay.series[0].y[0] == pytest.approx(60.0)
-    assert len(delay.series[0].y) == 404
-
-
-def test_rounds_are_told_apart_by_contender() -> None:
-    results = run(FULL, by_system)
-    assert sorted(rounds(results, RMPA, "roscpp", "event")) == [1, 2, 3, 4]
-    assert sorted(rounds(results, CLASSIC, "roscpp", "event")) == [1, 2, 3, 4]
-    assert sorted(rounds(results, DEFAULTS, "roscpp", "event")) == [1]
-
-
-def test_nothing_measured_says_nothing() -> None:
-    found = EXPERIMENT.findings(Results(FULL, []))
-    assert (found.figures, found.grids, found.claims, found.notes) == ((), (), (), ())

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.failure import EXPERIMENT, NODES
-from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, FlowLosses, outcomes
+from lab.experiments.failure import EXPERIMENT
+from lab.experiments.failure_findings import FLOWS, RATE, FlowLosses, outcomes
 from lab.experiments.model import Cell, Measured, Results, Value
-from lab.findings import Claim, Findings
 from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from lab.findings import Claim, Findings
 
 STEP = int(1e9 / RATE)
 DOWN, END = 100 * STEP, 600 * STEP
@@ -52,20 +53,6 @@ def outcome_of(key: str, found: list[FlowLosses]) -> FlowLosses:
 def claims(*cells: tuple[Cell, Measured]) -> dict[str, Claim]:
     found: Findings = EXPERIMENT.findings(Results(Plan(), cells))
     return {claim.text: claim for claim in found.claims}
-
-
-def test_each_flow_is_noted_by_a_node_that_there_is() -> None:
-    topics = {node.name: str(node.options.get("topics")).split(",") for node in NODES if node.program == "sink"}
-    assert {(flow.sink, flow.topic) for flow in FLOWS} == {(name, one) for name, of in topics.items() for one in of}
-
-
-def test_both_systems_take_turns_and_without_cables_none_is_cut() -> None:
-    settings = [one.settings for one in EXPERIMENT.cells(Plan())]
-    turns = [("classic", None), ("rmpa", None), ("rmpa", "direct")]
-    assert [(one["system"], one.get("transport")) for one in settings] == turns * (len(settings) // 3)
-    assert {one["scenario"] for one in settings} == set(SCENARIOS)
-    loopback = EXPERIMENT.cells(Plan(bed="loopback", clients=("own",), link=""))
-    assert {one.settings["scenario"] for one in loopback} == {"master", "host"}
 
 
 def test_a_flow_that_nothing_happens_to_loses_nothing() -> None:
@@ -118,12 +105,6 @@ def test_one_that_never_comes_back_is_told_and_what_hands_did() -> None:
     assert found.by_hand is True
 
 
-def test_a_flow_without_a_single_message_lost_all() -> None:
-    found = outcome_of("vel-pc", outcomes(cell("master"), measured(run(("vel-pc", range(600))))))
-    assert (found.lost, found.back) == (found.due, False)
-    assert found.due == pytest.approx(len(COUNTED), abs=1)
-
-
 def test_a_node_that_crashed_is_measured_from_its_own_start() -> None:
     rows = run(("vel-base", range(150, 200)))
     found = outcomes(
@@ -150,36 +131,3 @@ def test_a_message_lost_elsewhere_breaks_the_claim() -> None:
     ours = measured(run(("state-joystick", range(200, 203))), on=300 * STEP, on_up=310 * STEP)
     found = claims((cell("host"), ours))["RMPA, any failure: messages lost on flows of other hosts"]
     assert (found.value, found.reached) == (3, False)
-
-
-def test_the_direct_transport_has_claims_and_a_timeline_of_its_own() -> None:
-    lost = measured(run(("state-joystick", range(200, 203))), on=300 * STEP, on_up=310 * STEP)
-    told = Measured(lost.tables, {**lost.facts, "direct": 5, "connections": 6})
-    kept = measured(run(), on=300 * STEP, on_up=310 * STEP)
-    found = EXPERIMENT.findings(Results(Plan(), [(cell("host"), kept), (cell("host", transport="direct"), told)]))
-    values = {claim.text: claim.value for claim in found.claims}
-    assert values["RMPA, any failure: messages lost on flows of other hosts"] == 0
-    assert values["RMPA direct, any failure: messages lost on flows of other hosts"] == 3
-    assert [panel.series[0].system for panel in found.figures[0].panels] == ["rmpa", "direct"]
-    assert any("5 of 6 connections between hosts" in note for note in found.notes)
-
-
-def test_of_our_own_nodes_classic_ros_is_not_judged() -> None:
-    dead = measured(run(("cmd-pc", range(100, 600))), on=300 * STEP)
-    found = claims((cell("master", "classic", "own"), dead))
-    assert next(iter(found.values())).value is None
-
-
-def test_the_timeline_has_a_bar_for_each_time_without_a_hole() -> None:
-    rows = run(("cmd-velocity", range(100, 320)))
-    told = measured(rows, on=300 * STEP, on_up=310 * STEP)
-    figure = EXPERIMENT.findings(Results(Plan(), [(cell("host"), told)])).figures[0]
-    bars = figure.panels[0].series[0]
-    assert list(bars.y).count(0) == 4  # two bars, each with its two ends
-    assert list(bars.y).count(1) == 2
-    assert figure.panels[0].moments["on again"] == pytest.approx(200 / RATE)
-    assert len(figure.panels[0].names) == len(FLOWS)
-
-
-def test_without_any_cell_nothing_is_said() -> None:
-    assert EXPERIMENT.findings(Results(Plan(), [])) == Findings()

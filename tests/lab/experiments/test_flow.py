@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.bed.processes import BedError, Deadline, Process
+from lab.bed.processes import Deadline, Process
 from lab.experiments import flow
 
 if TYPE_CHECKING:
@@ -69,12 +69,6 @@ def test_round_is_asked_for_and_its_lateness_read(node: Callable[[str], Process]
     assert not list(tmp_path.iterdir())
 
 
-def test_message_is_never_shorter_than_its_head(node: Callable[[str], Process], tmp_path: Path) -> None:
-    source = node(SOURCE)
-    flow.sent(flow.begin(source, tmp_path, size=1, rate=1.0, count=1))
-    assert source.events("sent")[0]["asked"] == ["16", "1.0"]
-
-
 def test_rounds_have_numbers_of_their_own_and_are_not_mixed_up(
     node: Callable[[str], Process], tmp_path: Path
 ) -> None:
@@ -97,11 +91,6 @@ def test_what_came_is_read_by_topic(node: Callable[[str], Process], tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_topic_that_nobody_named_is_an_error(node: Callable[[str], Process], tmp_path: Path) -> None:
-    with pytest.raises(BedError, match="fake has more topics than /cmd"):
-        flow.noted(node(SINK), ["/cmd"], tmp_path)
-
-
 def test_node_that_ends_is_named_at_once(node: Callable[[str], Process], tmp_path: Path) -> None:
     begun = flow.begin(node(ENDS), tmp_path, size=64, rate=0.001, count=10)
     with pytest.raises(Deadline, match="fake; it ended with status 0"):
@@ -114,10 +103,3 @@ def test_silent_topic_is_named(node: Callable[[str], Process], tmp_path: Path) -
     with pytest.raises(Deadline, match=r"came to fake on /vel in 0\.0 s"):
         flow.wait_flowing(node(SOURCE), node(SILENT), ["/cmd", "/vel"], tmp_path, timeout=0.0)
     flow.wait_flowing(node(SOURCE), node(SILENT), ["/cmd"], tmp_path, timeout=0.0)
-
-
-def test_source_is_connected_when_it_has_so_many_subscribers(node: Callable[[str], Process]) -> None:
-    source = node('for count in (1, 0, 2): say("connected", subscribers=count)\nsys.stdin.read()')
-    flow.wait_connected(source, 2)
-    with pytest.raises(Deadline):
-        flow.wait_connected(source, 3, timeout=0.05)

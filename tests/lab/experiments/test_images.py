@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.contenders import CLASSIC, DIRECT, MIXED, RMPA, contender_of
 from lab.experiments.images import EXPERIMENT, bytes_per_second
 from lab.experiments.model import Cell, Measured, Results, Value
-from lab.findings import Claim, Findings
 from lab.frames import frame
+
+if TYPE_CHECKING:
+    from lab.findings import Claim, Findings
 
 MB = 1024 * 1024
 PERIOD = 10_000_000
@@ -38,12 +41,6 @@ def findings(*cells: tuple[Cell, Measured]) -> Findings:
 
 def claims(*cells: tuple[Cell, Measured]) -> dict[str, Claim]:
     return {claim.text: claim for claim in findings(*cells).claims}
-
-
-def test_each_round_another_system_begins() -> None:
-    cells = [contender_of(one) for one in EXPERIMENT.cells(Plan()) if one.settings["client"] == "rospy"]
-    assert cells == [CLASSIC, RMPA, DIRECT, MIXED, RMPA, DIRECT, MIXED, CLASSIC]
-    assert [contender_of(one) for one in EXPERIMENT.cells(Plan(size="short"))] == [CLASSIC, RMPA, DIRECT]
 
 
 def test_only_images_that_came_in_the_span_count() -> None:
@@ -77,27 +74,6 @@ def test_commands_beside_direct_images_are_held_against_both_relayed() -> None:
     assert found["commands beside images, p99, RMPA, roscpp"].value == pytest.approx(1.0)
 
 
-def test_of_few_commands_nothing_is_claimed() -> None:
-    found = claims((cell("rmpa"), measured([0.5] * 200)))
-    assert found["commands beside images, p99, RMPA, roscpp"].value is None
-    assert found["images' share of the cable, RMPA, roscpp"].value is None
-
-
-def test_without_a_cable_nothing_is_claimed_of_one() -> None:
-    found = findings((cell("rmpa"), measured([0.5] * 2000, link="")))
-    assert all(claim.value is None for claim in found.claims)
-    assert not found.notes
-
-
-def test_the_tables_count_what_never_came() -> None:
-    commands, images = findings((cell("rmpa"), measured([0.5] * 998 + [2.0] * 2))).grids
-    beside = next(row for row in commands.rows if row[1:3] == ("RMPA", "images"))
-    at = dict(zip(commands.columns, beside, strict=True))
-    assert (at["count"], at["lost"], at["later than 1 ms"]) == ("1000", "3", "0.50 %")
-    picture = next(row for row in images.rows if row[1] == "RMPA")
-    assert picture[-1] == "7"
-
-
 def test_a_message_that_came_twice_counts_once() -> None:
     told = measured([0.5] * 1000)
     rows = list(told.tables["commands"].itertuples(index=False, name=None))
@@ -106,7 +82,3 @@ def test_a_message_that_came_twice_counts_once() -> None:
     )
     beside = findings((cell("rmpa"), doubled)).grids[0].rows[1]
     assert beside[8] == "1000"
-
-
-def test_without_any_cell_nothing_is_said() -> None:
-    assert findings() == Findings()

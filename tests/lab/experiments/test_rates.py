@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.contenders import CLASSIC, DIRECT, RMPA, contender_of
+from lab.experiments.contenders import DIRECT, contender_of
 from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.rates import EXPERIMENT, PAPER
 from lab.frames import frame
@@ -15,7 +15,6 @@ from lab.frames import frame
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from lab.findings import Grid
 
 FULL = Plan(clients=("roscpp",))
 US = 1000
@@ -56,15 +55,6 @@ def test_the_full_run_has_the_papers_batches_and_ten_thousand_beyond() -> None:
     assert totals[100] >= 1000  # enough for a p99
 
 
-def test_systems_take_turns_and_another_one_begins_each_round() -> None:
-    planned = EXPERIMENT.cells(FULL)
-    assert [contender_of(cell) for cell in planned][:3] == [RMPA, DIRECT, CLASSIC]
-    assert [contender_of(cell) for cell in planned if cell.settings["round"] == 2] == [DIRECT, CLASSIC, RMPA]
-    cells = [cell.settings for cell in planned]
-    beside = [cell for cell in cells if cell.get("relays") or cell.get("nodelay") is False]
-    assert [cell["round"] for cell in beside] == [1, 1]
-
-
 @pytest.mark.parametrize(("step", "value", "reached"), [(1, 1.0, True), (2, 2.0, False)])
 def test_widening_is_that_of_rmpa_at_1_khz_against_the_papers_rates(step: int, value: float, reached: bool) -> None:
     def measure(cell: Cell) -> Measured:
@@ -83,19 +73,6 @@ def test_too_few_messages_say_nothing_of_the_width() -> None:
     assert claim.reached is None
 
 
-def test_relays_are_the_bound_that_rmpa_must_not_exceed() -> None:
-    def measure(cell: Cell) -> Measured:
-        if cell.settings.get("relays"):
-            return made(LADDER, lambda _rate, _number: 400)
-        return made(LADDER, lambda _rate, _number: 300 if cell.settings["system"] == "rmpa" else 100)
-
-    found = EXPERIMENT.findings(run(FULL, measure))
-    assert found.claims[1].value == pytest.approx(0.75)
-    rows = rows_of(found.grids[0])
-    assert rows["10 Hz", "classic"]["p50"] == "100"
-    assert rows["10 Hz", "classic, two relays"]["p50"] == "400"
-
-
 def test_the_direct_transport_is_held_against_classic_ros_at_1_khz() -> None:
     counts = {**LADDER, 1000: 500}  # in two rounds 1000, which p99 needs
 
@@ -110,51 +87,3 @@ def test_the_direct_transport_is_held_against_classic_ros_at_1_khz() -> None:
     assert claims["p95 less p50 at 1 kHz, roscpp: RMPA direct / classic"].value == pytest.approx(1.0)
     old = Results(FULL, [one for one in run(FULL, measure).cells if contender_of(one[0]) != DIRECT])
     assert not [one.text for one in EXPERIMENT.findings(old).claims if "direct" in one.text]
-
-
-def rows_of(grid: Grid) -> dict[tuple[str, str], dict[str, str]]:
-    return {(row[0], row[1]): dict(zip(grid.columns, row, strict=True)) for row in grid.rows}
-
-
-def test_the_table_has_all_rounds_together_and_classic_beside_it() -> None:
-    def measure(cell: Cell) -> Measured:
-        return made(LADDER, ramp(4 if cell.settings["system"] == "rmpa" else 2))
-
-    (grid,) = EXPERIMENT.findings(run(FULL, measure)).grids
-    rows = rows_of(grid)
-    ours = rows["100 Hz", "RMPA"]
-    assert (ours["p50"], ours["p95"], ours["p95 - p50"], ours["interquartile range"]) == ("400", "580", "180", "200")
-    assert (ours["messages"], ours["lost"], ours["largest"], ours["p99"]) == ("400", "0", "600", "-")
-    assert ours["p50 / classic"] == "1.33"
-    assert rows["100 Hz", "classic"]["messages"] == "400"
-    assert rows["10 Hz", "classic, nodelay off"]["messages"] == "200"
-
-
-def test_what_never_came_is_counted() -> None:
-    def measure(_: Cell) -> Measured:
-        whole = made(LADDER, ramp(1))
-        arrivals = whole.tables["arrivals"]
-        kept = [row for row in arrivals.itertuples(index=False, name=None) if row[:2] != (10, 7)]
-        return Measured({**whole.tables, "arrivals": frame(arrivals.columns, kept)})
-
-    (grid,) = EXPERIMENT.findings(run(FULL, measure)).grids
-    rows = rows_of(grid)
-    assert rows["10 Hz", "RMPA"]["lost"] == "2"
-    assert rows["20 Hz", "RMPA"]["lost"] == "0"
-
-
-def test_the_figure_has_every_message_the_percentiles_and_both_ends() -> None:
-    (figure,) = EXPERIMENT.findings(run(FULL, lambda _: made(LADDER, ramp(1)))).figures
-    boxes, curves, tails = figure.panels
-    assert [series.system for series in boxes.series] == ["classic", "rmpa", "direct"]
-    assert len(boxes.series[0].x) == 400 * len(LADDER)
-    assert sorted(boxes.ticks.values()) == sorted(LADDER)
-    medians = [series for series in curves.series if "p50" in series.label]
-    assert all(series.y == [250.0] * len(LADDER) for series in medians)
-    assert len(tails.series) == 6
-    assert all(max(series.y) == 1.0 for series in tails.series)
-
-
-def test_nothing_measured_says_nothing() -> None:
-    found = EXPERIMENT.findings(Results(FULL, []))
-    assert (found.figures, found.grids, found.claims) == ((), (), ())

@@ -9,7 +9,6 @@ import pytest
 from lab.bed.plan import Plan
 from lab.experiments.registry import EXPERIMENTS, find_experiment
 from lab.experiments.store import Store
-from rmpa.core.errors import ConfigError
 from tests.lab.experiments.fakes import CODE, MACHINE
 
 if TYPE_CHECKING:
@@ -48,10 +47,3 @@ def test_the_cells_of_each_plan_are_fit_for_a_run_directory(name: str, plan: Pla
 def test_a_short_run_is_short() -> None:
     for name in EXPERIMENTS:
         assert sum(cell.seconds for cell in find_experiment(name).cells(Plan(size="short"))) <= 70, name
-
-
-def test_a_misspelt_name_is_told_the_nearest() -> None:
-    with pytest.raises(ConfigError, match=r"contol: no such experiment; did you mean control\?"):
-        find_experiment("contol")
-    with pytest.raises(ConfigError, match="there are control, rates"):
-        find_experiment("xyz")

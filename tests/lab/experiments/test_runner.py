@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.processes import BedError
-from lab.experiments.model import Measured
 from lab.experiments.runner import ATTEMPTS, Outcome, run, to_measure
 from lab.experiments.store import Store
-from lab.frames import frame
 from tests.lab.experiments.fakes import CODE, MACHINE, PLAN, FakeExperiment, no_stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lab.bed.stage import Stage
     from lab.experiments.model import Cell
 
 
@@ -69,14 +65,6 @@ def test_all_cells_are_measured_in_their_order_and_kept(store: Store) -> None:
         ("/cmd", 20),
     ]
     assert all(record.attempts == 1 and record.began for record in again.manifest.cells.values())
-
-
-def test_how_late_the_machine_wakes_is_kept_with_each_cell(store: Store) -> None:
-    measure(store, FakeExperiment())
-    for _, measured in store.results("fake").cells:
-        late = measured.tables["lateness"]
-        assert late["when"].tolist() == ["before", "before", "after", "after"]
-        assert late["late_us"].tolist() == [0.3, 12.3, 0.3, 12.3]
 
 
 def test_a_cell_that_fails_once_is_repeated(store: Store) -> None:
@@ -138,22 +126,3 @@ def test_ctrl_c_leaves_what_was_measured_to_go_on_with(store: Store) -> None:
     assert measure(again, experiment)[0] == Outcome(2, 2, ())
     assert set(experiment.tried) == {"system-classic_rate-20_round-1", "system-rmpa_rate-20_round-1"}
     assert measure(again, experiment)[0] == Outcome(0, 4, ())
-
-
-def test_some_cells_now_and_the_others_later(store: Store) -> None:
-    experiment = FakeExperiment()
-    few = [cell for cell in experiment.cells(PLAN) if cell.settings["system"] == "rmpa"]
-    assert measure(store, experiment, cells=few)[0] == Outcome(2, 0, ())
-    assert measure(store, experiment)[0] == Outcome(2, 2, ())
-    assert experiment.tried == Counter({cell.key: 1 for cell in experiment.cells(PLAN)})
-
-
-def test_a_table_of_the_runners_name_is_a_mistake(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def clashing(_self: FakeExperiment, _cell: Cell, _stage: Stage) -> Measured:
-        return Measured({"lateness": frame(("x",), [])})
-
-    monkeypatch.setattr(FakeExperiment, "measure", clashing)
-    outcome, _ = measure(store, FakeExperiment(rates=(10,)))
-    assert [error.splitlines()[-1] for *_, error in outcome.failed] == [
-        "ValueError: fake has a table 'lateness', which is the runner's"
-    ] * 2

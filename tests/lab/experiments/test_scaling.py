@@ -7,7 +7,6 @@ import pytest
 from lab.bed.plan import Plan
 from lab.experiments.model import Cell, Measured, Results, Value
 from lab.experiments.scaling import EXPERIMENT
-from lab.findings import Findings
 from lab.frames import frame
 
 
@@ -43,29 +42,6 @@ RESULTS = Results(
 )
 
 
-def test_the_number_of_modules_grows_and_the_systems_take_turns() -> None:
-    settings = [one.settings for one in EXPERIMENT.cells(Plan())]
-    assert [one["modules"] for one in settings[::3]] == [2, 4, 8, 16, 32]
-    turns = [("classic", None), ("rmpa", None), ("rmpa", "direct")]
-    assert [(one["system"], one.get("transport")) for one in settings] == turns * 5
-    assert {one["client"] for one in settings} == {"roscpp"}
-    assert {one.settings["client"] for one in EXPERIMENT.cells(Plan(clients=("rospy",)))} == {"rospy"}
-
-
-def test_the_table_says_what_was_measured() -> None:
-    grid = EXPERIMENT.findings(RESULTS).grids[0]
-    row = dict(zip(grid.columns, grid.rows[1], strict=True))
-    assert row["modules"] == "2"
-    assert row["system"] == "RMPA"
-    assert row["p50, ms"] == "0.4"
-    assert row["p99"] == "-"  # of 600 messages nobody can say
-    assert row["lost"] == "2"
-    assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.6", "0.7", "1.2")
-    assert row["its two nodes"] == "3"
-    assert (row["idle: bytes/s"], row["packets/s"]) == ("500", "5.0")
-    assert (row["last start to all linked, s"], row["to its first message"]) == ("0.4", "0.5")
-
-
 def test_master_and_helpers_are_one() -> None:
     told = measured(0.2, [], [None])
     processes = told.tables["processes"]
@@ -87,32 +63,7 @@ def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> No
     assert [claim.value for claim in linked] == [pytest.approx(0.4), pytest.approx(1.75)]
 
 
-def test_the_direct_transport_has_a_row_a_line_and_a_claim_of_its_own() -> None:
-    straight = [(cell("rmpa", n, transport="direct"), measured(0.2, [0.5], [0.3])) for n in (2, 32)]
-    found = EXPERIMENT.findings(Results(Plan(), [*RESULTS.cells, *straight]))
-    assert [row[1] for row in found.grids[0].rows[:3]] == ["classic", "RMPA", "RMPA direct"]
-    growth = next(claim for claim in found.claims if "RMPA direct" in claim.text)
-    assert growth.value == pytest.approx(0.5)
-    assert {series.system for series in found.figures[0].panels[0].series} == {"classic", "rmpa", "direct"}
-
-
-def test_of_few_messages_nothing_is_claimed() -> None:
-    few = [(one, measured(1.0, [1.0], [0.1], messages=60)) for one, _ in RESULTS.cells]
-    growth = EXPERIMENT.findings(Results(Plan(), few)).claims[0]
-    assert growth.value is None
-
-
 def test_the_report_says_where_the_agents_together_fill_the_machine() -> None:
     notes = EXPERIMENT.findings(RESULTS).notes
     assert any("With 32 modules the agents together use 62 % of a core" in note for note in notes)
     assert not any("With 2 modules" in note for note in notes)
-
-
-def test_lines_are_drawn_where_there_is_something() -> None:
-    panels = EXPERIMENT.findings(RESULTS).figures[0].panels
-    joined = {series.label: list(series.y) for series in panels[3].series}
-    assert joined == {"classic": [0.5, 0.5], "RMPA": [0.5, 0.5], "RMPA, all agents linked": [0.4, 1.75]}
-
-
-def test_without_any_cell_nothing_is_said() -> None:
-    assert EXPERIMENT.findings(Results(Plan(), [])) == Findings()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -54,18 +53,6 @@ def test_what_was_kept_is_read_again(store: Store) -> None:
     assert [again.is_done(cell) for cell in CELLS] == [True, False, True, False]
 
 
-def test_where_files_are(store: Store) -> None:
-    store.keep(CELLS[0], MEASURED)
-    table = store.directory / "fake" / "system-classic_rate-10_round-1" / "samples.csv"
-    assert table.read_text() == "topic,due_ns\n/cmd,1\n/vel,2\n"
-    manifest = json.loads((store.directory / "manifest.json").read_text())
-    record = manifest["cells"]["fake/system-classic_rate-10_round-1"]
-    assert record["tables"] == {"samples": {"topic": "str", "due_ns": "int"}}
-    assert record["facts"] == {"lost": 3, "worst": 0.5, "fine": True, "why": None}
-    assert manifest["plan"]["seed"] == PLAN.seed
-    assert not list(store.directory.rglob("*.unfinished"))
-
-
 def test_a_cell_counts_once_the_manifest_says_so(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     def cut_off(_: Store) -> None:
         raise KeyboardInterrupt
@@ -76,27 +63,12 @@ def test_a_cell_counts_once_the_manifest_says_so(store: Store, monkeypatch: pyte
     assert not Store.load(store.directory).is_done(CELLS[0])
 
 
-def test_a_table_that_csv_cannot_hold_leaves_the_cell_undone(store: Store) -> None:
-    with pytest.raises(ValueError, match="column a holds int, str"):
-        store.keep(CELLS[0], Measured({"x": frame(("a",), [(1,), ("b",)])}))
-    assert not store.is_done(CELLS[0])
-
-
 def test_cells_that_are_known_keep_what_came_of_them(store: Store) -> None:
     store.keep(CELLS[0], MEASURED)
     again = Store.load(store.directory)
     more = [*CELLS, Cell("fake", {"system": "rmpa", "rate": 50, "round": 1})]
     again.expect("fake", "0. Nothing", more)
     assert [again.is_done(cell) for cell in more] == [True, False, False, False, False]
-
-
-@pytest.mark.parametrize(
-    "cells",
-    [[CELLS[0], CELLS[0]], [Cell("fake", {"link": "a/b"})], [Cell("fake", {"x": "y" * 300})], [Cell("b", {"x": 1})]],
-)
-def test_keys_that_are_no_directory_of_their_own_are_refused(store: Store, cells: list[Cell]) -> None:
-    with pytest.raises(ValueError):
-        store.expect("fake", "0. Nothing", cells)
 
 
 def test_a_run_goes_on_with_what_it_was_begun_with(store: Store) -> None:
@@ -109,27 +81,6 @@ def test_another_plan_is_refused_by_what_differs(store: Store) -> None:
         store.require(replace(PLAN, size="full", seed=7), CODE, MACHINE)
     with pytest.raises(ConfigError, match=r"clients own, not rospy, roscpp; link none, not 100mbit"):
         store.require(replace(PLAN, clients=("rospy", "roscpp"), link="100mbit"), CODE, MACHINE)
-
-
-def test_other_code_is_refused(store: Store) -> None:
-    other = msgspec.structs.replace(CODE, digest="ffffffffffff", commit="def5678", changed=True)
-    with pytest.raises(ConfigError, match=r"other code \(1\.0 abc1234, now 1\.0 def5678 with changes\)"):
-        store.require(PLAN, other, MACHINE)
-
-
-def test_another_machine_is_refused(store: Store) -> None:
-    with pytest.raises(ConfigError, match=r"measured elsewhere: cores 2, now 8"):
-        store.require(PLAN, CODE, {**MACHINE, "cores": 8})
-
-
-def test_sessions_say_how_they_ended(store: Store) -> None:
-    with store.session(["rmpa", "experiment", "run"]):
-        assert Store.load(store.directory).manifest.sessions[0].end == ""
-    with pytest.raises(KeyboardInterrupt), store.session(["again"]):
-        raise KeyboardInterrupt
-    one, two = Store.load(store.directory).manifest.sessions
-    assert (one.argv, one.end, two.end) == (["rmpa", "experiment", "run"], "finished", "interrupted")
-    assert one.began <= one.ended <= two.began <= two.ended
 
 
 def test_two_do_not_measure_into_one_directory(store: Store) -> None:
@@ -147,35 +98,6 @@ def test_a_directory_with_other_things_is_left_alone(tmp_path: Path) -> None:
     assert not is_run_directory(tmp_path)
     with pytest.raises(ConfigError, match="is not empty, and no run directory"):
         Store.create(tmp_path / "thesis.txt", PLAN, CODE, MACHINE)
-
-
-def test_where_nothing_can_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StartError, match="cannot be written to"):
-        Store.create(tmp_path / "file" / "run", PLAN, CODE, MACHINE)
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        (None, "is no run directory"),
-        (b"{", "is no manifest of a run"),
-        (b"\xff", "is no manifest of a run"),
-        (b'{"plan": {"size": "huge"}}', "is no manifest of a run"),
-    ],
-)
-def test_what_is_no_run_directory_is_said(tmp_path: Path, text: bytes | None, why: str) -> None:
-    if text is not None:
-        (tmp_path / "manifest.json").write_bytes(text)
-    with pytest.raises(ConfigError, match=why):
-        Store.load(tmp_path)
-
-
-def test_a_later_format_is_said(store: Store) -> None:
-    store.manifest.format = 2
-    store.save()
-    with pytest.raises(ConfigError, match="format 2; this version of rmpa reads 1"):
-        Store.load(store.directory)
 
 
 def test_a_file_that_was_spoiled_is_named(store: Store) -> None:

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import ctypes
 import json
-import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -13,10 +11,8 @@ from lab.nodes.node import (
     LEAD,
     Newest,
     Notes,
-    Subscribers,
     first_due,
     sink_options,
-    sleep_sharply,
     sleep_until,
     source_options,
     velocity_options,
@@ -33,15 +29,6 @@ SECOND = 1_000_000_000
 @pytest.fixture
 def said(capsys: pytest.CaptureFixture[str]) -> Callable[[], list[dict[str, object]]]:
     return lambda: [json.loads(line[2:]) for line in capsys.readouterr().out.splitlines() if line.startswith("@ ")]
-
-
-def test_head_is_sixteen_bytes_in_native_order() -> None:
-    assert HEAD.size == 16
-    assert HEAD.unpack(HEAD.pack(1, 2, 3)) == (1, 2, 3)
-
-
-def test_first_message_is_due_after_its_lead() -> None:
-    assert first_due(1000, 1e8, None) == 1000 + LEAD
 
 
 @pytest.mark.parametrize("now", [0, 12_345, 7 * SECOND + 1, 13_000 * SECOND + 999_999_999])
@@ -62,26 +49,6 @@ def test_sleep_ends_at_the_moment_and_not_before() -> None:
     assert time.monotonic_ns() >= due
 
 
-def test_slack_is_taken_from_the_thread_that_asks_alone() -> None:
-    found: list[int] = []
-
-    def sharp() -> None:
-        sleep_sharply()
-        found.append(_slack())
-
-    before = _slack()
-    thread = threading.Thread(target=sharp)
-    thread.start()
-    thread.join()
-    assert found == [1]
-    assert _slack() == before
-
-
-def _slack() -> int:
-    """PR_GET_TIMERSLACK of this thread, ns."""
-    return int(ctypes.CDLL(None).prctl(30, 0, 0, 0, 0))
-
-
 def test_newest_command_is_taken_once() -> None:
     newest: Newest[str] = Newest()
     assert newest.take() is None
@@ -89,13 +56,6 @@ def test_newest_command_is_taken_once() -> None:
     newest.put("second")
     assert newest.take() == "second"
     assert newest.take() is None
-
-
-def test_number_of_subscribers_is_said_when_it_changes(said: Callable[[], list[dict[str, object]]]) -> None:
-    subscribers = Subscribers()
-    for count in (0, 1, 1, 2, 0):
-        subscribers.changed(count)
-    assert [event["subscribers"] for event in said()] == [1, 2, 0]
 
 
 def test_first_message_of_each_topic_is_said_and_the_first_after_a_pause(
@@ -116,13 +76,6 @@ def test_first_message_of_each_topic_is_said_and_the_first_after_a_pause(
         {"event": "first", "topic": "/vel", "came_ns": 5 * SECOND + SECOND // 2},
         {"event": "again", "topic": "/cmd", "came_ns": now, "gap_ns": SECOND},
     ]
-
-
-def test_data_without_a_head_is_no_message_of_ours(said: Callable[[], list[dict[str, object]]]) -> None:
-    notes = Notes(["/cmd"])
-    notes.note(0, b"\0" * 15)
-    notes.note(0, b"\0" * (HEAD.size + 11), offset=12)
-    assert said() == []
 
 
 def test_our_own_frame_is_the_message_that_ros_knows() -> None:
