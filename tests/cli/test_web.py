@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tests.cli.conftest import Place
 
-WEB = ("aiohttp", "prometheus_client", "rmpa.web")
+WEB = ("aiohttp", "rmpa.web")
 
 
 def get(port: int, path: str, token: str = "") -> tuple[int, str]:

@@ -17,11 +17,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 from rmpa.web import limits
-from rmpa.web.api import EVENT_KINDS, exposition, metrics
-from rmpa.web.server.access import Figures, web_metrics
+from rmpa.web.api import EVENT_KINDS, Figures, content_type, exposition, metrics, web_metrics
 from tests.web.snapshots import AGENT, FULL, SERVICE, peer, route
 
 FIGURES = Figures(1, 2, {"200": 3}, {"host": 4}, 5, 0.6)
+EVERYTHING = (*metrics(FULL), *web_metrics(FIGURES))
 DOCS = Path(__file__).parents[2] / "docs"
 DASHBOARD = DOCS / "grafana" / "rmpa.json"
 PAGE = DOCS / "metrics.md"
@@ -31,7 +31,7 @@ ROUTE = {"topic": "/image", "peer": "arm", "node": "/camera", "direction": "in"}
 
 
 def samples(snapshot: Snapshot | None) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    text = exposition(snapshot)[0].decode()
+    text = exposition(metrics(snapshot)).decode()
     found = {}
     for family in text_string_to_metric_families(text):
         assert family.documentation, family.name
@@ -154,17 +154,17 @@ def test_hostile_names_break_nothing() -> None:
 
 
 def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
-    body, content_type = exposition(FULL, "application/openmetrics-text;version=1.0.0")
-    assert content_type.startswith("application/openmetrics-text")
-    families = list(parse_openmetrics(body.decode()))  # type: ignore[no-untyped-call]
+    form = content_type("application/openmetrics-text;version=1.0.0")
+    assert form.startswith("application/openmetrics-text")
+    families = list(parse_openmetrics(exposition(EVERYTHING, form).decode()))  # type: ignore[no-untyped-call]
     assert len(families) > 40
-    assert exposition(FULL)[1].startswith("text/plain")
+    assert content_type("text/html").startswith("text/plain")
 
 
 @with_promtool
 def test_prometheus_own_linter_finds_nothing() -> None:
     assert PROMTOOL is not None
-    body, _ = exposition(FULL, "", web_metrics(FIGURES))
+    body = exposition(EVERYTHING)
     checked = subprocess.run([PROMTOOL, "check", "metrics"], check=False, input=body, capture_output=True, timeout=30)
     assert checked.returncode == 0, checked.stderr.decode() + checked.stdout.decode()
     assert not checked.stderr.strip()
@@ -243,9 +243,10 @@ def test_the_alarms_of_the_page_are_valid_rules_about_metrics_that_there_are(tmp
 def test_the_page_has_a_row_for_each_metric() -> None:
     rows = re.findall(r"^\| `(rmpa_\w+)` \| (\w+) \| ([^|]+) \| ([^|]+) \|$", PAGE.read_text("utf-8"), re.MULTILINE)
     written = {name: (kind, set(re.findall(r"\w+", labels)), meaning) for name, kind, labels, meaning in rows}
+    families = parse_openmetrics(exposition(EVERYTHING, content_type("application/openmetrics-text")).decode())  # type: ignore[no-untyped-call]
     known = {
         family.samples[0].name: (family.type, set(family.samples[0].labels), family.documentation)
-        for family in (*metrics(FULL), *web_metrics(FIGURES))
+        for family in families
     }
     assert written == known
 

@@ -23,7 +23,7 @@ def get(path: str, snapshot: Snapshot | None = FULL) -> rest.RestResponse:
 def problem(response: rest.RestResponse) -> str:
     assert response.content_type == "application/problem+json"
     body = msgspec.json.decode(response.body, type=rest.Problem)
-    assert body.status == response.status
+    assert (body.status, body.detail) == (response.status, response.detail)
     return body.detail
 
 

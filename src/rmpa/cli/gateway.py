@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rmpa.cli.agent import Module
     from rmpa.config.read import Given, Loaded
     from rmpa.config.settings import Settings
-    from rmpa.web.server.process import Address, WebSetup
+    from rmpa.web.server.process import TokenAccess, WebSetup
 
 _log = logging.getLogger("rmpa.gateway")
 _LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
@@ -216,7 +216,7 @@ def _is_there(name: str) -> bool:
 
 
 _web_log = logging.getLogger("rmpa.web")
-_WEB_LIBRARIES = ("aiohttp", "cbor2", "prometheus_client")
+_WEB_LIBRARIES = ("aiohttp", "cbor2")
 _DEFAULTS = WebSettings()
 WEB_EPILOG = """\
 \b
@@ -314,8 +314,8 @@ def web(
         _web_log.warning("%s", note)
     from rmpa.web.server.process import serve
 
-    def announce(address: Address) -> None:
-        _announce(address, as_json=as_json)
+    def announce(url: str, access: TokenAccess) -> None:
+        _announce(url, access, as_json=as_json)
 
     def load() -> WebSetup:
         return make()[1]
@@ -363,17 +363,17 @@ def _host(option: str, text: str) -> str:
         raise ConfigError(option, error.problem, error.remedy) from None
 
 
-def _announce(address: Address, *, as_json: bool) -> None:
+def _announce(url: str, access: TokenAccess, *, as_json: bool) -> None:
     if as_json:
         from rmpa.cli.output import print_json
 
-        print_json({"url": address.url, "token_file": address.token_file})
+        print_json({"url": url, "token_file": str(access.file or "")})
     else:
-        click.echo(address.url)
-        if address.is_new:
-            click.echo(f"the token is kept in {address.token_file}; it is not printed again")
-        elif address.token_file:
-            click.echo(f"clients need the token of {address.token_file}")
+        click.echo(url)
+        if access.is_new:
+            click.echo(f"the token is kept in {access.file}; it is not printed again")
+        elif access.file:
+            click.echo(f"clients need the token of {access.file}")
     sys.stdout.flush()
 
 

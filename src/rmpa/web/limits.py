@@ -164,20 +164,12 @@ METRIC_SERVICES: Final = 1000
 """Services in /metrics, each with some six time series."""
 METRIC_REASONS: Final = 256
 """Counters of what was refused or dropped in /metrics; there are some hundred."""
-METRIC_ROUTES_IN_THREAD: Final = 300
-"""Routes up to which /metrics is made in a thread of the server, in some 50 ms; beyond, in a process of its own."""
-METRIC_PROCESS_TIMEOUT: Final = 20.0
-"""Time for that process, which else is ended; then a thread does it."""
-METRIC_FORMATS: Final = 4
-"""Formats of /metrics that are kept for the scrapes of one snapshot; clients ask for two."""
 METRIC_LABEL_CHARACTERS: Final = 256
 """Characters of a label's value in /metrics, which Prometheus keeps with each time series."""
 
 # --- REST ---------------------------------------------------------------------------------------------------------
 REST_PATH_MAX: Final = 2048
 """Characters of a path: a name of 512 characters, percent-encoded."""
-REST_NAMES_COMPARED: Final = 1000
-"""Names that a wrong one is compared with for a hint, which takes some microseconds each."""
 
 # --- HTTP server --------------------------------------------------------------------------------------------------
 WEB_CONNECTIONS_MAX: Final = 256

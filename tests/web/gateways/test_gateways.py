@@ -16,7 +16,7 @@ import aiohttp
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL, READ_ONLY
-from rmpa.web.server.process import tls_context
+from rmpa.web.server.process import CertificateFiles, tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.gateways.server import Client, Server, running_server
 from tests.web.hub.client import node
@@ -189,7 +189,7 @@ async def test_large_messages_arrive_whole_at_every_client(core: RosCore) -> Non
 
 async def test_large_messages_arrive_whole_by_tls_at_a_client_that_reads_late(core: RosCore) -> None:
     files = Path(__file__).parents[1] / "server" / "tls"
-    tls = tls_context(str(files / "cert.pem"), str(files / "key.pem"))
+    tls = tls_context(CertificateFiles(str(files / "cert.pem"), str(files / "key.pem")))
     assert tls is not None
     trusted = ssl.create_default_context(cafile=files / "cert.pem")
     payload = bytes(BYTES.serialize(BYTES.make({"data": bytes(range(250)) * 40_000})))

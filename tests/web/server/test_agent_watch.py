@@ -154,14 +154,14 @@ async def test_all_of_a_large_graph_is_read_only_for_those_that_need_it() -> Non
 
     watch = AgentWatch(lambda: shown, lambda: now, read_whole)
     assert (await watch.reading()).snapshot == part
-    readings = await asyncio.gather(*(watch.whole() for _ in range(10)))
+    readings = await asyncio.gather(*(watch.reading(whole=True) for _ in range(10)))
     assert all(reading.snapshot is FULL for reading in readings)
     assert wholes == 1
     now += limits.WEB_WHOLE_AGE
-    assert (await watch.whole()).snapshot is FULL
+    assert (await watch.reading(whole=True)).snapshot is FULL
     assert wholes == 2
     now += limits.WEB_WHOLE_AGE
     shown = FULL  # nothing is left out
-    assert (await watch.whole()).snapshot is FULL
+    assert (await watch.reading(whole=True)).snapshot is FULL
     assert wholes == 2
     await watch.close()

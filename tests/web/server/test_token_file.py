@@ -10,7 +10,7 @@ import pytest
 from rmpa.config.settings import WebSettings
 from rmpa.core.errors import StartError
 from rmpa.web.server.access import token_from
-from rmpa.web.server.process import access_of, address_of
+from rmpa.web.server.process import access_of, url_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,10 +55,10 @@ def test_beyond_loopback_the_token_is_made_and_its_url_told_once(tmp_path: Path)
     environ, web = {"RMPA_STATE_DIR": str(tmp_path)}, WebSettings(listen="192.168.1.7")
     first = access_of(web, "base", environ)
     assert first.file == tmp_path / "base" / "web-token"
-    assert address_of(web, first, 8480).url == f"http://192.168.1.7:8480/?token={first.token}"
+    assert url_of(web, first, 8480) == f"http://192.168.1.7:8480/?token={first.token}"
     again = access_of(web, "base", environ)
     assert again.token == first.token
-    assert first.token not in address_of(web, again, 8480).url
+    assert first.token not in url_of(web, again, 8480)
 
 
 def test_without_a_place_for_the_token_the_remedy_is_told() -> None:

@@ -1,8 +1,6 @@
-"""Which requests are served: host, origin, token, connections, and the counts of refusals.
+"""Which requests and connections are served: host, origin, token, and limits of connections that aiohttp has not.
 
-Which requests are served: decisions over a request's headers; no I/O.
-
-Three checks, in this order:
+A request is judged by its headers, in this order:
 
 * ``Host`` is an address or one of the server's names. A page of another site that lets its own name point to this
   machine (DNS rebinding) sends its own name here.
@@ -25,28 +23,21 @@ import re
 import secrets
 import stat
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, cast
-
-from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, SummaryMetricFamily
+from enum import Enum
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias, cast
 
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import StartError
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import MaskCheck
-from rmpa.web.gateways.gateways import PROTOCOLS, GatewayFigures
-from rmpa.web.gateways.gateways import REASONS as GATEWAY_REASONS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable
     from pathlib import Path
-
-    from prometheus_client.metrics_core import Metric
 
     from rmpa.core.counters import Counters
 
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
-ACCESS_REASONS: Final = ("host", "origin", "token")
-"""The values of ``AccessRefused.reason``."""
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
 
@@ -82,27 +73,11 @@ class RequestFacts:
     secure: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class AccessGranted:
-    """The request is served."""
-
-
-@dataclass(frozen=True, slots=True)
-class MoveToken:
-    """The page is served at the same URL without its token, which becomes a cookie."""
-
-
-@dataclass(frozen=True, slots=True)
-class Preflight:
-    """The browser is told what pages of a listed site may send."""
-
-
-@dataclass(frozen=True, slots=True)
-class AccessRefused:
+class AccessRefused(NamedTuple):
     """The request is not served.
 
     Attributes:
-        reason: One of ``REASONS``, for the counter.
+        reason: ``host``, ``origin`` or ``token``, for the counter.
         status: The HTTP status.
         detail: What happened and what to do.
     """
@@ -110,6 +85,11 @@ class AccessRefused:
     reason: str
     status: int
     detail: str
+
+
+Verdict: TypeAlias = AccessRefused | Literal["granted", "move token", "preflight"]
+"""``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
+browser is told what pages of a listed site may send."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,13 +113,13 @@ class AccessPolicy:
         """The name of the token's cookie."""
         return f"rmpa_token_{self.port}"
 
-    def judge(self, request: RequestFacts) -> AccessGranted | MoveToken | Preflight | AccessRefused:
+    def judge(self, request: RequestFacts) -> Verdict:
         """The decision about a request."""
         refused = self._wrong_host(request) or self._wrong_origin(request)
         if refused is not None:
             return refused
         if request.is_preflight and self.lists(request.origin):
-            return Preflight()
+            return "preflight"
         return self._by_token(request)
 
     def lists(self, origin: str | None) -> bool:
@@ -173,20 +153,18 @@ class AccessPolicy:
             return _foreign("another site")
         return None
 
-    def _by_token(self, request: RequestFacts) -> AccessGranted | MoveToken | AccessRefused:
+    def _by_token(self, request: RequestFacts) -> Verdict:
         if not self.token or request.is_open:
-            return AccessGranted()
+            return "granted"
         if self._fits(request.token):
-            return MoveToken() if request.is_page else AccessGranted()
-        given = [bearer(request.authorization), request.cookie]
+            return "move token" if request.is_page else "granted"
+        given = (bearer(request.authorization), request.cookie)
         if any(map(self._fits, given)):
-            return AccessGranted()
-        remedy = (
-            "send it as Authorization: Bearer TOKEN or as ?token=TOKEN; rmpa web says at its start where the token is"
-        )
-        if request.token is None and not any(each is not None for each in given):
-            return AccessRefused("token", 401, f"this server needs a token; {remedy}")
-        return AccessRefused("token", 401, f"the token is wrong; {remedy}")
+            return "granted"
+        is_given = any(each is not None for each in (request.token, *given))
+        problem = "the token is wrong" if is_given else "this server needs a token"
+        remedy = "send it as Authorization: Bearer TOKEN or as ?token=TOKEN"
+        return AccessRefused("token", 401, f"{problem}; {remedy}; rmpa web says at its start where the token is")
 
     def _fits(self, token: str | None) -> bool:
         return token is not None and hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
@@ -280,36 +258,28 @@ def _read(path: Path) -> str:
     return text
 
 
-# Limits of connections that aiohttp has not: their number, the time of a request and of a response, bytes in a row.
-#
-# Each connection has a ``GuardedConnection`` between its transport and aiohttp's protocol. Where there is no room
-# for
-# a new connection, the one that has gone without a request for longest is closed: connections that send nothing, or
-# one byte a second, keep no others out.
-
-
 _log = logging.getLogger(__name__)
-CONNECTION_REASONS: Final = ("connections", "slow_request", "slow_response", "oversized")
-"""Why connections are closed, as counted."""
 
 
 class ConnectionTable:
     """All connections of one server.
 
+    Each has a ``GuardedConnection`` between its transport and aiohttp's protocol. Where there is no room for a new
+    one, the one that has gone without a request for longest is closed: connections that send nothing, or one byte a
+    second, keep no others out.
+
     Args:
         make_protocol: Makes aiohttp's protocol of a new connection.
-        counters: Counts what is closed, by the words of ``REASONS``.
+        counters: Counts what is closed, by its reason (``api.REFUSALS``).
     """
 
     def __init__(self, make_protocol: Callable[[], asyncio.Protocol], counters: Counters) -> None:
         self._make_protocol = make_protocol
-        self._refusals = RefusalLog(_log, counters)
-        self._open: dict[GuardedConnection, None] = {}
+        self.refusals = RefusalLog(_log, counters)
+        self.open: dict[GuardedConnection, None] = {}
+        """The connections, the idlest first."""
         self.accepted = 0
         """Connections so far."""
-
-    def __len__(self) -> int:
-        return len(self._open)
 
     def make(self) -> GuardedConnection:
         """The protocol of a new connection, for ``loop.create_server``."""
@@ -318,32 +288,28 @@ class ConnectionTable:
     def opened(self, connection: GuardedConnection) -> bool:
         """Take a connection in; return whether there is room."""
         self.accepted += 1
-        if len(self._open) >= limits.WEB_CONNECTIONS_MAX:
-            idle = next((each for each in self._open if not each.is_answering), connection)
+        if len(self.open) >= limits.WEB_CONNECTIONS_MAX:
+            idle = next((each for each in self.open if each.phase is not ConnectionPhase.ANSWERING), connection)
             idle.refuse("connections", f"{limits.WEB_CONNECTIONS_MAX} connections are open; the idlest is closed")
             if idle is connection:
                 return False
-        self._open[connection] = None
+        self.open[connection] = None
         return True
-
-    def used(self, connection: GuardedConnection) -> None:
-        """Note that a connection got a request: others are idler."""
-        if connection in self._open:
-            del self._open[connection]
-            self._open[connection] = None
-
-    def closed(self, connection: GuardedConnection) -> None:
-        """Forget a connection."""
-        self._open.pop(connection, None)
-
-    def refuse(self, now: float, reason: str, address: str, text: str) -> None:
-        """Count and log a connection that is closed."""
-        self._refusals.refuse(now, reason, address, f"{address}: {text}")
 
     def abort_all(self) -> None:
         """Close every connection at once."""
-        for connection in list(self._open):
+        for connection in list(self.open):
             connection.abort()
+
+
+class ConnectionPhase(Enum):
+    """What a connection waits for."""
+
+    IDLE = "the next request"
+    ARRIVING = "the rest of a request"
+    ANSWERING = "the response of a handler"
+    UNREAD = "the client to read"
+    UPGRADED = "a WebSocket, whose handler has limits of its own"
 
 
 class GuardedConnection(asyncio.Protocol):
@@ -360,40 +326,35 @@ class GuardedConnection(asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._received = 0
-        self._arriving = False
-        self._unread = False
-        self._upgraded = False
-        self._mask: MaskCheck | None = None
+        self._since_response = 0
+        self._mask = MaskCheck()
         self._on_unmasked: Callable[[], None] | None = None
+        self.phase = ConnectionPhase.IDLE
         self.received = 0
         """Bytes of the client so far."""
-        self.is_answering = False
-        """Whether a response is being made."""
 
     # --- what aiohttp's handlers tell ---
 
     def request_begins(self) -> None:
-        """A request has arrived; its response is being made."""
-        self.is_answering, self._arriving = True, False
-        self._table.used(self)
-        self._limit(limits.WEB_RESPONSE_TIMEOUT, "slow_response", "the response takes too long")
+        """A request has arrived; its response is being made. Other connections are idler now."""
+        if self in self._table.open:
+            del self._table.open[self]
+            self._table.open[self] = None
+        self._enter(ConnectionPhase.ANSWERING)
 
     def request_ends(self) -> None:
         """The response is made; the client has some time to read it and to send the next request."""
-        self.is_answering, self._received = False, 0
-        if not self._upgraded:
-            self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
+        self._since_response = 0
+        self._enter(ConnectionPhase.IDLE)
 
     def upgrade(self, on_unmasked: Callable[[], None]) -> None:
-        """The connection is a WebSocket from now on, whose handler has limits of its own.
+        """The connection is a WebSocket from now on.
 
         Args:
             on_unmasked: Called when a frame of the client is not masked; it and all after it is dropped.
         """
-        self._upgraded = True
-        self._mask, self._on_unmasked = MaskCheck(), on_unmasked
-        self._stop_timer()
+        self._on_unmasked = on_unmasked
+        self._enter(ConnectionPhase.UPGRADED)
 
     # --- the transport ---
 
@@ -402,23 +363,25 @@ class GuardedConnection(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         self._inner.connection_made(transport)
         if self._table.opened(self):
-            self._await_request()
+            self._enter(ConnectionPhase.ARRIVING)
 
     def data_received(self, data: bytes) -> None:
         """Pass bytes on, as many as one request may have."""
         self.received += len(data)
-        if self._on_unmasked is not None and (self._mask is None or not self._mask.passes(data)):
-            if self._mask is not None:
-                self._mask = None
+        if self.phase is ConnectionPhase.UPGRADED:
+            if self._on_unmasked is None:
+                return
+            if not self._mask.passes(data):
                 self._on_unmasked()
-            return
-        if not self._upgraded:
-            self._received += len(data)
-            if self._received > limits.WEB_REQUEST_MAX:
+                self._on_unmasked = None
+                return
+        else:
+            self._since_response += len(data)
+            if self._since_response > limits.WEB_REQUEST_MAX:
                 self.refuse("oversized", f"it sent more than {limits.WEB_REQUEST_MAX} bytes at once")
                 return
-            if not (self._arriving or self.is_answering or self._unread):
-                self._await_request()
+            if self.phase is ConnectionPhase.IDLE:
+                self._enter(ConnectionPhase.ARRIVING)
         self._inner.data_received(data)
 
     def eof_received(self) -> bool | None:
@@ -427,133 +390,55 @@ class GuardedConnection(asyncio.Protocol):
 
     def pause_writing(self) -> None:
         """Pass on that the client reads too slowly; it has some time to go on."""
-        self._unread = True
-        if not self._upgraded:
-            self._limit(limits.WEB_RESPONSE_TIMEOUT, "slow_response", "it does not read the response")
+        self._enter(ConnectionPhase.UNREAD)
         self._inner.pause_writing()
 
     def resume_writing(self) -> None:
         """Pass on that it reads again."""
-        self._unread = False
-        if not self._upgraded:
-            self._limit(limits.WEB_IDLE_TIMEOUT, None, "")
+        self._enter(ConnectionPhase.IDLE)
         self._inner.resume_writing()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
-        self._stop_timer()
-        self._table.closed(self)
+        self._forget()
         self._inner.connection_lost(exc)
 
     # --- limits ---
 
     def refuse(self, reason: str, text: str) -> None:
-        """Close the connection for one of ``REASONS``."""
+        """Close the connection, counted by its reason."""
         peer = self._transport.get_extra_info("peername") if self._transport is not None else None
-        self._table.refuse(self._loop.time(), reason, str(peer[0]) if peer else "?", text)
+        address = str(peer[0]) if peer else "?"
+        self._table.refusals.refuse(self._loop.time(), reason, address, f"{address}: {text}")
         self.abort()
 
     def abort(self) -> None:
         """Close the connection; what waits to be sent is dropped."""
-        self._stop_timer()
-        self._table.closed(self)
+        self._forget()
         if self._transport is not None:
             self._transport.abort()
 
-    def _await_request(self) -> None:
-        self._arriving = True
-        seconds = limits.WEB_REQUEST_TIMEOUT
-        self._limit(seconds, "slow_request", f"no complete request came within {seconds:g} s")
-
-    def _limit(self, seconds: float, reason: str | None, text: str) -> None:
-        self._stop_timer()
-        if self._transport is not None and not self._transport.is_closing():
-            self._timer = self._loop.call_later(seconds, self._too_slow, reason, text)
-
-    def _too_slow(self, reason: str | None, text: str) -> None:
-        if reason is None:
-            self.abort()
-        else:
-            self.refuse(reason, text)
-
-    def _stop_timer(self) -> None:
+    def _forget(self) -> None:
+        self._table.open.pop(self, None)
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
 
-
-# The server's own figures, for ``/metrics``; no I/O.
-
-
-REASONS: Final = (
-    *ACCESS_REASONS,
-    "method",
-    "body",
-    "malformed",
-    "connections",
-    "slow_request",
-    "slow_response",
-    "oversized",
-    *GATEWAY_REASONS,
-)
-"""Why requests, connections and clients are refused; all are shown from 0 on, so that an alarm sees the first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """What the server counts.
-
-    Attributes:
-        connections: Open at present.
-        accepted: Connections so far.
-        responses: Responses so far, by HTTP status.
-        refused: Refusals so far, by the words of ``REASONS``.
-        reads: Questions to the agent so far.
-        read_seconds: Seconds that they took.
-        gateways: What each gateway counts, by its protocol.
-    """
-
-    connections: int
-    accepted: int
-    responses: Mapping[str, int]
-    refused: Mapping[str, int]
-    reads: int
-    read_seconds: float
-    gateways: Mapping[str, GatewayFigures] = field(default_factory=dict)
-
-
-def web_metrics(figures: Figures) -> Iterator[Metric]:
-    """All metrics of the server."""
-    yield GaugeMetricFamily("rmpa_web_connections", "Open connections of clients.", figures.connections)
-    yield CounterMetricFamily("rmpa_web_accepted_connections", "Connections of clients so far.", figures.accepted)
-    responses = CounterMetricFamily("rmpa_web_responses", "Responses by HTTP status.", labels=("status",))
-    for status, count in sorted(figures.responses.items()):
-        responses.add_metric((status,), count)
-    yield responses
-    refused = CounterMetricFamily(
-        "rmpa_web_refused", "Requests, connections and WebSocket clients refused, by reason.", labels=("reason",)
-    )
-    for reason in REASONS:
-        refused.add_metric((reason,), figures.refused.get(reason, 0))
-    yield refused
-    yield SummaryMetricFamily(
-        "rmpa_web_agent_read_seconds", "Time to read the agent's snapshot.", figures.reads, figures.read_seconds
-    )
-    yield from _gateway_metrics(figures)
-
-
-def _gateway_metrics(figures: Figures) -> Iterator[Metric]:
-    labels = ("protocol",)
-    clients = GaugeMetricFamily("rmpa_web_clients", "WebSocket clients of the gateways.", labels=labels)
-    queued = GaugeMetricFamily("rmpa_web_client_queue_bytes", "Bytes that wait for these.", labels=labels)
-    sent = CounterMetricFamily("rmpa_web_client_frames", "Messages and answers sent to these.", labels=labels)
-    dropped = CounterMetricFamily(
-        "rmpa_web_client_dropped_messages", "Messages dropped because one of these was slow.", labels=labels
-    )
-    for protocol in PROTOCOLS:
-        gateway = figures.gateways.get(protocol, GatewayFigures())
-        clients.add_metric((protocol,), gateway.clients)
-        queued.add_metric((protocol,), gateway.queued)
-        sent.add_metric((protocol,), gateway.sent)
-        dropped.add_metric((protocol,), gateway.dropped)
-    yield from (clients, queued, sent, dropped)
+    def _enter(self, phase: ConnectionPhase) -> None:
+        """Begin to wait, for as long as the phase may take."""
+        if self.phase is ConnectionPhase.UPGRADED:
+            return
+        self.phase = phase
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._transport is None or self._transport.is_closing():
+            return
+        request, response = limits.WEB_REQUEST_TIMEOUT, limits.WEB_RESPONSE_TIMEOUT
+        late = self._loop.call_later
+        if phase is ConnectionPhase.ARRIVING:
+            self._timer = late(request, self.refuse, "slow_request", f"no complete request came within {request:g} s")
+        elif phase is ConnectionPhase.ANSWERING:
+            self._timer = late(response, self.refuse, "slow_response", "the response takes too long")
+        elif phase is ConnectionPhase.UNREAD:
+            self._timer = late(response, self.refuse, "slow_response", "it does not read the response")
+        elif phase is ConnectionPhase.IDLE:
+            self._timer = late(limits.WEB_IDLE_TIMEOUT, self.abort)

@@ -1,12 +1,8 @@
-"""The process ``rmpa web``: its start, its certificate, and the hub on the agent's core.
-
-The hub of ``rmpa web``: its node joins the core of the agent that the server shows.
-"""
+"""The process ``rmpa web``: its start, its certificate, and the hub, whose node joins the core of the agent."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import signal
@@ -15,7 +11,7 @@ import ssl
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Effect
@@ -29,13 +25,12 @@ from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.monitor import Monitor
-from rmpa.web.server import access as auth
-from rmpa.web.server.access import token_from
-from rmpa.web.server.agent_watch import AgentWatch, ControlReader, GraphSignal, TrustWatch
+from rmpa.web.server.access import TOKEN_PARAMETER, AccessPolicy, is_loopback, own_names, token_from
+from rmpa.web.server.agent_watch import AgentFollower, AgentWatch, ControlReader
 from rmpa.web.server.app import WebServer
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.core.contract import Contracts
@@ -86,11 +81,10 @@ def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateFiles:
+class CertificateFiles(NamedTuple):
     """Where a server's certificate is.
 
-    Args:
+    Attributes:
         cert: A PEM file: the certificate, and the intermediate ones behind it; empty for none: plain HTTP.
         key: A PEM file with the private key, not encrypted; empty: it is in ``cert``.
     """
@@ -126,31 +120,24 @@ def certificate_files(cert: str, key: str, store: TrustStore | None) -> Certific
     return CertificateFiles(str(store.path(CERTIFICATE)), str(store.path(KEY)))
 
 
-def tls_context(cert: str, key: str) -> ssl.SSLContext | None:
+def tls_context(files: CertificateFiles) -> ssl.SSLContext | None:
     """The context of a server; ``None`` without a certificate.
 
-    Args:
-        cert: As in ``CertificateFiles``.
-        key: Likewise.
-
     Raises:
-        ConfigError: There is a key without a certificate.
         StartError: The files cannot be read, or do not belong together.
     """
-    if not cert:
-        if key:
-            raise ConfigError("web.key", "there is a key without a certificate", "name the certificate with --cert")
+    if not files.cert:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        context.load_cert_chain(cert, key or None, password=_no_password)
+        context.load_cert_chain(files.cert, files.key or None, password=_no_password)
     except FileNotFoundError as error:
-        raise StartError(error.filename or cert, "there is no such file", "see cert and key of [web]") from None
+        raise StartError(error.filename or files.cert, "there is no such file", "see cert and key of [web]") from None
     except (OSError, ValueError) as error:  # an SSLError is an OSError
         text = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
         remedy = "the certificate and its unencrypted private key are wanted, as PEM"
-        raise StartError(cert, f"cannot be used with its key: {text}", remedy) from None
+        raise StartError(files.cert, f"cannot be used with its key: {text}", remedy) from None
     return context
 
 
@@ -170,7 +157,7 @@ class ServerCertificate:
     def __init__(self, files: CertificateFiles) -> None:
         self._files = files
         self._stamps = self._look()
-        self.context = tls_context(files.cert, files.key)
+        self.context = tls_context(files)
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -182,9 +169,7 @@ class ServerCertificate:
         """End."""
         if self._task is not None:
             self._task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._task
-            self._task = None
+            await asyncio.wait([self._task])
 
     def renew(self) -> bool:
         """Load the files if they have changed; return whether new connections get another certificate. It blocks."""
@@ -192,7 +177,7 @@ class ServerCertificate:
         if stamps == self._stamps or self.context is None:
             return False
         try:
-            tls_context(self._files.cert, self._files.key)  # a context that fails half-way has the new one in part
+            tls_context(self._files)  # a context that fails half-way has the new one in part
             self.context.load_cert_chain(self._files.cert, self._files.key or None, password=_no_password)
         except (StartError, OSError, ValueError) as error:
             _log.warning("! the changed certificate is not used yet: %s", error)
@@ -206,17 +191,17 @@ class ServerCertificate:
             await asyncio.sleep(limits.CERTIFICATE_LOOK_PERIOD)
             await asyncio.to_thread(self.renew)
 
-    def _look(self) -> Sequence[tuple[int, int] | None]:
+    def _look(self) -> list[tuple[int, int] | None]:
         """What changes when the files do."""
-        return [_stamp(Path(name)) for name in (self._files.cert, self._files.key) if name]
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    try:
-        info = path.stat()
-    except OSError:
-        return None
-    return info.st_ino, info.st_mtime_ns
+        stamps: list[tuple[int, int] | None] = []
+        for name in filter(None, self._files):
+            try:
+                info = Path(name).stat()
+            except OSError:
+                stamps.append(None)
+            else:
+                stamps.append((info.st_ino, info.st_mtime_ns))
+        return stamps
 
 
 def _no_password() -> str:
@@ -228,23 +213,8 @@ def _no_password() -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Address:
-    """Where a server is.
-
-    Attributes:
-        url: Of its first page; with the token if that was made now.
-        token_file: Where the token is; empty where none is needed.
-        is_new: Whether the token was made now.
-    """
-
-    url: str
-    token_file: str
-    is_new: bool
-
-
-@dataclass(frozen=True, slots=True)
 class TokenAccess:
-    """The token of a server, and where it is."""
+    """The token of a server, where it is, and whether it was made now."""
 
     token: str = field(default="", repr=False)
     file: Path | None = None
@@ -276,14 +246,14 @@ class WebSetup:
         return agent is None or (self.trusted and agent.module == self.module and agent.folder == self.trust_folder)
 
     @property
-    def policy(self) -> auth.AccessPolicy:
+    def policy(self) -> AccessPolicy:
         """Which requests are served."""
         web = self.settings.web
-        hosts = auth.own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
+        hosts = own_names((socket.gethostname(), *web.hosts)) | {web.listen.lower()}
         if self.trusted:
             hosts |= frozenset(server_names(self.module))
         origins = frozenset(origin.lower().rstrip("/") for origin in web.origins)
-        return auth.AccessPolicy(web.port, hosts, self.access.token, origins)
+        return AccessPolicy(web.port, hosts, self.access.token, origins)
 
     @property
     def rights(self) -> Rights:
@@ -323,7 +293,7 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     Raises:
         StartError: The file cannot be used, or there is no place for one.
     """
-    if auth.is_loopback(web.listen) and not (web.token_file or web.control or web.drive):
+    if is_loopback(web.listen) and not (web.token_file or web.control or web.drive):
         return TokenAccess()
     place = state_dir(environ, state or None)
     folder = module_dir(place, module) if place is not None else None
@@ -334,18 +304,17 @@ def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: 
     return TokenAccess(token, file, is_new)
 
 
-def address_of(web: WebSettings, access: TokenAccess, port: int, *, is_https: bool = False) -> Address:
-    """Where a server is, for the user."""
+def url_of(web: WebSettings, access: TokenAccess, port: int, *, is_https: bool = False) -> str:
+    """The URL of a server's first page; with the token if that was made now."""
     host = socket.gethostname() if web.listen == "0.0.0.0" else web.listen  # noqa: S104 - compared
-    query = f"?{auth.TOKEN_PARAMETER}={access.token}" if access.is_new else ""
-    scheme = "https" if is_https else "http"
-    return Address(f"{scheme}://{host}:{port}/{query}", str(access.file or ""), access.is_new)
+    query = f"?{TOKEN_PARAMETER}={access.token}" if access.is_new else ""
+    return f"{'https' if is_https else 'http'}://{host}:{port}/{query}"
 
 
 async def serve(
     setup: WebSetup,
     agent: str | None,
-    announce: Callable[[Address], None],
+    announce: Callable[[str, TokenAccess], None],
     *,
     with_agent: bool,
     load: Callable[[], WebSetup],
@@ -358,7 +327,7 @@ async def serve(
     Args:
         setup: The settings, token and certificate.
         agent: The agent's name; ``None``: the one that runs.
-        announce: Called when the server listens.
+        announce: Called with the URL and the token when the server listens.
         with_agent: Whether to end when standard input ends: it is a pipe that the agent holds open.
         load: Reads all of ``setup`` again; it may block, and raise ``RmpaError``.
 
@@ -371,13 +340,11 @@ async def serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     web = setup.settings.web
-    trust = TrustWatch(os.environ, agent, setup.fits)
-    reader = ControlReader(os.environ, agent, trust.check)
+    follower = AgentFollower(os.environ, agent, setup.fits)
+    reader = ControlReader(os.environ, agent, follower.check)
     watch = AgentWatch(reader, read_whole=reader.read_whole)
     hub = make_hub(watch, web.port, setup.rules)
-
     monitor = Monitor(hub, watch, agent=agent)
-    changes = GraphSignal(os.environ, lambda: agent or monitor.mesh.agent or None, hub.graph)
     gateways = Gateways(
         hub,
         f"RMPA {setup.module or socket.gethostname()}",
@@ -392,18 +359,17 @@ async def serve(
             await server.start()
             certificate.start()
             monitor.start()
-            changes.start()
-            trust.start()
+            follower.start(hub.graph)
             if with_agent:
                 _stop_at_end_of_input(loop, stop)
-            announce(address_of(web, setup.access, server.port, is_https=certificate.context is not None))
-            await _first_of(stop.wait(), trust.misfit.wait(), _changed(setup, load, reload))
+            announce(url_of(web, setup.access, server.port, is_https=certificate.context is not None), setup.access)
+            await _first_of(stop.wait(), follower.misfit.wait(), _changed(setup, load, reload))
             _log.info("= ending" if stop.is_set() else "= beginning anew with other settings")
             await gateways.close()
-            await changes.close()
+            await follower.close()
             await monitor.close()
     finally:
-        await trust.close()
+        await follower.close()
         await certificate.close()
         await server.close()
         reader.close()
