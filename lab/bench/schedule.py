@@ -6,7 +6,6 @@ it (no coordinated omission). All hosts are network namespaces of one machine an
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import statistics
@@ -106,23 +105,6 @@ class Arrivals:
         """From when the publisher did send to there, µs: without what kept the publisher from its processor."""
         late = (self.late[sequence - self.lead] for sequence in self.sequence)
         return [value - by / 1000 for value, by in zip(self.latencies(), late, strict=True)]
-
-    def periods(self) -> list[float]:
-        """Between arrivals that are neighbours in the sequence, µs."""
-        pairs = zip(self.sequence, self.came, strict=True)
-        return [(b - a) / 1000 for (i, a), (j, b) in itertools.pairwise(pairs) if j == i + 1]
-
-    def source_periods(self) -> list[float]:
-        """Between what the publisher sent, µs: the part of the jitter that no path can take away."""
-        step = self.step
-        return [step + (b - a) / 1000 for a, b in itertools.pairwise(self.late)]
-
-    @property
-    def step(self) -> float:
-        """The period that was meant, µs; 0 if fewer than two came."""
-        if len(self.due) < 2 or self.sequence[-1] == self.sequence[0]:
-            return 0.0
-        return (self.due[-1] - self.due[0]) / (self.sequence[-1] - self.sequence[0]) / 1000
 
     def bytes_per_second(self, size: int, begin: int, end: int) -> float:
         """What came of messages of ``size`` bytes between two moments of the clock."""
@@ -235,7 +217,6 @@ class Way:
         here: The publisher's shell.
         there: The receiver's.
         agents: The agents between them; none in classic ROS.
-        relayed: Whether a roscpp relay on each host takes each message on.
         transport: How messages cross where there are agents.
     """
 
@@ -244,16 +225,10 @@ class Way:
     here: Ros
     there: Ros
     agents: list[Agent] = field(default_factory=list)
-    relayed: bool = False
     transport: Transport | None = None
 
-    def stream(
-        self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0, transport: Transport | None = None
-    ) -> MeasuredStream:
-        """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority.
-
-        ``transport`` is the topic's own, where a contract gives it another one than the way has.
-        """
+    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> MeasuredStream:
+        """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
 
         def node(shell: Ros, program: str, *words: str) -> Process:
@@ -261,14 +236,9 @@ class Way:
             return shell.start(*argv, name=program, commands=True)
 
         between = {f"agent {number}": agent.process for number, agent in enumerate(self.agents, 1)}
-        end = topic
-        if self.relayed:
-            for number, shell in enumerate((self.here, self.there), 1):
-                begin, end = end, f"{topic}_{number}"
-                between[f"relay {number}"] = node(shell, "velocity", "--cmd", begin, "--vel", end)
-        target = node(self.there, "sink", "--topics", end)
+        target = node(self.there, "sink", "--topics", topic)
         source = node(self.here, "source", "--topic", topic)
-        made = MeasuredStream(bed, source, target, end, between, transport or self.transport)
+        made = MeasuredStream(bed, source, target, topic, between, self.transport)
         made.wait_flowing()
         return made
 
@@ -276,11 +246,6 @@ class Way:
 def direct(bed: Bed, network: int = 0) -> Way:
     """Classic ROS at its best: roscpp with tcpNoDelay across the cable, one master."""
     return Way("direct", "roscpp direct", *bed.classic(network))
-
-
-def relays(bed: Bed, network: int = 0) -> Way:
-    """Classic ROS with a relay in C++ on each host: as many hops as through two agents, each at its best."""
-    return Way("relays", "roscpp, two relays", *bed.classic(network, "relays"), relayed=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +266,6 @@ class AgentPair:
 
 
 RELAYED: Final = AgentPair("agents", "two agents")
-DIRECT: Final = AgentPair("agents_direct", "RMPA direct", "direct")
 
 
 def agents(bed: Bed, kind: AgentPair = RELAYED, *, network: int = 0, flags: Sequence[str] = ()) -> Way:
@@ -319,24 +283,6 @@ def realtime_agents(
     """Two agents with ``--realtime``, and what they got."""
     way = agents(bed, kind, network=network, flags=["--realtime"])
     return way, f"rmpa up --realtime; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
-
-
-def direct_and_agents(
-    bed: Bed, kinds: Sequence[AgentPair] = (RELAYED,), *, realtime: bool
-) -> tuple[list[Way], int, str]:
-    """Classic ROS and pairs of agents, each on a network of its own; the nodes' priority (0: none), and how all ran.
-
-    Args:
-        bed: Where they are.
-        kinds: Which pairs.
-        realtime: Whether nodes and agents run under SCHED_FIFO, so that other processes are out of the figures.
-    """
-    if not realtime:
-        ways = [agents(bed, kind, network=number) for number, kind in enumerate(kinds, 1)]
-        return [direct(bed), *ways], 0, "everything under SCHED_OTHER"
-    made = [realtime_agents(bed, kind, network=number) for number, kind in enumerate(kinds, 1)]
-    how = f"nodes under SCHED_FIFO {NODE_PRIORITY}; agents: {'; '.join(dict.fromkeys(how for _, how in made))}"
-    return [direct(bed), *(way for way, _ in made)], NODE_PRIORITY, how
 
 
 def _policy(pid: int) -> str:
@@ -396,11 +342,6 @@ class LatencyScore:
             "publisher_late_us": asdict(samples.summary(self.source_late)),
             "processes": {name: usage_row(usage, self.messages) for name, usage in self.usage.items()},
         }
-
-
-def named(measurement: str, *, realtime: bool) -> str:
-    """The result's name."""
-    return f"{measurement}_realtime" if realtime else measurement
 
 
 def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[Way]]:

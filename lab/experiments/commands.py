@@ -154,7 +154,7 @@ def run(
     from lab.bed.stage import make_stage, why_not
     from lab.experiments import runner
     from lab.experiments.asked import Asked, choose
-    from lab.experiments.progress import last_line, watching
+    from lab.experiments.progress import Progress, last_line
     from lab.experiments.store import Store, is_run_directory
 
     there = Store.load(out) if out is not None and is_run_directory(out) else None
@@ -175,9 +175,9 @@ def run(
         with (
             _terminated(),
             store.session([*_PROGRAM, *sys.argv[1:]]),
-            watching([cell for _, cell in waiting]) as watcher,
+            Progress([cell for _, cell in waiting]) as progress,
         ):
-            outcome = runner.run(jobs, store, make_stage, watcher)
+            outcome = runner.run(jobs, store, make_stage, progress)
     except KeyboardInterrupt:
         words = [
             *_PROGRAM,

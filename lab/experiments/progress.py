@@ -1,151 +1,90 @@
-"""How a run goes: two bars on a terminal, one line a cell anywhere else. All of it on stderr."""
+"""How a run goes, on stderr: a bar on a terminal, one line a cell anywhere else."""
 
 from __future__ import annotations
 
 import sys
 import time
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
-from lab.experiments.estimate import Estimate
 from rmpa.cli.output import duration, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from rich.console import Console
-    from rich.table import Table
+    from collections.abc import Sequence
 
     from lab.experiments.model import Cell
-    from lab.experiments.runner import Watcher
 
 _REFRESH: Final = 1.0
-"""Times a second that the bars are drawn anew: seldom, for the machine is being measured."""
+"""Times a second that the bar is drawn anew: seldom, for the machine is being measured."""
 
 
-@contextmanager
-def watching(cells: Sequence[Cell]) -> Iterator[Watcher]:
-    """Show how it goes while these cells are measured."""
-    estimate = Estimate([cell.seconds for cell in cells])
-    if not sys.stderr.isatty():
-        yield Lines(estimate, _write)
-        return
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(stderr=True)
-    bars = Bars(estimate, console)
-    with Live(get_renderable=bars.render, console=console, refresh_per_second=_REFRESH, transient=True):
-        yield bars
-
-
-class Lines:
-    """One line for each cell that is over.
+class Progress:
+    """Shows how it goes while cells are measured.
 
     Args:
-        estimate: Of the cells' times.
-        write: Takes each line.
-        now: The clock, in seconds.
+        cells: All of them, in their order.
     """
 
-    def __init__(
-        self, estimate: Estimate, write: Callable[[str], None], now: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._estimate = estimate
-        self._write = write
-        self._now = now
+    def __init__(self, cells: Sequence[Cell]) -> None:
+        self._total, self._left = len(cells), sum(cell.seconds for cell in cells)
+        self._done, self._planned = 0, 0.0
+        self._began = time.monotonic()
+        self._live = None
+        if sys.stderr.isatty():
+            from rich import progress
+            from rich.console import Console
 
-    def cell_begins(self, cell: Cell, attempt: int) -> None:  # noqa: ARG002 - the watcher's signature
-        """Count the seconds from here."""
-        self._estimate.begin(self._now())
-
-    def cell_ends(self, cell: Cell, seconds: float) -> None:
-        """Say that it is done, and how long the rest takes."""
-        self._estimate.end(self._now())
-        self._write(f"{self._count()} {_name(cell)}: {duration(seconds)}{self._rest()}")
-
-    def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
-        """Say why."""
-        if not again:
-            self._estimate.end(self._now())
-        what = "failed, and is tried again" if again else "failed"
-        self._write(f"{self._count()} {_name(cell)} {what}: {last_line(error)}")
-
-    def _count(self) -> str:
-        total = len(self._estimate.expected)
-        return f"[{self._estimate.done:>{len(str(total))}}/{total}]"
-
-    def _rest(self) -> str:
-        left = self._estimate.left(self._now())
-        return f", about {duration(left)} left" if left else ""
-
-
-class Bars:
-    """The whole run, and the cell that is being measured.
-
-    Args:
-        estimate: Of the cells' times.
-        console: Where failures are said, above the bars.
-        now: The clock, in seconds.
-    """
-
-    def __init__(self, estimate: Estimate, console: Console, now: Callable[[], float] = time.monotonic) -> None:
-        self._estimate = estimate
-        self._console = console
-        self._now = now
-        self._began = now()
-        self._cell: Cell | None = None
-        self._attempt = 1
-
-    def cell_begins(self, cell: Cell, attempt: int) -> None:
-        """Show it."""
-        self._estimate.begin(self._now())
-        self._cell, self._attempt = cell, attempt
-
-    def cell_ends(self, cell: Cell, seconds: float) -> None:  # noqa: ARG002 - the watcher's signature
-        """Count it."""
-        self._estimate.end(self._now())
-        self._cell = None
-
-    def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
-        """Say why, above the bars."""
-        if not again:
-            self._estimate.end(self._now())
-            self._cell = None
-        what = "failed, and is tried again" if again else "failed"
-        self._console.print(
-            f"! {_name(cell)} {what}: {last_line(error)}", style="yellow", markup=False, highlight=False
-        )
-
-    def render(self) -> Table:
-        """The bars as they are now."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        now, estimate, cell = self._now(), self._estimate, self._cell
-        table = Table.grid(padding=(0, 1))
-        table.add_column(no_wrap=True)
-        table.add_column(width=24)
-        table.add_column(no_wrap=True, overflow="ellipsis")
-        gone, takes = estimate.cell(now)
-        table.add_row(
-            Text("all", style="bold"),
-            ProgressBar(100.0, 100 * estimate.share(now), width=24),
-            Text(
-                f"{estimate.done} of {len(estimate.expected)} cells, {duration(now - self._began)}, "
-                f"about {duration(estimate.left(now))} left"
-            ),
-        )
-        if cell is not None:
-            again = ", second attempt" if self._attempt > 1 else ""
-            settings = " ".join(f"{name}={value}" for name, value in cell.settings.items())
-            table.add_row(
-                Text(cell.experiment, style="bold"),
-                ProgressBar(100.0, 100 * min(1.0, gone / takes) if takes else 0.0, width=24),
-                Text(f"{duration(gone)} of about {duration(takes)}{again}: {settings}"),
+            columns = (
+                progress.TextColumn("{task.description}"),
+                progress.BarColumn(24),
+                progress.TimeRemainingColumn(),
             )
-        return table
+            self._live = progress.Progress(
+                *columns, console=Console(stderr=True), refresh_per_second=_REFRESH, transient=True
+            )
+            self._task = self._live.add_task("", total=self._left)
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def begins(self, cell: Cell, attempt: int) -> None:
+        """A cell is tried for the first or the second time."""
+        if self._live:
+            again = ", second attempt" if attempt > 1 else ""
+            self._live.update(self._task, description=f"[{self._done}/{self._total}] {_name(cell)}{again}")
+
+    def ends(self, cell: Cell, seconds: float) -> None:
+        """It was measured, and that took so long."""
+        self._over(cell)
+        gone = time.monotonic() - self._began
+        rest = f", about {duration(gone / self._planned * self._left)} left" if self._left > 0 else ""
+        if not self._live:
+            self._say(f"{_name(cell)}: {duration(seconds)}{rest}")
+
+    def fails(self, cell: Cell, error: str, *, again: bool) -> None:
+        """It could not be measured; ``again``: it is tried once more."""
+        if not again:
+            self._over(cell)
+        self._say(f"{_name(cell)} {'failed, and is tried again' if again else 'failed'}: {last_line(error)}")
+
+    def _over(self, cell: Cell) -> None:
+        self._done += 1
+        self._planned += cell.seconds
+        self._left -= cell.seconds
+        if self._live:
+            self._live.advance(self._task, cell.seconds)
+
+    def _say(self, text: str) -> None:
+        line = f"[{self._done:>{len(str(self._total))}}/{self._total}] {text}"
+        if self._live:
+            self._live.console.print(line, style="yellow", markup=False, highlight=False)
+        else:
+            print(line, file=sys.stderr, flush=True)
 
 
 def _name(cell: Cell) -> str:
@@ -156,8 +95,3 @@ def last_line(error: str) -> str:
     """The line of an error that says most: the last of a traceback, the first of what a bed says."""
     lines = error.splitlines() or [""]
     return printable(lines[-1] if lines[0].startswith("Traceback") else lines[0])
-
-
-def _write(line: str) -> None:
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()

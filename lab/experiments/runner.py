@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from lab import machine
 from lab.experiments.model import Measured
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from lab.bed.plan import Plan
     from lab.bed.stage import Stage
     from lab.experiments.model import Cell, Experiment
+    from lab.experiments.progress import Progress
     from lab.experiments.store import Store
 
 LATENESS: Final = "lateness"
@@ -28,22 +29,6 @@ LATENESS_SECONDS: Final = 0.3
 """Of sleeps before and after each cell."""
 ATTEMPTS: Final = 2
 """How often a cell is tried."""
-
-
-class Watcher(Protocol):
-    """Is notified of a run's progress."""
-
-    def cell_begins(self, cell: Cell, attempt: int) -> None:
-        """A cell is tried for the first or the second time."""
-        ...
-
-    def cell_ends(self, cell: Cell, seconds: float) -> None:
-        """It was measured, and that took so long."""
-        ...
-
-    def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
-        """It could not be measured; ``again``: it is tried once more."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +59,9 @@ def run(
     jobs: Sequence[Job],
     store: Store,
     make_stage: Callable[[Plan], AbstractContextManager[Stage]],
-    watcher: Watcher,
+    progress: Progress,
     *,
     lateness: Callable[[float], list[float]] = machine.lateness,
-    now: Callable[[], float] = time.monotonic,
 ) -> Outcome:
     """Measure what is not there yet; call it from the main thread, which child processes are tied to.
 
@@ -87,32 +71,32 @@ def run(
         jobs: What is wanted.
         store: Where it is kept.
         make_stage: Sets the stage for one cell.
-        watcher: Is told how it goes.
+        progress: Shows how it goes.
         lateness: Says how late sleeps of so many seconds altogether end, in µs.
-        now: The clock, in seconds.
     """
     for experiment, cells in jobs:
         store.expect(experiment.name, experiment.title, cells)
     measured, failed = 0, []
     waiting = to_measure(jobs, store)
     for experiment, cell in waiting:
-        began = now()
+        began = time.monotonic()
         error = ""
         for attempt in range(1, ATTEMPTS + 1):
-            watcher.cell_begins(cell, attempt)
-            started, started_utc = now(), utc()
+            progress.begins(cell, attempt)
+            started, started_utc = time.monotonic(), utc()
             try:
                 came = _measure(experiment, cell, store.plan, make_stage, lateness)
-                took = now() - started
-                store.keep(cell, came, began=started_utc, seconds=took, attempts=attempt, error=error)
+                took = time.monotonic() - started
+                store.note(cell, came, began=started_utc, seconds=took, attempts=attempt, error=error)
             except Exception as caught:  # noqa: BLE001 - the top of one cell: the others do not depend on it
                 error = _told(caught)
-                watcher.cell_fails(cell, error, again=attempt < ATTEMPTS)
+                progress.fails(cell, error, again=attempt < ATTEMPTS)
                 if attempt == ATTEMPTS:
-                    store.note_failure(cell, error, began=started_utc, seconds=now() - started, attempts=attempt)
+                    took = time.monotonic() - started
+                    store.note(cell, None, began=started_utc, seconds=took, attempts=attempt, error=error)
                     failed.append((cell.experiment, cell.key, error))
             else:
-                watcher.cell_ends(cell, now() - began)
+                progress.ends(cell, time.monotonic() - began)
                 measured += 1
                 break
     return Outcome(measured, sum(len(cells) for _, cells in jobs) - len(waiting), tuple(failed))

@@ -188,10 +188,10 @@ class Store:
         record = self.manifest.cells.get(_id(cell))
         return record is not None and record.state == "done"
 
-    def keep(
+    def note(
         self,
         cell: Cell,
-        measured: Measured,
+        measured: Measured | None,
         *,
         began: str = "",
         seconds: float = 0.0,
@@ -202,56 +202,41 @@ class Store:
 
         Args:
             cell: Which.
-            measured: What came.
+            measured: What came; ``None``: it could not be measured.
             began: UTC, ISO 8601.
             seconds: That it took.
             attempts: How often it was tried.
-            error: Why the attempt before failed.
+            error: Why the last attempt that failed did.
 
         Raises:
             ValueError: A table cannot be kept as CSV.
         """
-        held = {name: frames.kinds(table) for name, table in measured.tables.items()}
+        came = measured or Measured()
+        held = {name: frames.kinds(table) for name, table in came.tables.items()}
         folder = self.directory / cell.experiment / cell.key
         folder.mkdir(parents=True, exist_ok=True)
-        for name, table in measured.tables.items():
-            _write_table(folder / f"{name}.csv", table)
-        self._note(
-            cell,
-            state="done",
+        for name, table in came.tables.items():
+            unfinished = folder / f"{name}.unfinished"
+            with unfinished.open("w", encoding="utf-8", newline="") as file:
+                frames.write(file, table)
+            unfinished.replace(folder / f"{name}.csv")
+        self.manifest.cells[_id(cell)] = msgspec.structs.replace(
+            self.manifest.cells[_id(cell)],
+            state="failed" if measured is None else "done",
             began=began,
             seconds=round(seconds, 3),
             attempts=attempts,
-            facts=dict(measured.facts),
+            facts=dict(came.facts),
             tables=held,
             error=error,
         )
-
-    def note_failure(
-        self, cell: Cell, error: str, *, began: str = "", seconds: float = 0.0, attempts: int = 1
-    ) -> None:
-        """Note that a cell could not be measured, and why."""
-        self._note(
-            cell,
-            state="failed",
-            began=began,
-            seconds=round(seconds, 3),
-            attempts=attempts,
-            error=error,
-            facts={},
-            tables={},
-        )
+        self.save()
 
     def save(self) -> None:
         """Write the manifest."""
-        _replace(
-            self.directory / _MANIFEST, msgspec.json.format(msgspec.json.encode(self.manifest), indent=1) + b"\n"
-        )
-
-    def _note(self, cell: Cell, **values: object) -> None:
-        record = self.manifest.cells[_id(cell)]
-        self.manifest.cells[_id(cell)] = msgspec.structs.replace(record, **values)
-        self.save()
+        unfinished = self.directory / ".manifest.unfinished"
+        unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(self.manifest), indent=1) + b"\n")
+        unfinished.replace(self.directory / _MANIFEST)
 
     # --- reading ------------------------------------------------------------------------------------------------
 
@@ -268,13 +253,9 @@ class Store:
         ]
         return Results(self.plan, cells)
 
-    def failed(self, experiment: str) -> list[CellRecord]:
-        """The cells of an experiment that could not be measured."""
-        return [record for _, record in self._records(experiment) if record.state == "failed"]
-
-    def waiting(self, experiment: str) -> list[CellRecord]:
-        """The cells of an experiment that have not been tried yet."""
-        return [record for _, record in self._records(experiment) if record.state == "planned"]
+    def records(self, experiment: str, state: str) -> list[CellRecord]:
+        """The cells of an experiment in this state."""
+        return [record for _, record in self._records(experiment) if record.state == state]
 
     def _records(self, experiment: str) -> list[tuple[Cell, CellRecord]]:
         return [
@@ -309,19 +290,6 @@ def utc() -> str:
 
 def _id(cell: Cell) -> str:
     return f"{cell.experiment}/{cell.key}"
-
-
-def _write_table(path: Path, table: DataFrame) -> None:
-    unfinished = path.with_suffix(".unfinished")
-    with unfinished.open("w", encoding="utf-8", newline="") as file:
-        frames.write(file, table)
-    unfinished.replace(path)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_bytes(content)
-    unfinished.replace(path)
 
 
 def _plain(machine: Mapping[str, object]) -> dict[str, object]:

@@ -55,7 +55,7 @@ def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Pa
 
     store = Store.load(out)
     assert store.names == [name]
-    assert not store.failed(name)
+    assert not store.records(name, "failed")
     results = store.results(name)
     assert {cell.settings["system"] for cell, _ in results.cells} == {"classic", "rmpa"}
     for cell, measured in results.cells:

@@ -80,7 +80,7 @@ def gather(
     Returns:
         A section with a ``problem`` where the samples cannot be read or make no sense: the others can still be told.
     """
-    failures = [FailedCell(record.settings, record.error) for record in store.failed(name)]
+    failures = [FailedCell(record.settings, record.error) for record in store.records(name, "failed")]
     title, about, cells = store.manifest.titles.get(name, name), "", 0
     late: list[float] = []
     images: dict[str, tuple[Path, Path]] = {}
@@ -100,7 +100,7 @@ def gather(
     except Exception as error:  # noqa: BLE001 - an experiment that fails must not take the others' report away
         _log.exception("%s: no findings", name)
         problem = f"{type(error).__name__}: {error}"
-    waiting = len(store.waiting(name))
+    waiting = len(store.records(name, "planned"))
     return Section(name, title, about, findings, cells, waiting, failures, late, images, problem)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.processes import BedError
+from lab.experiments.progress import Progress
 from lab.experiments.runner import ATTEMPTS, Outcome, run, to_measure
 from lab.experiments.store import Store
 from tests.lab.experiments.fakes import CODE, MACHINE, PLAN, FakeExperiment, no_stage
@@ -19,20 +19,21 @@ if TYPE_CHECKING:
     from lab.experiments.model import Cell
 
 
-@dataclass
-class Heard:
-    """A watcher that writes down what it is told."""
+class Heard(Progress):
+    """Writes down what it is told."""
 
-    lines: list[str] = field(default_factory=list)
+    def __init__(self) -> None:
+        super().__init__([])
+        self.lines: list[str] = []
 
-    def cell_begins(self, cell: Cell, attempt: int) -> None:
+    def begins(self, cell: Cell, attempt: int) -> None:
         self.lines.append(f"{cell.key} {attempt}")
 
-    def cell_ends(self, cell: Cell, seconds: float) -> None:
+    def ends(self, cell: Cell, seconds: float) -> None:
         assert seconds >= 0
         self.lines.append(f"{cell.key} done")
 
-    def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
+    def fails(self, cell: Cell, error: str, *, again: bool) -> None:
         self.lines.append(f"{cell.key} {'again' if again else 'given up'}: {error.splitlines()[-1]}")
 
 
@@ -99,12 +100,12 @@ def test_a_cell_that_fails_again_is_noted_and_the_run_goes_on(store: Store) -> N
     assert experiment.tried["system-rmpa_rate-10_round-1"] == ATTEMPTS
     assert heard.lines[-1] == "system-rmpa_rate-20_round-1 done"
     again = Store.load(store.directory)
-    assert [one.error for one in again.failed("fake")] == [error]
+    assert [one.error for one in again.records("fake", "failed")] == [error]
     assert len(again.results("fake").cells) == 3
 
     experiment.before = lambda _cell, _attempt: None  # what failed is measured when the run is gone on with
     assert measure(again, experiment)[0] == Outcome(1, 3, ())
-    assert not again.failed("fake")
+    assert not again.records("fake", "failed")
     assert again.manifest.cells["fake/system-rmpa_rate-10_round-1"].error == ""
 
 
@@ -119,7 +120,7 @@ def test_ctrl_c_leaves_what_was_measured_to_go_on_with(store: Store) -> None:
     again = Store.load(store.directory)
     jobs = [(experiment, experiment.cells(PLAN))]
     assert [cell.settings["rate"] for _, cell in to_measure(jobs, again)] == [20, 20]
-    assert len(again.waiting("fake")) == 2
+    assert len(again.records("fake", "planned")) == 2
 
     experiment.before = lambda _cell, _attempt: None
     experiment.tried.clear()

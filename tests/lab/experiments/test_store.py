@@ -33,9 +33,9 @@ def store(tmp_path: Path) -> Store:
 
 
 def test_what_was_kept_is_read_again(store: Store) -> None:
-    store.keep(CELLS[2], MEASURED, began="2026-01-01T00:00:00+00:00", seconds=1.5)
-    store.keep(CELLS[0], MEASURED)
-    store.note_failure(CELLS[1], "BedError: no", attempts=2)
+    store.note(CELLS[2], MEASURED, began="2026-01-01T00:00:00+00:00", seconds=1.5)
+    store.note(CELLS[0], MEASURED)
+    store.note(CELLS[1], None, attempts=2, error="BedError: no")
     again = Store.load(store.directory)
     assert again.plan == PLAN
     assert again.names == ["fake"]
@@ -46,10 +46,10 @@ def test_what_was_kept_is_read_again(store: Store) -> None:
     for _, measured in results.cells:
         assert measured.facts == MEASURED.facts
         assert_frame_equal(measured.tables["samples"], MEASURED.tables["samples"])
-    assert [(one.settings, one.error, one.attempts) for one in again.failed("fake")] == [
+    assert [(one.settings, one.error, one.attempts) for one in again.records("fake", "failed")] == [
         (CELLS[1].settings, "BedError: no", 2)
     ]
-    assert [one.settings for one in again.waiting("fake")] == [CELLS[3].settings]
+    assert [one.settings for one in again.records("fake", "planned")] == [CELLS[3].settings]
     assert [again.is_done(cell) for cell in CELLS] == [True, False, True, False]
 
 
@@ -59,12 +59,12 @@ def test_a_cell_counts_once_the_manifest_says_so(store: Store, monkeypatch: pyte
 
     monkeypatch.setattr(Store, "save", cut_off)
     with pytest.raises(KeyboardInterrupt):
-        store.keep(CELLS[0], MEASURED)
+        store.note(CELLS[0], MEASURED)
     assert not Store.load(store.directory).is_done(CELLS[0])
 
 
 def test_cells_that_are_known_keep_what_came_of_them(store: Store) -> None:
-    store.keep(CELLS[0], MEASURED)
+    store.note(CELLS[0], MEASURED)
     again = Store.load(store.directory)
     more = [*CELLS, Cell("fake", {"system": "rmpa", "rate": 50, "round": 1})]
     again.expect("fake", "0. Nothing", more)
@@ -101,7 +101,7 @@ def test_a_directory_with_other_things_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_spoiled_is_named(store: Store) -> None:
-    store.keep(CELLS[0], MEASURED)
+    store.note(CELLS[0], MEASURED)
     table = store.directory / "fake" / CELLS[0].key / "samples.csv"
     table.write_text("topic,due_ns\n/cmd,soon\n")
     with pytest.raises(ConfigError, match=r"samples\.csv: is not what was measured"):

@@ -99,7 +99,7 @@ def make_run(
             top = largest if cell.settings["system"] == "rmpa" else 1.5
             table = frame(("sequence", "late_ms"), [(0, 1.0), (1, top), (2, 1.25)])
             late = frame(("when", "late_us"), [("before", 60.0), ("after", 75.5)] * 10)
-            store.keep(cell, Measured({"arrivals": table, "lateness": late}), seconds=3.0)
+            store.note(cell, Measured({"arrivals": table, "lateness": late}), seconds=3.0)
         if fail:
-            store.note_failure(cells[0], "no answer <script>", attempts=2)
+            store.note(cells[0], None, attempts=2, error="no answer <script>")
     return directory
