@@ -5,10 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
-from rmpa.gateway.ros2.actions import GoalsToRos1
-from rmpa.gateway.ros2.conversion import ActionPair
-from rmpa.gateway.ros2.mapping import (
-    ActionRule,
+from rmpa.gateway.ros2.action_messages import (
     GoalId,
     GoalState,
     Ros1Status,
@@ -21,6 +18,9 @@ from rmpa.gateway.ros2.mapping import (
     ros2_states,
     with_uuid,
 )
+from rmpa.gateway.ros2.actions import GoalsToRos1
+from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _JAZZY = Ros2Types("jazzy")
 _PARTS = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-_PAIR = ActionPair(_PARTS, ActionRule("actionlib/action/Test"), _JAZZY)
+_PAIR = ActionPair(_PARTS, TypePair("actionlib/action/Test"), _JAZZY)
 _UUID = bytes(range(16))
 _GOAL = GoalId("goal", 1, 2)
 _STATE = GoalState(_GOAL, Ros1Status.ACTIVE, "text")

@@ -72,7 +72,7 @@ def _fuzz_service(name: str, type_hash: str, fields: dict[str, Any]) -> None:
         return
     try:
         types = described_types(_JAZZY, name, type_hash, fields)
-        kind = derive_service(types.store, name, "odd_msgs/Grip", TypeMapping().ros1_message)
+        kind = derive_service(types.store, name, "odd_msgs/Grip", TypeMapping().ros1_type)
         ServicePair(kind, TypePair(name), types)
     except (RmpaError, KeyError):
         return

@@ -10,7 +10,7 @@ import pytest
 from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import eventually
 from rmpa.gateway.ros2.conversion import ActionPair
-from rmpa.gateway.ros2.mapping import ActionRule
+from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks
@@ -41,7 +41,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 def hashes() -> str:
     """The type hashes of actionlib's TestAction, by the ends of their names."""
     kinds = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-    pair = ActionPair(kinds, ActionRule("actionlib/action/Test"), Ros2Types("jazzy"))
+    pair = ActionPair(kinds, TypePair("actionlib/action/Test"), Ros2Types("jazzy"))
     return json.dumps({name.rpartition("/")[2].rpartition("_")[2]: each for name, each in pair.types.values()})
 
 

@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.actions import GoalsToRos1
-from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
-from rmpa.gateway.ros2.mapping import (
+from rmpa.gateway.ros2.action_messages import (
     ALL_GOALS,
-    ActionRule,
     GoalId,
     GoalState,
     Ros1Status,
     Ros2Status,
-    TypeMapping,
     cancel_request,
     cancel_response,
     parse_outcome,
@@ -29,6 +25,9 @@ from rmpa.gateway.ros2.mapping import (
     send_goal_response,
     with_uuid,
 )
+from rmpa.gateway.ros2.actions import GoalsToRos1
+from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
+from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
 from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
@@ -36,7 +35,7 @@ from rmpa.runtime.loop import SystemClock
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-PAIR = ActionPair(TEST, ActionRule("actionlib/action/Test"), JAZZY)
+PAIR = ActionPair(TEST, TypePair("actionlib/action/Test"), JAZZY)
 UUID = bytes(range(16))
 STAMP = 1_700_000_000_500_000_000
 GOAL = MessageType("actionlib/TestActionGoal")

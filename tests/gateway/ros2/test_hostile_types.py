@@ -19,7 +19,7 @@ from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversi
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.pairs import Ros2Pairs
-from rmpa.gateway.ros2.transcoder import Items, Number, Side, Text, Transcoder
+from rmpa.gateway.ros2.transcoder import LayoutPart, Transcoder
 from rmpa.gateway.ros2.types import Ros2Types, parse_type_response
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.ros2.type_descriptions import respond
@@ -116,7 +116,7 @@ def test_a_giant_array_of_ros_1_is_not_made_up_for_each_message() -> None:
 
 def test_elements_that_the_other_side_fills_up_are_bounded() -> None:
     """Each element has 4 bytes in ROS 2, and 8,000 more in ROS 1."""
-    made = Transcoder((Items((Number(4), Number(8, 1000, Side.ROS1))),))
+    made = Transcoder((LayoutPart(items=(LayoutPart(4), LayoutPart(8, 1000, in2=False))),))
     assert len(made.to_ros1(HEAD + struct.pack("<I", 10) + bytes(40))) == 4 + 10 * 8004
     tracemalloc.start()
     try:
@@ -128,22 +128,27 @@ def test_elements_that_the_other_side_fills_up_are_bounded() -> None:
 
 
 def test_loops_within_loops_are_bounded_and_arrays_of_numbers_are_not() -> None:
-    texts = Transcoder((Items((Items((Text(),)),)),))
+    texts = Transcoder((LayoutPart(items=(LayoutPart(items=(LayoutPart(),)),)),))
     begin = time.process_time()
     with pytest.raises(ValueError, match="too many elements"):
         texts.to_ros1(HEAD + struct.pack("<I", 3_000_000) + bytes(12_000_000))
     assert time.process_time() - begin < 10
-    image = Transcoder((Items((Number(1),)),))
+    image = Transcoder((LayoutPart(items=(LayoutPart(1),)),))
     size = 8_000_000
     assert len(image.to_ros1(HEAD + struct.pack("<I", size) + bytes(size))) == size + 4
     with pytest.raises(ValueError, match="fixed length"):
-        Transcoder((Items((Text(),), limits.ROS2_WORK_MAX + 1),))
+        Transcoder((LayoutPart(0, limits.ROS2_WORK_MAX + 1, (LayoutPart(),)),))
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**31, 1000])
 def test_a_length_that_the_message_does_not_have_allocates_nothing(count: int) -> None:
-    for parts in ((Items((Text(),)),), (Items((Number(8),)),), (Text(),), (Items((Items((Number(1),)),)),)):
-        made = Transcoder(parts)
+    for part in (
+        LayoutPart(items=(LayoutPart(),)),
+        LayoutPart(items=(LayoutPart(8),)),
+        LayoutPart(),
+        LayoutPart(items=(LayoutPart(items=(LayoutPart(1),)),)),
+    ):
+        made = Transcoder((part,))
         for convert, head in ((made.to_ros1, HEAD), (made.to_cdr, b"")):
             tracemalloc.start()
             try:
@@ -157,15 +162,15 @@ def test_a_length_that_the_message_does_not_have_allocates_nothing(count: int) -
 def test_no_name_of_a_type_gets_into_the_code_of_a_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also names that the parsers would refuse: the code has numbers alone."""
     written: list[str] = []
-    write = transcoder._Writer.add
+    write = transcoder.FunctionText.add
 
-    def add(self: transcoder._Writer, *lines: str) -> None:
+    def add(self: transcoder.FunctionText, *lines: str) -> None:
         written.extend(lines)
         write(self, *lines)
 
-    monkeypatch.setattr(transcoder._Writer, "add", add)
+    monkeypatch.setattr(transcoder.FunctionText, "add", add)
     evil = "x'); raise SystemExit  # {1/0}"
-    made = Transcoder((Text(bound=2, name=evil), Items((Text(),), bound=2, name=evil)))
+    made = Transcoder((LayoutPart(bound=2, name=evil), LayoutPart(items=(LayoutPart(),), bound=2, name=evil)))
     assert not any("SystemExit" in line for line in written)
     with pytest.raises(ValueError, match=r"SystemExit.* has 3 bytes; ROS 2 allows 2"):
         made.to_cdr(struct.pack("<I", 3) + b"abc" + bytes(4))

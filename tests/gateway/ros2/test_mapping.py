@@ -57,22 +57,22 @@ def test_packages_that_end_in_msgs_also_fit_interfaces() -> None:
 def test_rules_for_packages_messages_and_fields(mapping: TypeMapping) -> None:
     assert mapping.message("arm_msgs/Grip", KNOWN) == TypePair("arm_interfaces/msg/Grip")
     fields = {"header.stamp": "stamp", "angle": "position"}
-    assert mapping.message("arm_msgs/Joint", KNOWN) == TypePair("control_msgs/msg/JointState", fields)
+    assert mapping.message("arm_msgs/Joint", KNOWN) == TypePair("control_msgs/msg/JointState", {"": fields})
 
 
 def test_rules_for_services(mapping: TypeMapping) -> None:
-    assert mapping.service("arm_msgs/Home") == TypePair("arm_interfaces/srv/GoHome", request={"fast": "quick"})
+    assert mapping.service("arm_msgs/Home") == TypePair("arm_interfaces/srv/GoHome", {"request": {"fast": "quick"}})
     assert mapping.service("arm_msgs/Stop") == TypePair("arm_interfaces/srv/Stop")
     assert mapping.service("std_srvs/Trigger") == TypePair("std_srvs/srv/Trigger")
 
 
 def test_the_way_back(mapping: TypeMapping) -> None:
-    assert mapping.ros1_message("std_msgs/msg/String") == "std_msgs/String"
-    assert mapping.ros1_message("control_msgs/msg/JointState") == "arm_msgs/Joint"
-    assert mapping.ros1_message("arm_interfaces/msg/Grip") == "arm_msgs/Grip"
-    assert mapping.ros1_message("rcl_interfaces/msg/Log") == "rosgraph_msgs/Log"
-    assert mapping.ros1_service("arm_interfaces/srv/GoHome") == "arm_msgs/Home"
-    assert mapping.ros1_message("tf2_msgs/msg/TFMessage", ["tf2_msgs/TFMessage"]) == "tf2_msgs/TFMessage"
+    assert mapping.ros1_type("std_msgs/msg/String") == "std_msgs/String"
+    assert mapping.ros1_type("control_msgs/msg/JointState") == "arm_msgs/Joint"
+    assert mapping.ros1_type("arm_interfaces/msg/Grip") == "arm_msgs/Grip"
+    assert mapping.ros1_type("rcl_interfaces/msg/Log") == "rosgraph_msgs/Log"
+    assert mapping.ros1_type("arm_interfaces/srv/GoHome") == "arm_msgs/Home"
+    assert mapping.ros1_type("tf2_msgs/msg/TFMessage", ["tf2_msgs/TFMessage"]) == "tf2_msgs/TFMessage"
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ DIFFER = {
 
 
 def name1(name: str) -> str:
-    return TypeMapping().ros1_message(name, known_types())
+    return TypeMapping().ros1_type(name, known_types())
 
 
 def test_the_ros1_form_of_ros2s_types_is_noetics_where_both_have_the_type() -> None:
@@ -48,7 +48,7 @@ def test_a_type_that_only_ros2_has_can_be_subscribed_to_in_ros1() -> None:
     conversion = made.incoming(name, JAZZY.type_hash(name))
     assert conversion is not None
     assert conversion.ros1.name == "geometry_msgs/VelocityStamped"
-    store = conversion._store
+    store = JAZZY.store
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](3, 4), "map")
     vector = store.types["geometry_msgs/msg/Vector3"]
     twist = store.types["geometry_msgs/msg/Twist"](vector(1.0, 2.0, 3.0), vector(4.0, 5.0, 6.0))

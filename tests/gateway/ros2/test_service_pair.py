@@ -65,7 +65,9 @@ def test_a_service_under_another_name_has_that_names_hash(jazzy: Ros2Types) -> N
 def test_a_rule_renames_the_fields_of_a_service(jazzy: Ros2Types) -> None:
     ros1 = ServiceType("robot_srvs/Sum", "int64 left\nint64 right\n---\nint64 all\n")
     pair("rospy_tutorials/AddTwoInts", jazzy)  # its type is known from here on
-    rule = TypePair("example_interfaces/srv/AddTwoInts", None, {"left": "a", "right": "b"}, {"all": "sum"})
+    rule = TypePair(
+        "example_interfaces/srv/AddTwoInts", {"request": {"left": "a", "right": "b"}, "response": {"all": "sum"}}
+    )
     made = ServicePair(ros1, rule, jazzy)
     raw = made.request.to_ros2(ros1.request.serialize(ros1.request.make({"left": 5, "right": -6})))
     read: Any = jazzy.store.deserialize_cdr(raw, "example_interfaces/srv/AddTwoInts_Request")
@@ -75,7 +77,7 @@ def test_a_rule_renames_the_fields_of_a_service(jazzy: Ros2Types) -> None:
 def test_a_rule_with_fields_of_an_unknown_type_is_refused_with_what_to_do(jazzy: Ros2Types) -> None:
     ros1 = ServiceType("robot_srvs/Sum", "int64 left\n---\nint64 all\n")
     with pytest.raises(NoConversion, match=r"other_srvs/srv/Sum.*workspace"):
-        ServicePair(ros1, TypePair("other_srvs/srv/Sum", None, {"left": "a"}), jazzy)
+        ServicePair(ros1, TypePair("other_srvs/srv/Sum", {"request": {"left": "a"}}), jazzy)
 
 
 def test_services_that_the_other_side_cannot_use_are_left_out_with_a_reason() -> None:

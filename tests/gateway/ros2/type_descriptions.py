@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rosbags.interfaces import Nodetype
-
 from rmpa.gateway.ros2 import types as type_description
-from rmpa.gateway.ros2.types import embedded
 
 if TYPE_CHECKING:
-    from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.gateway.ros2.types import Ros2Field, Ros2Types
 
 IDS = {name: number for number, name in type_description._BASES.items() if number not in (13, 21)}
 PACKAGE = "type_description_interfaces/msg/"
@@ -18,8 +15,13 @@ PACKAGE = "type_description_interfaces/msg/"
 
 def response(types: Ros2Types, name: str) -> bytes:
     """A true response: the type and all that it embeds."""
-    every = dict.fromkeys(embedded(types.store, name))
-    return respond({each: [(key, *_numbers(desc)) for key, desc in types.store.fielddefs[each][1]] for each in every})
+    every: dict[str, list[tuple[str, int, int, int, str]]] = {}
+    todo = [name]
+    while todo:
+        if (each := todo.pop()) not in every:
+            every[each] = [(field.name, *_numbers(field)) for field in types.fields(each)]
+            todo += [field.type for field in types.fields(each) if not field.primitive]
+    return respond(every)
 
 
 def respond(types: dict[str, list[tuple[str, int, int, int, str]]], *, ok: bool = True, why: str = "") -> bytes:
@@ -46,16 +48,10 @@ def respond(types: dict[str, list[tuple[str, int, int, int, str]]], *, ok: bool 
     return bytes(store.serialize_cdr(message, type_description._RESPONSE))
 
 
-def _inner(desc: Any) -> Any:
-    return desc[1][0] if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
-
-
-def _numbers(desc: Any) -> tuple[int, int, int, str]:
-    inner, more, capacity = _inner(desc), 0, 0
-    if desc[0] == Nodetype.ARRAY:
-        more, capacity = 48, desc[1][1]
-    elif desc[0] == Nodetype.SEQUENCE:
-        more, capacity = (96, desc[1][1]) if desc[1][1] else (144, 0)
-    if inner[0] == Nodetype.NAME:
-        return more + 1, capacity, 0, str(inner[1])
-    return more + IDS[inner[1][0]], capacity, 0, ""
+def _numbers(field: Ros2Field) -> tuple[int, int, int, str]:
+    more, capacity = 0, field.size or field.bound
+    if field.array:
+        more = 48 if field.size is not None else 96 if field.bound else 144
+    if not field.primitive:
+        return more + 1, capacity, 0, field.type
+    return more + IDS[field.type], capacity, 0, ""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind, ZenohQos
-from rmpa.gateway.ros2 import mapping as messages
+from rmpa.gateway.ros2 import action_messages as messages
+from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, action_name
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
 from rmpa.gateway.ros2.graph import valid_name
-from rmpa.gateway.ros2.mapping import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
 from rmpa.gateway.ros2.shown_action import JoinedAction, ShownAction, find_headers, find_parts
 

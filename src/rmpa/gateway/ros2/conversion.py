@@ -1,152 +1,55 @@
 """Conversion of messages between ROS 1's bytes and CDR, for each pair of types and for actions.
 
-An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions.
+Where the fields that both types have are in one order and of one size, the bytes are converted without making objects
+(``transcoder``). Else the values are read, each goes to the field of the same name, or as a mapping file says, and
+they are written; numbers are checked for their range. A field that only one side has, as ``seq`` of a header, is 0 or
+empty there. As in ros1_bridge, two types of which *each* has fields that the other lacks are no pair: a rule must say
+what goes where.
 """
 
 from __future__ import annotations
 
+import functools
 import struct
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys.base import normalize_fieldname
 
-from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.gateway.ros2.transcoder import Items, Number, Part, Side, Text, Transcoder, on_side
-from rmpa.gateway.ros2.types import check_ros1_size, ros2_name, snake_case
+from rmpa.core.errors import RmpaError
+from rmpa.core.limits import UINT32_MAX
+from rmpa.gateway.ros2.transcoder import HEAD, LayoutPart, Transcoder
+from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, Ros2Field, check_size, ros2_name, snake_case
+from rmpa.ros.types.codec import CODES, SIZES, MessageCodec
 from rmpa.ros.types.definitions import Specification
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.gateway.ros2.mapping import ActionRule, FieldPaths
+    from rmpa.gateway.ros2.mapping import FieldPaths, TypePair
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.ros.types.definitions import Field
     from rmpa.ros.wire.tcpros import Buffer
 
-
-# The layout of a pair of types: what their messages are made of, in order, for the transcoder.
-
+    FieldsOf = Callable[[str], Iterable[Field]]
+    """The fields of a type of one side by its name."""
 
 HEADER: Final = "std_msgs/msg/Header"
-TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
-"""ROS 1's primitive times, and the messages of ROS 2 that have the same 8 bytes."""
-_TIME_LAYOUT: Final = Number(4, 2)
-_SIZES: Final = {
-    **dict.fromkeys(("bool", "byte", "char", "int8", "uint8", "octet"), 1),
-    **dict.fromkeys(("int16", "uint16"), 2),
-    **dict.fromkeys(("int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("int64", "uint64", "float64"), 8),
-}
-"""Bytes of the numbers of both sides, and their alignment in CDR."""
-_BYTES: Final = dict.fromkeys(("byte", "char", "int8", "uint8", "octet"), "byte")
-"""Numbers of one byte mean the same under each of these names; other numbers have to have one name."""
-
-
-class Layouts:
-    """Finds the layouts of pairs of types.
-
-    Args:
-        ros1: The fields of ROS 1's types by name.
-        ros2: The fields of ROS 2's types by name, as rosbags has them.
-    """
-
-    def __init__(self, ros1: Mapping[str, Specification], ros2: Mapping[str, Any]) -> None:
-        self._ros1 = ros1
-        self._ros2 = ros2
-
-    def of(self, name1: str, name2: str) -> tuple[Part, ...] | None:
-        """The parts of a message of both types; ``None`` if order or size of their common fields differ."""
-        fields2 = dict(self._ros2[name2][1])
-        if ros2_name(name1) == name2 == HEADER:
-            return (Number(4, side=Side.ROS1), _TIME_LAYOUT, Text())  # seq, stamp, frame_id
-        ones = {name2_of(field.name, fields2): field for field in self._ros1[name1].fields}
-        if [name for name in ones if name in fields2] != [name for name in fields2 if name in ones]:
-            return None
-        parts: list[Part] = []
-        waiting = list(fields2.items())
-        for name, field in ones.items():
-            if name not in fields2:
-                parts += on_side(self._only1(field), Side.ROS1)
-                continue
-            while waiting[0][0] != name:
-                parts += on_side(self._only2(waiting.pop(0)[1]), Side.ROS2)
-            both = self._field(field, waiting.pop(0)[1])
-            if both is None:
-                return None
-            parts += both
-        for _, desc in waiting:
-            parts += on_side(self._only2(desc), Side.ROS2)
-        return tuple(parts)
-
-    def _field(self, field: Field, desc: Any) -> tuple[Part, ...] | None:
-        """The parts of a field that both sides have."""
-        if not field.array:
-            return self._scalar(field, desc)
-        if desc[0] != (Nodetype.SEQUENCE if field.size is None else Nodetype.ARRAY):
-            return None
-        inner, count = desc[1]
-        parts = self._scalar(field, inner)
-        if parts is None or (field.size is not None and field.size != count):
-            return None
-        return (_array(parts, field.size, count if field.size is None else 0, field.name),)
-
-    def _scalar(self, field: Field, desc: Any) -> tuple[Part, ...] | None:
-        if desc[0] == Nodetype.NAME:
-            if field.primitive:
-                return (_TIME_LAYOUT,) if TIMES.get(field.type) == desc[1] else None
-            return self.of(field.type, desc[1])
-        if desc[0] != Nodetype.BASE or not field.primitive:
-            return None
-        base, bound = desc[1]
-        if field.type == base == "string":
-            return (Text(bound=bound, name=field.name),)
-        same = _BYTES.get(field.type, field.type) == _BYTES.get(base, base)
-        return (Number(_SIZES[base]),) if same and base in _SIZES else None
-
-    def _only1(self, field: Field) -> tuple[Part, ...]:
-        if field.primitive:
-            number = _TIME_LAYOUT if field.type in TIMES else Number(_SIZES.get(field.type, 0))
-            parts: tuple[Part, ...] = (Text() if field.type == "string" else number,)
-        else:
-            parts = tuple(part for each in self._ros1[field.type].fields for part in self._only1(each))
-        return (_array(parts, field.size),) if field.array else parts
-
-    def _only2(self, desc: Any) -> tuple[Part, ...]:
-        if desc[0] == Nodetype.NAME:
-            return tuple(part for _, each in self._ros2[desc[1]][1] for part in self._only2(each))
-        if desc[0] == Nodetype.BASE:
-            return (Text(),) if desc[1][0] == "string" else (Number(_SIZES[desc[1][0]]),)
-        inner, count = desc[1]
-        return (_array(self._only2(inner), count if desc[0] == Nodetype.ARRAY else None),)
-
-
-def name2_of(name: str, fields2: Iterable[str]) -> str:
-    """ROS 2's name of a field of ROS 1."""
-    return name if name in fields2 else snake_case(name)
-
-
-def _array(parts: tuple[Part, ...], count: int | None, bound: int = 0, name: str = "") -> Part:
-    """An array; one of a fixed number of numbers is numbers, so that it is copied with its neighbours."""
-    if count is not None and len(parts) == 1 and isinstance(parts[0], Number):
-        return Number(parts[0].size, parts[0].count * count, parts[0].side)
-    return Items(parts, count, Side.BOTH, bound, name)
-
-
-# Conversion of messages between ROS 1's serialization and ROS 2's CDR.
-#
-# Where the fields that both types have are in one order and of one size, the bytes are converted without making
-# objects (``transcoder``). Else each field goes to the one of the same name, or as a mapping file says; numbers are
-# checked for their range. A field that only one side has, as ``seq`` of a header, is 0 or empty there. As in
-# ros1_bridge, two types of which *each* has fields that the other lacks are no pair: a rule must say what goes
-# where.
-
-
-_EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
-_UNSIGNED: Final = ("uint8", "char")
-_LITTLE_ENDIAN: Final = b"\x00\x01"
+_ONE_BYTE: Final = ("byte", "char", "int8", "uint8")
+"""Numbers of one byte keep their bits under each of these names; other numbers are equal if they have one name."""
+_LITTLE_ENDIAN: Final = HEAD[:2]
+_ERRORS: Final = (
+    SerdeError,
+    RmpaError,
+    struct.error,
+    ValueError,
+    KeyError,
+    IndexError,
+    AssertionError,
+    OverflowError,
+)
+"""What is raised for bytes that are not a message; rosbags does not check everything itself."""
 
 
 class NoConversion(RmpaError):  # noqa: N818 - the name says what happened
@@ -155,6 +58,51 @@ class NoConversion(RmpaError):  # noqa: N818 - the name says what happened
 
 class ConversionError(RmpaError):
     """A message does not fit the other side's type."""
+
+
+class Ros2Codec:
+    """Reads and writes the CDR of one type of ROS 2 as values, whose times are ``{sec, nanosec}``.
+
+    Args:
+        types: ROS 2's types.
+        name: The type.
+
+    Raises:
+        KeyError: It or a type within it is not known.
+        ValueError: Its messages are too much work.
+        DefinitionError: Likewise.
+    """
+
+    def __init__(self, types: Ros2Types, name: str) -> None:
+        known: dict[str, Specification] = {}
+        todo = [name]
+        while todo:
+            each = todo.pop()
+            if each not in known:
+                known[each] = Specification(each, "", types.fields(each), ())
+                todo += known[each].depends()
+        fields = known[name].fields
+        self._transcoder = Transcoder([part for field in fields for part in _parts_of(field, types.fields)])
+        self._codec = MessageCodec(name, known)
+
+    def read(self, raw: Buffer) -> dict[str, Any]:
+        """The values of CDR with its head; arrays of numbers are memoryviews.
+
+        Raises:
+            ValueError: The bytes are not such a message.
+            struct.error: They are too short.
+            MessageError: They claim too many values.
+        """
+        return self._codec.views(memoryview(self._transcoder.to_ros1(raw)))
+
+    def write(self, values: Mapping[str, Any]) -> bytes:
+        """The CDR of values; what is not given is 0 or empty.
+
+        Raises:
+            MessageError: A value does not fit.
+            ValueError: A string or sequence is longer than its bound.
+        """
+        return self._transcoder.to_cdr(self._codec.write(values, 0).out)
 
 
 class Conversion:
@@ -173,27 +121,24 @@ class Conversion:
     def __init__(self, ros1: MessageType, ros2: str, types: Ros2Types, fields: FieldPaths | None = None) -> None:
         self.ros1 = ros1
         self.ros2 = ros2
-        self._store = types.store
-        self._fields = fields
+        self._types = types
+        self._mapped: list[tuple[list[str], list[str], Field, Ros2Field]] | None = None
+        """What goes where, if a mapping file says it."""
+        self.transcoder: Transcoder | None = None
+        """What converts the bytes without making values, if that can be."""
         try:
-            check_ros1_size(ros1.name, ros1.specifications)
-        except RemoteProtocolError as error:
-            raise NoConversion(str(error)) from error
-        if fields is None:
-            self._check_fields(ros1.name, ros2)
-        else:
-            self._check_paths(fields)
-        layouts = Layouts(ros1.specifications, self._store.fielddefs)
-        parts = layouts.of(ros1.name, ros2) if fields is None else None
-        try:
-            self._transcoder = Transcoder(parts) if parts is not None else None
-        except ValueError as error:
+            check_size(ros1.name, self._fields1)
+            if fields is None:
+                parts = self._common_parts(ros1.name, ros2)
+                self.transcoder = Transcoder(parts) if parts is not None else None
+            else:
+                self._mapped = [self._map(*paths) for paths in fields.items()]
+            if self.transcoder is None:
+                _ = self._codecs
+        except NoConversion:
+            raise
+        except (RmpaError, ValueError) as error:
             raise NoConversion(f"{ros1.name} and {ros2} cannot be converted: {error}") from error
-
-    @property
-    def direct(self) -> bool:
-        """Whether the bytes are converted without making objects."""
-        return self._transcoder is not None
 
     def to_ros2(self, raw: Buffer) -> bytes:
         """Convert a serialized message of ROS 1, without a length in front, to CDR (little-endian, with its head).
@@ -202,16 +147,10 @@ class Conversion:
             ConversionError: The bytes are not such a message, or a value does not fit ROS 2's type.
         """
         try:
-            if self._transcoder is not None:
-                return self._transcoder.to_cdr(raw)
-            message = self.ros1.deserialize(raw)
-            if self._fields is None:
-                made = self._make(self.ros1.name, self.ros2, message)
-            else:
-                made = self._zero(self.ros2)
-                for path1, path2 in self._fields.items():
-                    self._set(made, path2, self._convert_path(message, path1, path2))
-            return bytes(self._store.serialize_cdr(made, self.ros2))
+            if self.transcoder is not None:
+                return self.transcoder.to_cdr(raw)
+            codec1, codec2 = self._codecs
+            return codec2.write(self._convert(codec1.views(memoryview(raw)), to_ros1=False))
         except _ERRORS as error:
             raise ConversionError(f"cannot convert a {self.ros1.name} to {self.ros2}: {error}") from error
 
@@ -222,253 +161,203 @@ class Conversion:
             ConversionError: The bytes are not such a message, or a value does not fit ROS 1's type.
         """
         try:
-            if self._transcoder is not None and bytes(raw[:2]) == _LITTLE_ENDIAN:
-                return self._transcoder.to_ros1(raw)
-            message = self._store.deserialize_cdr(bytes(raw), self.ros2)
-            if self._fields is None:
-                values = self._values(self.ros1.name, self.ros2, message)
-            else:
-                values = {}
-                for path1, path2 in self._fields.items():
-                    self._put(values, path1, self._value_of_path(message, path1, path2))
-            return self.ros1.serialize(self.ros1.make(values))
+            if bytes(raw[:2]) != _LITTLE_ENDIAN:
+                store = self._types.store
+                raw = bytes(store.serialize_cdr(store.deserialize_cdr(bytes(raw), self.ros2), self.ros2))
+            if self.transcoder is not None:
+                return self.transcoder.to_ros1(raw)
+            codec1, codec2 = self._codecs
+            return codec1.write(self._convert(codec2.read(raw), to_ros1=True), 0).payload
         except _ERRORS as error:
             raise ConversionError(f"cannot convert a {self.ros2} to {self.ros1.name}: {error}") from error
 
-    # --- whether two types are a pair --------------------------------------------------------------------------
+    @functools.cached_property
+    def _codecs(self) -> tuple[MessageCodec, Ros2Codec]:
+        return MessageCodec(self.ros1.name, self.ros1.specifications), Ros2Codec(self._types, self.ros2)
 
-    def _ros1_fields(self, name: str) -> tuple[Field, ...]:
-        return self.ros1.specifications[name].fields
+    # --- whether two types are a pair, and what both have --------------------------------------------------------
 
-    def _ros2_fields(self, name: str) -> dict[str, Any]:
-        return {key: desc for key, desc in self._store.fielddefs[name][1] if key != _EMPTY_MEMBER}
+    def _fields1(self, name: str) -> tuple[Field, ...]:
+        known = self.ros1.specifications.get(name)
+        return known.fields if known is not None else ()
 
-    def _check_fields(self, ros1: str, ros2: str) -> None:
-        """Check that the fields of one type are all in the other, at any depth."""
-        fields2 = self._ros2_fields(ros2)
-        ones = {name2_of(field.name, fields2): field for field in self._ros1_fields(ros1)}
-        if ros2_name(ros1) == HEADER:
-            ones.pop("seq", None)
-        only1, only2 = sorted(ones.keys() - fields2.keys()), sorted(fields2.keys() - ones.keys())
+    def _fields2(self, name: str) -> dict[str, Ros2Field]:
+        return {field.name: field for field in self._types.fields(name)}
+
+    def _common_parts(self, name1: str, name2: str) -> tuple[LayoutPart, ...] | None:
+        """The parts of a message of both types; ``None`` if order or size of their common fields differ.
+
+        Raises:
+            NoConversion: Each has fields that the other lacks, or a field is of another kind.
+        """
+        fields2 = self._fields2(name2)
+        if ros2_name(name1) == name2 == HEADER and list(fields2) == ["stamp", "frame_id"]:
+            return (LayoutPart(4, in2=False), LayoutPart(4, 2), LayoutPart())  # seq, stamp, frame_id
+        ones = {name2_of(field.name, fields2): field for field in self._fields1(name1)}
+        only1, only2 = sorted(ones.keys() - fields2), sorted(fields2.keys() - ones.keys() - {EMPTY_MEMBER})
         if only1 and only2:
             raise NoConversion(
-                f"{ros1} has {', '.join(only1)}, and {ros2} has {', '.join(only2)} instead: write fields_1_to_2 in a "
-                "mapping file"
+                f"{name1} has {', '.join(only1)}, and {name2} has {', '.join(only2)} instead: write fields_1_to_2 in "
+                "a mapping file"
             )
-        for name in ones.keys() & fields2.keys():
-            self._check_field(ones[name], fields2[name], f"{ros1} and {ros2}: {name}")
+        common = {
+            name: self._both(ones[name], fields2[name], f"{name1} and {name2}: {name}")
+            for name in fields2
+            if name in ones
+        }
+        if [name for name in ones if name in fields2] != list(common):
+            return None
+        parts: list[LayoutPart] = []
+        waiting = list(fields2.values())
+        for name, field in ones.items():
+            if name not in common:
+                parts += _parts_of(field, self._fields1, in2=False)
+                continue
+            while waiting[0].name != name:
+                parts += _parts_of(waiting.pop(0), self._types.fields, in1=False)
+            waiting.pop(0)
+            both = common[name]
+            if both is None:
+                return None
+            parts += both
+        return (*parts, *(part for field in waiting for part in _parts_of(field, self._types.fields, in1=False)))
 
-    def _check_field(self, field: Field, desc: Any, where: str) -> None:
-        inner = desc
-        if (desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)) != field.array:
+    def _both(self, field: Field, other: Ros2Field, where: str) -> tuple[LayoutPart, ...] | None:
+        """The parts of a field that both sides have; ``None`` and errors as for ``_common_parts``."""
+        if field.array != other.array:
             raise NoConversion(f"{where} is an array on one side only")
-        if field.array:
-            inner = desc[1][0]
-            if desc[0] == Nodetype.ARRAY and field.size != desc[1][1]:
-                raise NoConversion(
-                    f"{where} has {'any number of' if field.size is None else field.size} elements, or {desc[1][1]}"
-                )
-        if inner[0] == Nodetype.NAME:
-            if field.primitive and TIMES.get(field.type) != inner[1]:
-                raise NoConversion(f"{where} is a {field.type}, or a {inner[1]}")
-            if not field.primitive:
-                self._check_fields(field.type, inner[1])
-        elif not field.primitive or field.type in TIMES or (field.type == "string") != (inner[1][0] == "string"):
-            raise NoConversion(f"{where} is a {field.type}, or a {inner[1][0]}")
+        if other.size not in (None, field.size):
+            size = "any number of" if field.size is None else field.size
+            raise NoConversion(f"{where} has {size} elements, or {other.size}")
+        named = "/" in other.type
+        parts: tuple[LayoutPart, ...] | None = None
+        if TIMES.get(field.type) == other.type:
+            parts = (LayoutPart(4, 2),)
+        elif named and not field.primitive:
+            parts = self._common_parts(field.type, other.type)
+        elif (
+            named
+            or not field.primitive
+            or field.type in TIMES
+            or (field.type == "string") != (other.type == "string")
+        ):
+            raise NoConversion(f"{where} is a {field.type}, or a {other.type}")
+        elif field.type == "string":
+            parts = (LayoutPart(bound=other.text, name=field.name),)
+        elif field.type == other.type or {field.type, other.type}.issubset(_ONE_BYTE):
+            parts = (LayoutPart(SIZES[other.type]),)
+        if parts is None or field.size != other.size:
+            return None
+        return (_array(parts, field.size, other.bound, field.name),) if field.array else parts
 
-    def _check_paths(self, fields: FieldPaths) -> None:
-        for path1, path2 in fields.items():
-            field, desc = self._field1(path1), self._desc2(path2)
-            self._check_field(field, desc, f"{self.ros1.name}.{path1} and {self.ros2}.{path2}")
+    def _map(self, path1: str, path2: str) -> tuple[list[str], list[str], Field, Ros2Field]:
+        """The two fields of a rule; errors as for ``_common_parts``."""
+        field = _field_at(self.ros1.name, path1, self._fields1)
+        other = _field_at(self.ros2, path2, self._types.fields)
+        self._both(field, other, f"{self.ros1.name}.{path1} and {self.ros2}.{path2}")
+        return path1.split("."), path2.split("."), field, other
 
-    def _field1(self, path: str) -> Field:
-        """The field of ROS 1 at a path."""
-        name, found = self.ros1.name, None
-        for part in path.split("."):
-            inside = self._ros1_fields(name) if found is None or not (found.primitive or found.array) else ()
-            found = next((field for field in inside if field.name == part), None)
-            if found is None:
-                raise NoConversion(f"{self.ros1.name} has no field {path}")
-            name = found.type
-        if found is None:
-            raise NoConversion(f"{self.ros1.name} has no field {path!r}")
-        return found
+    # --- values of one side for the other ------------------------------------------------------------------------
 
-    def _desc2(self, path: str) -> Any:
-        """The field of ROS 2 at a path."""
-        desc: Any = (Nodetype.NAME, self.ros2)
-        for part in path.split("."):
-            fields = self._ros2_fields(desc[1]) if desc[0] == Nodetype.NAME else {}
-            if part not in fields:
-                raise NoConversion(f"{self.ros2} has no field {path}")
-            desc = fields[part]
-        return desc
-
-    # --- ROS 1 to ROS 2 ------------------------------------------------------------------------------------------
-
-    def _make(self, ros1: str, ros2: str, message: Any) -> Any:
-        """Make ROS 2's object of a ROS 1 object."""
+    def _convert(self, values: dict[str, Any], *, to_ros1: bool) -> dict[str, Any]:
+        if self._mapped is None:
+            return self._by_name(self.ros1.name, self.ros2, values, to_ros1=to_ros1)
         made: dict[str, Any] = {}
-        ones = {snake_case(field.name): field for field in self._ros1_fields(ros1)}
-        ones.update((field.name, field) for field in self._ros1_fields(ros1))
-        for name, desc in self._store.fielddefs[ros2][1]:
-            field = ones.get(name)
-            if field is None:
-                made[normalize_fieldname(name)] = self._zero_of(desc)
-            else:
-                value = getattr(message, normalize_fieldname(field.name))
-                made[normalize_fieldname(name)] = self._value2(field, desc, value, name)
-        return self._store.types[ros2](**made)
+        for path1, path2, field, other in self._mapped:
+            source, (*outer, last) = (path2, path1) if to_ros1 else (path1, path2)
+            value: Any = values
+            for part in source:
+                value = value[part]
+            into = made
+            for part in outer:
+                into = into.setdefault(part, {})
+            into[last] = self._value(field, other, value, to_ros1=to_ros1)
+        return made
 
-    def _value2(self, field: Field, desc: Any, value: Any, where: str) -> Any:
-        if not field.array:
-            return self._scalar2(field, desc, value, where)
-        inner, count = desc[1]
-        if desc[0] == Nodetype.SEQUENCE and count and len(value) > count:
-            raise ConversionError(f"{where} has {len(value)} elements; ROS 2 allows {count}")
-        if field.type == "byte" and inner[1][0] != "int8":
-            value = value.view("uint8")
-        if inner[0] == Nodetype.BASE and inner[1][0] != "string":
-            return _as_array(value, inner[1][0], where)
-        return [self._scalar2(field, inner, item, where) for item in value]
+    def _by_name(self, name1: str, name2: str, values: dict[str, Any], *, to_ros1: bool) -> dict[str, Any]:
+        fields2, made = self._fields2(name2), {}
+        for field in self._fields1(name1):
+            other = fields2.get(name2_of(field.name, fields2))
+            if other is not None:
+                source, target = (other, field) if to_ros1 else (field, other)
+                made[target.name] = self._value(field, other, values[source.name], to_ros1=to_ros1)
+        return made
 
-    def _scalar2(self, field: Field, desc: Any, value: Any, where: str) -> Any:
-        if desc[0] == Nodetype.NAME:
-            if field.primitive:  # a time
-                return self._store.types[desc[1]](sec=_signed(value.sec), nanosec=value.nanosec)
-            if ros2_name(field.type) == desc[1] == HEADER:
-                stamp = self._store.types[TIMES["time"]](_signed(value.stamp.sec), value.stamp.nanosec)
-                return self._store.types[HEADER](stamp=stamp, frame_id=value.frame_id)
-            return self._make(field.type, desc[1], value)
-        base, bound = desc[1]
-        if base == "string":
-            if bound and len(value.encode()) > bound:
-                raise ConversionError(f"{where} has {len(value.encode())} bytes; ROS 2 allows {bound}")
+    def _value(self, field: Field, other: Ros2Field, value: Any, *, to_ros1: bool) -> Any:
+        if isinstance(value, list):
+            return [self._value(field, other, each, to_ros1=to_ros1) for each in value]
+        target = (field if to_ros1 else other).type
+        if isinstance(value, dict):
+            if not field.primitive:
+                return self._by_name(field.type, other.type, value, to_ros1=to_ros1)
+            # The same 32 bits are unsigned seconds of a time in ROS 1, and signed ones in ROS 2.
+            seconds, nanoseconds = value.values()
+            signed = not to_ros1 or field.type == "duration"
+            return {"sec": _bits(seconds, 32) if signed else seconds & UINT32_MAX, "nanosec": nanoseconds}
+        if field.type in (other.type, "string"):
             return value
-        if field.type == "byte" and base in _UNSIGNED:  # signed in ROS 1 (wiki.ros.org/msg), an octet in ROS 2
-            value &= 0xFF
-        return _as_number(value, base, where)
-
-    def _convert_path(self, message: Any, path1: str, path2: str) -> Any:
-        value = message
-        for part in path1.split("."):
-            value = getattr(value, normalize_fieldname(part))
-        return self._value2(self._field1(path1), self._desc2(path2), value, path2)
-
-    def _set(self, message: Any, path: str, value: Any) -> None:
-        *parents, last = path.split(".")
-        for part in parents:
-            message = getattr(message, normalize_fieldname(part))
-        object.__setattr__(message, normalize_fieldname(last), value)  # rosbags' dataclasses may be frozen
-
-    def _zero(self, ros2: str) -> Any:
-        fields = self._store.fielddefs[ros2][1]
-        return self._store.types[ros2](**{normalize_fieldname(name): self._zero_of(desc) for name, desc in fields})
-
-    def _zero_of(self, desc: Any) -> Any:
-        if desc[0] == Nodetype.NAME:
-            return self._zero(desc[1])
-        if desc[0] == Nodetype.BASE:
-            return "" if desc[1][0] == "string" else _as_number(0, desc[1][0], "")
-        inner, count = desc[1]
-        count = count if desc[0] == Nodetype.ARRAY else 0
-        if inner[0] == Nodetype.BASE and inner[1][0] != "string":
-            return _as_array([0] * count, inner[1][0], "")
-        return [self._zero_of(inner) for _ in range(count)]
-
-    # --- ROS 2 to ROS 1 ------------------------------------------------------------------------------------------
-
-    def _values(self, ros1: str, ros2: str, message: Any) -> dict[str, Any]:
-        """Make values for ROS 1's object, by ROS 1's names of the fields."""
-        fields2 = self._ros2_fields(ros2)
-        values = {}
-        for field in self._ros1_fields(ros1):
-            name = name2_of(field.name, fields2)
-            if name in fields2:
-                value = getattr(message, normalize_fieldname(name))
-                values[field.name] = self._value1(field, fields2[name], value)
-        return values
-
-    def _value1(self, field: Field, desc: Any, value: Any) -> Any:
-        if not field.array:
-            return self._scalar1(field, desc, value)
-        if desc[1][0][0] == Nodetype.BASE:
-            return value.view("int8") if field.type == "byte" and value.dtype == "uint8" else value
-        return [self._scalar1(field, desc[1][0], item) for item in value]
-
-    def _scalar1(self, field: Field, desc: Any, value: Any) -> Any:
-        if desc[0] != Nodetype.NAME:
-            if field.type == "byte":
-                return value - 256 if value > 127 else value
-            return value & 0xFF if desc[1][0] == "byte" and field.type in _UNSIGNED else value
-        if not field.primitive:
-            return self._values(field.type, desc[1], value)
-        sec = int(value.sec)
-        return {"secs": sec & 0xFFFFFFFF if field.type == "time" else sec, "nsecs": int(value.nanosec)}
-
-    def _value_of_path(self, message: Any, path1: str, path2: str) -> Any:
-        value = message
-        for part in path2.split("."):
-            value = getattr(value, normalize_fieldname(part))
-        return self._value1(self._field1(path1), self._desc2(path2), value)
-
-    @staticmethod
-    def _put(values: dict[str, Any], path: str, value: Any) -> None:
-        *parents, last = path.split(".")
-        for part in parents:
-            values = values.setdefault(part, {})
-        values[last] = value
+        if field.type in _ONE_BYTE and other.type in _ONE_BYTE:  # a ``byte`` is signed in ROS 1, an octet in ROS 2
+            if isinstance(value, memoryview):
+                return value.cast("B").cast(CODES[target])  # type: ignore[call-overload]
+            return _bits(value, 8) if CODES[target] == "b" else value & 0xFF
+        if isinstance(value, memoryview):
+            return self._value(field, other, value.tolist(), to_ros1=to_ros1)
+        return bool(value) if target == "bool" else value + 0  # a bool is no number to the codec
 
 
-def _signed(seconds: int) -> int:
-    """ROS 1's unsigned seconds of a time as ROS 2's signed ones: the same 32 bits."""
-    return int(seconds) - (1 << 32) if seconds >= 1 << 31 else int(seconds)
+def name2_of(name: str, fields2: Iterable[str]) -> str:
+    """ROS 2's name of a field of ROS 1."""
+    return name if name in fields2 else snake_case(name)
 
 
-def _dtype(base: str) -> str:
-    return {"octet": "uint8", "byte": "uint8", "char": "uint8", "bool": "bool"}.get(base, base)
+def _parts_of(field: Field, fields_of: FieldsOf, *, in1: bool = True, in2: bool = True) -> tuple[LayoutPart, ...]:
+    """The parts of a field of one side, and whether both sides have it."""
+    bound, text = (field.bound, field.text) if isinstance(field, Ros2Field) else (0, 0)
+    if field.type == "string":
+        parts: tuple[LayoutPart, ...] = (LayoutPart(in1=in1, in2=in2, bound=text, name=field.name),)
+    elif field.type in TIMES:
+        parts = (LayoutPart(4, 2, in1=in1, in2=in2),)
+    elif field.primitive:
+        parts = (LayoutPart(SIZES[field.type], in1=in1, in2=in2),)
+    else:
+        parts = tuple(part for each in fields_of(field.type) for part in _parts_of(each, fields_of, in1=in1, in2=in2))
+    return (_array(parts, field.size, bound, field.name, in1=in1, in2=in2),) if field.array else parts
 
 
-def _as_array(values: Any, base: str, where: str) -> Any:
-    import numpy as np  # noqa: PLC0415 - it takes 70 ms, and most types need no arrays
-
-    wanted = np.dtype(_dtype(base))
-    given = np.asarray(values)
-    if given.dtype == wanted:
-        return given
-    if wanted.kind in "iu" and given.size:
-        bounds = np.iinfo(wanted)
-        if given.dtype.kind == "f" or given.min() < bounds.min or given.max() > bounds.max:
-            raise ConversionError(f"{where}: {given.min()} to {given.max()} do not fit {base}")
-    return given.astype(wanted)
+def _array(
+    parts: tuple[LayoutPart, ...], size: int | None, bound: int, name: str, *, in1: bool = True, in2: bool = True
+) -> LayoutPart:
+    """An array; one of a fixed number of numbers is numbers, so that it is copied with its neighbours."""
+    if size is not None and len(parts) == 1 and parts[0].size:
+        count = 1 if parts[0].count is None else parts[0].count
+        return LayoutPart(parts[0].size, count * size, in1=parts[0].in1, in2=parts[0].in2)
+    return LayoutPart(0, size, parts, in1, in2, bound, name)
 
 
-def _as_number(value: Any, base: str, where: str) -> Any:
-    if base == "bool":
-        return bool(value)
-    if base.startswith("float"):
-        return float(value)
-    import numpy as np  # noqa: PLC0415 - see above
-
-    if base == "byte" and isinstance(value, int) and 127 < value < 256:
-        value -= 256  # rosbags has one byte signed, and an array of them unsigned
-    bounds = np.iinfo(np.dtype("int8" if base == "byte" else _dtype(base)))
-    if not isinstance(value, int) or not bounds.min <= value <= bounds.max:
-        raise ConversionError(f"{where}: {value} does not fit {base} ({bounds.min} to {bounds.max})")
-    return int(value)
+def _field_at(name: str, path: str, fields_of: Any) -> Any:
+    """The field at a path."""
+    root, found = name, None
+    for part in path.split("."):
+        inside = fields_of(name) if found is None or not (found.primitive or found.array) else ()
+        found = next((field for field in inside if field.name == part), None)
+        if found is None:
+            raise NoConversion(f"{root} has no field {path}")
+        name = found.type
+    return found
 
 
-_ERRORS: Final = (
-    SerdeError,
-    RmpaError,
-    struct.error,
-    ValueError,
-    KeyError,
-    IndexError,
-    AssertionError,
-    OverflowError,
-)
-"""What rosbags raises for bytes that are not a message; it does not check everything itself."""
+def _bits(number: int, bits: int) -> int:
+    """The signed number of the same bits."""
+    number &= (1 << bits) - 1
+    return number - (1 << bits) if number >> bits - 1 else number
+
+
+def action_name(type_name: str, part: str) -> str:
+    """``package/Name`` of the action that has a topic of this type of ROS 1; empty for none."""
+    return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""
+
+
+# An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions.
 
 
 PART: Final = "/_action/"
@@ -492,13 +381,13 @@ class ActionPair:
         NoConversion: The types are no pair.
     """
 
-    def __init__(self, kinds: Sequence[MessageType], rule: ActionRule, types: Ros2Types) -> None:
+    def __init__(self, kinds: Sequence[MessageType], rule: TypePair, types: Ros2Types) -> None:
         goal, result, feedback = kinds
         self.name: Final = rule.name
         """``package/action/Name`` of ROS 2."""
         self.ros1: Final = goal.name.removesuffix("Goal")
         """``package/Name`` of ROS 1."""
-        if rule.has_fields and f"{rule.name}_Goal" not in types:
+        if rule.paths and f"{rule.name}_Goal" not in types:
             raise NoConversion(
                 f"the rule of {self.ros1} maps fields to {rule.name}, whose definition is not known here"
             )
@@ -507,15 +396,17 @@ class ActionPair:
             types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
         self.types: Final = _define(rule.name, types)
         """The type of each service and topic in ROS 2, and its hash."""
-        self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.goal)
+        self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.paths.get("goal"))
         """Converts goals, without the id."""
-        self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.feedback)
+        self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.paths.get("feedback"))
         """Converts feedback, without the id."""
         self.result: Final = result
         """ROS 1's result."""
         wrapped = f"{self.ros1}GetResultResponse"
         both = Specification.parse(wrapped, f"int8 status\n{result.name} result\n")
-        paths = rule.result and {"status": "status", **{f"result.{a}": f"result.{b}" for a, b in rule.result.items()}}
+        paths = rule.paths.get("result")
+        if paths is not None:
+            paths = {"status": "status", **{f"result.{one}": f"result.{two}" for one, two in paths.items()}}
         known = {**result.specifications, wrapped: both}
         self._result = Conversion(MessageType(wrapped, known), f"{rule.name}_GetResult_Response", types, paths)
         self.no_result: Final = result.serialize(result.make(None))
@@ -546,7 +437,7 @@ def _define(name: str, types: Ros2Types) -> dict[str, tuple[str, str]]:
     sent = [("accepted", (Nodetype.BASE, ("bool", 0))), _TIME]
     types.define_service(f"{name}_SendGoal", [_UUID, ("goal", own["Goal"])], sent)
     types.define_service(f"{name}_GetResult", [_UUID], [("status", number), ("result", own["Result"])])
-    types.define(f"{name}_FeedbackMessage", [_UUID, ("feedback", own["Feedback"])])
+    types.take({f"{name}_FeedbackMessage": ([], [_UUID, ("feedback", own["Feedback"])])})
     cancelled = [("return_code", number), ("goals_canceling", (Nodetype.SEQUENCE, (_INFO, 0)))]
     types.define_service(CANCEL_TYPE, [("goal_info", _INFO)], cancelled)
     kinds = {
@@ -557,8 +448,3 @@ def _define(name: str, types: Ros2Types) -> dict[str, tuple[str, str]]:
         "status": STATUS_TYPE,
     }
     return {part: (kind, types.type_hash(kind)) for part, kind in kinds.items()}
-
-
-def action_name(type_name: str, part: str) -> str:
-    """``package/Name`` of the action that has a topic of this type of ROS 1; empty for none."""
-    return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""

@@ -6,34 +6,34 @@ sent, or of a description that a ROS 2 node gave.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import TypesysError
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
-from rmpa.gateway.ros2.types import check_ros1_size, ros2_name
+from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, check_size, ros2_fields, ros2_name
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_text, known_types
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from rosbags.typesys.store import Typestore
 
     from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
     from rmpa.gateway.ros2.types import Ros2Types
 
+    _Kept = dict[tuple[str, str], Conversion | NoConversion]
+
 
 # The ROS 1 definition of a type that only ROS 2 defines: a node of ROS 1 can ask for it by name.
 
 
-_EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
-_TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
-_BASES: Final = {"octet": "byte", "wstring": "string"}
+_TIMES: Final = {ros2: ros1 for ros1, ros2 in TIMES.items()}
 
 
 def derive_ros1(store: Typestore, name: str, name1: Callable[[str], str]) -> MessageType:
@@ -71,55 +71,30 @@ def derive_service(store: Typestore, name: str, own: str, name1: Callable[[str],
     return ServiceType(own, "\n---\n".join(texts.pop(half) for half in halves.values()), texts.get)
 
 
-def _texts(store: Typestore, names: list[str], name1: Callable[[str], str]) -> dict[str, str]:
+def _texts(store: Typestore, names: Sequence[str], name1: Callable[[str], str]) -> dict[str, str]:
     """The own texts of some types, and of all that they embed, by their names of ROS 1."""
     texts: dict[str, str] = {}
     todo = list(names)
-    roots = {name1(name) for name in names}
     while todo:
         each = todo.pop()
         key = name1(each)
         if key in texts:
             continue
-        text = known_text(key) if key not in roots else None
-        texts[key] = text if text is not None else _text(store, each, name1)
-        if text is None:
-            todo += [inner for inner in _embedded(store, each) if inner not in _TIMES]
-        else:  # ROS 1's type may embed others, which rmpa brings too
-            todo += [_back(inner) for inner in MessageType(key).specifications if inner != key]
+        text = known_text(key) if each not in names else None
+        if text is not None:  # ROS 1's type may embed others, which rmpa brings too
+            todo += [ros2_name(inner) for inner in MessageType(key).specifications if inner != key]
+        else:
+            constants, described = store.fielddefs[each]
+            lines = [f"{kind} {label}={value}" for label, kind, value in constants]
+            for field in ros2_fields(described):
+                kind = field.type if field.primitive else _TIMES.get(field.type) or name1(field.type)
+                if field.name != EMPTY_MEMBER:
+                    lines.append(f"{replace(field, type=kind)} {field.name}")
+                if not field.primitive and field.type not in _TIMES:
+                    todo.append(field.type)
+            text = "\n".join(lines)
+        texts[key] = text
     return texts
-
-
-def _back(name: str) -> str:
-    package, _, base = name.partition("/")
-    return f"{package}/msg/{base}"
-
-
-def _embedded(store: Typestore, name: str) -> list[str]:
-    inner = [_inner(desc) for _, desc in store.fielddefs[name][1]]
-    return [str(desc[1]) for desc in inner if desc[0] == Nodetype.NAME]
-
-
-def _inner(desc: Any) -> Any:
-    return desc[1][0] if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
-
-
-def _text(store: Typestore, name: str, name1: Callable[[str], str]) -> str:
-    constants, fields = store.fielddefs[name]
-    lines = [f"{_BASES.get(kind, kind)} {key}={value}" for key, kind, value in constants]
-    lines += [f"{_kind(desc, name1)} {key}" for key, desc in fields if key != _EMPTY_MEMBER]
-    return "\n".join(lines)
-
-
-def _kind(desc: Any, name1: Callable[[str], str]) -> str:
-    inner = _inner(desc)
-    if inner[0] == Nodetype.NAME:
-        kind = _TIMES.get(inner[1]) or name1(inner[1])
-    else:
-        kind = _BASES.get(inner[1][0], inner[1][0])
-    if desc[0] == Nodetype.ARRAY:
-        return f"{kind}[{desc[1][1]}]"
-    return f"{kind}[]" if desc[0] == Nodetype.SEQUENCE else kind
 
 
 class Ros2Pairs:
@@ -138,8 +113,8 @@ class Ros2Pairs:
         self._ros1: dict[str, MessageType] = {}
         self._variants: dict[tuple[str, str], Ros2Types] = {}
         self._learnt_fields = 0
-        self._out: dict[tuple[str, str], Conversion | NoConversion] = {}
-        self._in: dict[tuple[str, str], Conversion | NoConversion] = {}
+        self._out: _Kept = {}
+        self._in: _Kept = {}
 
     # --- from the mesh to ROS 2 ----------------------------------------------------------------------------------
 
@@ -165,7 +140,7 @@ class Ros2Pairs:
             NoConversion: A rule maps it to a type that is not known here, or it is too large.
         """
         try:
-            check_ros1_size(kind.name, kind.specifications)
+            check_size(kind.name, lambda each: kind.specifications[each].fields)
         except RemoteProtocolError as error:
             raise NoConversion(f"{kind.name} has no form in ROS 2: {error}") from error
         if len(self._ros1) < limits.ROS2_TYPES_MAX:
@@ -186,12 +161,13 @@ class Ros2Pairs:
             NoConversion: The types are no pair; the text says which fields differ, and what to write.
         """
         key = kind.name, kind.md5sum
-        if key not in self._out:
-            name, _ = self.learn(kind)
+        name = "" if key in self._out else self.learn(kind)[0]
+
+        def make() -> Conversion:
             pair = self._mapping.message(kind.name, self._types)
-            fields = pair.fields if pair is not None else None
-            self._keep(self._out, key, lambda: Conversion(kind, name, self._types, fields))
-        return _found(self._out[key])
+            return Conversion(kind, name, self._types, pair.fields if pair is not None else None)
+
+        return self._kept(self._out, key, make)
 
     def _hash(self, name: str, pair: TypePair) -> str:
         try:
@@ -206,7 +182,7 @@ class Ros2Pairs:
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a type of ROS 2, ``package/msg/Name``."""
-        return self._mapping.ros1_message(name, (*known_types(), *self._ros1))
+        return self._mapping.ros1_type(name, (*known_types(), *self._ros1))
 
     def incoming(self, name: str, type_hash: str) -> Conversion | None:
         """The conversion of a type of ROS 2.
@@ -221,13 +197,10 @@ class Ros2Pairs:
         Raises:
             NoConversion: The types are no pair; the text says which fields differ, and what to write.
         """
-        key = name, type_hash
-        if key not in self._in:
-            types = self._types_of(name, type_hash)
-            if types is None:
-                return None
-            self._keep(self._in, key, lambda: self._make_incoming(name, types))
-        return _found(self._in[key])
+        types = self._types_of(name, type_hash) if (name, type_hash) not in self._in else self._types
+        if types is None:
+            return None
+        return self._kept(self._in, (name, type_hash), lambda: self._make_incoming(name, types))
 
     def described(self, name: str, type_hash: str, fields: Mapping[str, Any]) -> None:
         """Take in what a ROS 2 node says of a type.
@@ -288,25 +261,21 @@ class Ros2Pairs:
             return None
 
     @staticmethod
-    def _keep(
-        into: dict[tuple[str, str], Conversion | NoConversion],
-        key: tuple[str, str],
-        make: Callable[[], Conversion],
-    ) -> None:
-        if len(into) >= limits.ROS2_TYPES_MAX:
-            del into[next(iter(into))]
-        try:
-            into[key] = make()
-        except NoConversion as error:
-            into[key] = error
-        except (DefinitionError, KeyError) as error:
-            into[key] = NoConversion(f"{key[0]} cannot be converted: {error}")
-
-
-def _found(kept: Conversion | NoConversion) -> Conversion:
-    if isinstance(kept, NoConversion):
-        raise kept.with_traceback(None)
-    return kept
+    def _kept(into: _Kept, key: tuple[str, str], make: Callable[[], Conversion]) -> Conversion:
+        """What was made before for a key, or is made now; a failure is kept too, and raised again."""
+        if key not in into:
+            if len(into) >= limits.ROS2_TYPES_MAX:
+                del into[next(iter(into))]
+            try:
+                into[key] = make()
+            except NoConversion as error:
+                into[key] = error
+            except (DefinitionError, KeyError) as error:
+                into[key] = NoConversion(f"{key[0]} cannot be converted: {error}")
+        kept = into[key]
+        if isinstance(kept, NoConversion):
+            raise kept.with_traceback(None)
+        return kept
 
 
 def described_types(types: Ros2Types, name: str, type_hash: str, fields: Mapping[str, Any]) -> Ros2Types:

@@ -114,7 +114,7 @@ class ServicePair:
     """
 
     def __init__(self, ros1: ServiceType, pair: TypePair, types: Ros2Types) -> None:
-        if (pair.request is not None or pair.response is not None) and pair.name not in types:
+        if pair.paths and pair.name not in types:
             raise NoConversion(
                 f"the rule of {ros1.name} maps fields to {pair.name}, whose definition is not known here: "
                 "source the ROS 2 workspace that has it"
@@ -123,9 +123,9 @@ class ServicePair:
         self.ros2 = pair.name
         self.type_hash = types.service_hash(ros1, pair.name)
         """The hash in keys and tokens."""
-        self.request = Conversion(ros1.request, f"{pair.name}_Request", types, pair.request)
+        self.request = Conversion(ros1.request, f"{pair.name}_Request", types, pair.paths.get("request"))
         """Converts requests."""
-        self.response = Conversion(ros1.response, f"{pair.name}_Response", types, pair.response)
+        self.response = Conversion(ros1.response, f"{pair.name}_Response", types, pair.paths.get("response"))
         """Converts responses."""
 
 
@@ -173,7 +173,7 @@ class Ros2Context:
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a message type of ROS 2, ``package/msg/Name``."""
-        return self.mapping.ros1_message(name, known_types())
+        return self.mapping.ros1_type(name, known_types())
 
 
 class Ros2Part(Protocol):
@@ -374,7 +374,7 @@ class ShownRos2Service:
 
     async def _show(self) -> None:
         context, server = self._context, self.server
-        name = context.mapping.ros1_service(server.type)
+        name = context.mapping.ros1_type(server.type)
         try:
             self._pair = await self._find_pair(name)
         except RmpaError as error:

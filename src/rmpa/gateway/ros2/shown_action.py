@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.gateway.ros2 import mapping as messages
+from rmpa.gateway.ros2 import action_messages as messages
+from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, NoConversion
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Qos
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.mapping import ActionRule, CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
+from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.pairs import derive_ros1
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
@@ -158,7 +159,7 @@ async def find_parts(name: str) -> list[MessageType]:
 
 
 async def learn_action(
-    context: Ros2Context, server: Ros2Endpoint, ros1: str, rule: ActionRule, known: Sequence[MessageType] = ()
+    context: Ros2Context, server: Ros2Endpoint, ros1: str, rule: TypePair, known: Sequence[MessageType] = ()
 ) -> ActionPair:
     """Make the pair of an action from what the node of its server in ROS 2 says of its types.
 
@@ -457,10 +458,10 @@ class ShownAction(JoinedAction[GoalsToRos2]):
         """
         context, server = self._context, self.server
         ros2 = server.type.removesuffix("_SendGoal")
-        ros1 = context.mapping.ros1_action(ros2)
+        ros1 = context.mapping.ros1_type(ros2)
         rule = context.mapping.action(ros1)
         if rule.name != ros2:
-            rule = ActionRule(ros2)
+            rule = TypePair(ros2)
         known: list[MessageType] = []
         try:
             known = await find_parts(ros1)

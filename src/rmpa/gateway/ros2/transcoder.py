@@ -9,8 +9,7 @@ nested messages, and skips fields that only one side has, or makes them zero.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.gateway import limits
@@ -24,76 +23,35 @@ HEAD: Final = b"\x00\x01\x00\x00"
 """The head of CDR: little-endian, no options."""
 _VIEWED: Final = 1 << 15
 """Bytes above which slices of a memoryview are quicker than those of bytes, for they are not copied twice."""
-
-
-class Side(Enum):
-    """Which of the two types has a field."""
-
-    BOTH = "both"
-    ROS1 = "ros1"
-    ROS2 = "ros2"
+_U32: Final = struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
-    """Numbers of one size, one after another.
+class LayoutPart:
+    """Numbers of one size, an array, or a string.
 
     Args:
-        size: Bytes of one, which is its alignment too.
-        count: How many.
-        side: Who has them.
-    """
-
-    size: int
-    count: int = 1
-    side: Side = Side.BOTH
-
-
-@dataclass(frozen=True, slots=True)
-class Text:
-    """A string.
-
-    Args:
-        side: Who has it.
-        bound: Its largest number of bytes in ROS 2; 0 for any.
+        size: Bytes of one number, which is its alignment too; 0 for a string or an array.
+        count: How many numbers, or elements of an array; ``None``: one number, or as many elements as a message says.
+        items: What one element of an array is made of; ``None``: it is no array.
+        in1: Whether ROS 1's type has it.
+        in2: Whether ROS 2's type has it.
+        bound: The largest number of elements, or bytes of a string, in ROS 2; 0 for any.
         name: The field, for errors.
     """
 
-    side: Side = Side.BOTH
-    bound: int = 0
-    name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Items:
-    """An array.
-
-    Args:
-        parts: What one element is made of.
-        count: The number of elements; ``None`` if each message says it.
-        side: Who has it.
-        bound: The largest number of elements in ROS 2; 0 for any.
-        name: The field, for errors.
-    """
-
-    parts: tuple[Part, ...]
+    size: int = 0
     count: int | None = None
-    side: Side = Side.BOTH
+    items: tuple[LayoutPart, ...] | None = None
+    in1: bool = True
+    in2: bool = True
     bound: int = 0
     name: str = ""
 
-
-Part = Number | Text | Items
-
-
-def on_side(parts: Iterable[Part], side: Side) -> tuple[Part, ...]:
-    """The same parts, which only one side has."""
-    return tuple(
-        replace(part, parts=on_side(part.parts, side), side=side)
-        if isinstance(part, Items)
-        else replace(part, side=side)
-        for part in parts
-    )
+    @property
+    def bytes(self) -> int:
+        """The bytes of its numbers."""
+        return self.size * (1 if self.count is None else self.count)
 
 
 class Transcoder:
@@ -106,11 +64,11 @@ class Transcoder:
         ValueError: Arrays of a fixed length make each message too much work.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
-        if max(_work(parts, Side.ROS1), _work(parts, Side.ROS2)) > limits.ROS2_WORK_MAX:
+    def __init__(self, parts: Sequence[LayoutPart]) -> None:
+        if max(_work(parts, to_cdr=False), _work(parts, to_cdr=True)) > limits.ROS2_WORK_MAX:
             raise ValueError("its arrays of a fixed length are too large")
-        self._to_cdr = _compile(_ToCdr(), parts)
-        self._to_ros1 = _compile(_ToRos1(), parts)
+        self._to_cdr = _compile(parts, to_cdr=True)
+        self._to_ros1 = _compile(parts, to_cdr=False)
 
     def to_cdr(self, raw: Buffer) -> bytes:
         """Convert a message of ROS 1, without a length in front, to CDR with its head.
@@ -132,17 +90,16 @@ class Transcoder:
         return self._to_ros1(body if len(body) > _VIEWED else bytes(body), len(body))
 
 
-class _Writer:
-    """Writes one function: what both directions have in common.
+class FunctionText:
+    """Writes the text of one function, which has nothing of the types but numbers.
 
-    ``i`` is the place in the source. What is known of the place in CDR, ``c``, before the program runs, is its rest
-    ``_rest`` by ``_known``: after a string nothing (1), after an alignment the alignment.
+    ``s`` is the source, ``i`` the place in it, and ``c`` that in CDR where it is made. What is known of the place in
+    CDR before the program runs is its rest ``_rest`` by ``_known``: after a string nothing (1), after an alignment
+    the alignment.
     """
 
-    made = Side.ROS1
-    """The side that the function makes a message of."""
-
-    def __init__(self) -> None:
+    def __init__(self, *, to_cdr: bool) -> None:
+        self._to_cdr = to_cdr
         self._lines: list[str] = []
         self._indent = 1
         self._known = 8
@@ -152,227 +109,115 @@ class _Writer:
         self.texts: list[str] = []
         """The names of fields, for errors: ``TEXTS`` of the function, whose code has none."""
 
+    def text(self, parts: Iterable[LayoutPart]) -> str:
+        """The function for a message of these parts."""
+        self.add("i = c = t = 0", f"out = [{'HEAD' if self._to_cdr else ''}]", "add = out.append")
+        self._parts(parts)
+        # Some serializers of CDR fill the end up to 4 bytes.
+        wrong = "i != end" if self._to_cdr else "not i <= end <= i + 3"
+        self.add(f"if {wrong}: raise ValueError(f'a message of {{end}} bytes has {{i}}')", "return b''.join(out)")
+        return "\n".join(("def convert(s, end):", *self._lines))
+
     def add(self, *lines: str) -> None:
+        """Add lines at the present indentation."""
         self._lines += [" " * self._indent + line for line in lines]
 
-    def name(self) -> str:
-        self._names += 1
-        return f"n{self._names}"
+    # --- what moves both places ----------------------------------------------------------------------------------
 
-    def forget(self, known: int = 1) -> None:
-        self._known, self._rest = known, 0
-
-    def moved(self, size: int) -> None:
+    def _moved(self, size: int) -> None:
         self._rest = (self._rest + size) % self._known
 
-    def padding(self, size: int) -> int | None:
-        """The padding before a number of this size, if it is known by now."""
-        return -self._rest % size if self._known >= size else None
+    def _forget(self, known: int = 1) -> None:
+        self._known, self._rest = known, 0
 
-    def parts(self, parts: Iterable[Part]) -> None:
-        for part in parts:
-            if isinstance(part, Number):
-                self.number(part)
-                continue
-            self.flush()
-            if isinstance(part, Text):
-                self.text(part)
-            elif part.count is not None:
-                self.loop(part, str(part.count))
-            else:
-                self.sequence(part)
-
-    def loop(self, part: Items, count: str) -> None:
-        self.add(f"for _ in range({count}):")
-        self._indent += 1
-        self.forget()
-        before = len(self._lines)
-        self.parts(part.parts)
-        self.flush()
-        if len(self._lines) == before:
-            self.add("pass")
-        self._indent -= 1
-        self.forget()
-
-    def check(self, part: Text | Items, name: str, what: str) -> None:
-        """Check a length against the bound of ROS 2."""
-        if part.bound:
-            self.texts.append(part.name)
-            field = f"{{TEXTS[{len(self.texts) - 1}]}}"
-            text = f"{field} has {{{name}}} {what}; ROS 2 allows {part.bound}"
-            self.add(f"if {name} > {part.bound}: raise ValueError(f'{text}')")
-
-    def check_work(self, part: Items, name: str) -> None:
-        """Count what a loop does: few bytes may claim many elements, each of which the other side fills up."""
-        self.add(
-            f"t += {name} * {1 + _work(part.parts, self.made)}",
-            f"if t > {limits.ROS2_WORK_MAX}: raise ValueError('its arrays have too many elements')",
-        )
-
-    def write(self, parts: Iterable[Part]) -> list[str]:
-        raise NotImplementedError
-
-    def number(self, part: Number) -> None:
-        raise NotImplementedError
-
-    def text(self, part: Text) -> None:
-        raise NotImplementedError
-
-    def sequence(self, part: Items) -> None:
-        raise NotImplementedError
-
-    def flush(self) -> None:
-        raise NotImplementedError
-
-
-class _ToCdr(_Writer):
-    """ROS 1 to CDR: ``i`` is the place in ROS 1's bytes, ``c`` that in CDR."""
-
-    made = Side.ROS2
-
-    def write(self, parts: Iterable[Part]) -> list[str]:
-        self.add("i = c = t = 0", "out = [HEAD]", "add = out.append")
-        self.parts(parts)
-        self.flush()
-        self.add("if i != end: raise ValueError(f'a message of {end} bytes has {i}')", "return b''.join(out)")
-        return self._lines
-
-    def flush(self) -> None:
+    def _flush(self) -> None:
         if self._run:
-            self.add(f"add(s[i:i + {self._run}])", f"i += {self._run}", f"c += {self._run}")
-            self._run = 0
+            run, self._run = self._run, 0
+            self._pass(run)
 
-    def align(self, size: int) -> None:
-        padding = self.padding(size)
-        if padding is None:
-            self.flush()
-            self.add(f"p = -c & {size - 1}", "if p:", " add(ZEROS[p])", " c += p")
-            self.forget(size)
-        elif padding:
-            self.flush()
-            self.add(f"add(ZEROS[{padding}])", f"c += {padding}")
-            self.moved(padding)
-
-    def zeros(self, size: int) -> None:
-        self.flush()
-        self.add(f"add(bytes({size}))", f"c += {size}")
-        self.moved(size)
-
-    def number(self, part: Number) -> None:
-        size = part.size * part.count
-        if part.side is Side.ROS1:
-            self.flush()
+    def _pass(self, size: int | str, sides: tuple[bool, bool] = (True, True), zeros: str = "") -> None:
+        """Copy bytes, skip those that the source alone has, or make zeros for those that the target alone has."""
+        made, sourced = sides
+        if made:
+            self.add(f"add(s[i:i + {size}])" if sourced else f"add({zeros or f'bytes({size})'})")
+            if self._to_cdr:
+                self.add(f"c += {size}")
+        if sourced:
             self.add(f"i += {size}")
-        elif size:
-            self.align(part.size)
-            if part.side is Side.ROS2:
-                self.zeros(size)
-            else:
-                self._run += size
-                self.moved(size)
 
-    def text(self, part: Text) -> None:
-        if part.side is Side.ROS1:
-            self.add("i += 4 + U(s, i)[0]")
+    def _align(self, size: int, when: str = "") -> None:
+        """Align the place in CDR to numbers of a size; ``when``: a name that must not be 0 in the program."""
+        padding = -self._rest % size if self._known >= size else None
+        if padding == 0:
             return
-        self.align(4)
-        if part.side is Side.ROS2:
-            self.add("add(EMPTY)", "c += 5")
+        self._flush()
+        condition = f"p and {when}" if when else "p"
+        if not self._to_cdr:
+            skip = padding if padding and not when else f"-i & {size - 1}"
+            self.add(f"{f'if {when}: ' if when else ''}i += {skip}")
+        elif padding and not when:
+            self.add(f"add(ZEROS[{padding}])", f"c += {padding}")
         else:
-            name = self.name()
-            self.add(f"{name} = U(s, i)[0]")
-            self.check(part, name, "bytes")
-            self.add(
-                f"add(P({name} + 1))",
-                f"add(s[i + 4:i + 4 + {name}])",
-                "add(NULL)",
-                f"i += 4 + {name}",
-                f"c += 5 + {name}",
-            )
-        self.forget()
-
-    def sequence(self, part: Items) -> None:
-        if part.side is Side.ROS2:
-            self.align(4)
-            self.zeros(4)
-            return
-        name = self.name()
-        if part.side is Side.BOTH:
-            self.align(4)
-        self.add(f"{name} = U(s, i)[0]")
-        if part.side is Side.BOTH:
-            self.add("add(s[i:i + 4])", "c += 4")
-            self.moved(4)
-        self.add("i += 4")
-        self.check(part, name, "elements")
-        stride = _stride(part)
-        if stride is None:
-            self.add(
-                f"if {name} * {_least(part.parts, Side.ROS1)} > end - i: raise ValueError('an array is too long')"
-            )
-            self.check_work(part, name)
-            self.loop(part, name)
-            return
-        size, alignment = stride
-        if part.side is Side.ROS1:
-            self.add(f"i += {name} * {size}")
-            return
-        if self.padding(alignment) != 0:
-            self.add(f"p = -c & {alignment - 1}", f"if p and {name}:", " add(ZEROS[p])", " c += p")
-        self.add(f"{name} *= {size}", f"add(s[i:i + {name}])", f"i += {name}", f"c += {name}")
-        self.forget(min(4, size & -size))
-
-
-class _ToRos1(_Writer):
-    """CDR to ROS 1: ``i`` is the place in CDR, behind its head."""
-
-    def write(self, parts: Iterable[Part]) -> list[str]:
-        self.add("i = t = 0", "out = []", "add = out.append")
-        self.parts(parts)
-        self.flush()
-        # Some serializers fill the end up to 4 bytes.
-        self.add("if not i <= end <= i + 3:", " raise ValueError(f'a message of {end} bytes has {i}')")
-        self.add("return b''.join(out)")
-        return self._lines
-
-    def flush(self) -> None:
-        if self._run:
-            self.add(f"add(s[i:i + {self._run}])", f"i += {self._run}")
-            self._run = 0
-
-    def align(self, size: int) -> None:
-        padding = self.padding(size)
+            self.add(f"p = -c & {size - 1}", f"if {condition}:", " add(ZEROS[p])", " c += p")
         if padding is None:
-            self.flush()
-            self.add(f"i += -i & {size - 1}")
-            self.forget(size)
-        elif padding:
-            self.flush()
-            self.add(f"i += {padding}")
-            self.moved(padding)
+            self._forget(size)
+        else:
+            self._moved(padding)
 
-    def number(self, part: Number) -> None:
-        size = part.size * part.count
-        if part.side is Side.ROS1:
-            self.flush()
-            self.add(f"add(bytes({size}))")
-        elif size:
-            self.align(part.size)
-            if part.side is Side.ROS2:
-                self.flush()
-                self.add(f"i += {size}")
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    def _sides(self, part: LayoutPart) -> tuple[bool, bool]:
+        """Whether the target has a part, and whether the source has it."""
+        return (part.in2, part.in1) if self._to_cdr else (part.in1, part.in2)
+
+    def _parts(self, parts: Iterable[LayoutPart]) -> None:
+        for part in parts:
+            if part.size:
+                self._number(part)
+                continue
+            self._flush()
+            if part.items is None:
+                self._text(part)
+            elif part.count is not None:
+                self._loop(part.items, str(part.count))
             else:
-                self._run += size
-            self.moved(size)
+                self._sequence(part, part.items)
+        self._flush()
 
-    def text(self, part: Text) -> None:
-        if part.side is Side.ROS1:
-            self.add("add(bytes(4))")
+    def _number(self, part: LayoutPart) -> None:
+        if not part.bytes:
             return
-        self.align(4)
-        name = self.name()
-        self.add(f"{name} = U(s, i)[0]")
-        if part.side is Side.BOTH:
+        if part.in2:
+            self._align(part.size)
+        if part.in1 and part.in2:
+            self._run += part.bytes
+        else:
+            self._flush()
+            self._pass(part.bytes, self._sides(part))
+        if part.in2:
+            self._moved(part.bytes)
+
+    def _length(self) -> str:
+        """Read a length from the source, and return the name that has it."""
+        self._names += 1
+        self.add(f"n{self._names} = U(s, i)[0]")
+        return f"n{self._names}"
+
+    def _text(self, part: LayoutPart) -> None:
+        sides = made, sourced = self._sides(part)
+        if part.in2:
+            self._align(4)
+        if not sourced:
+            self._pass(5 if self._to_cdr else 4, sides, "EMPTY" if self._to_cdr else "ZEROS[4]")
+        elif not made:
+            self.add("i += 4 + U(s, i)[0]")
+        elif self._to_cdr:
+            name = self._length()
+            self._check_bound(part, name, "bytes")
+            self.add(f"add(P({name} + 1))", f"add(s[i + 4:i + 4 + {name}])", "add(NULL)")
+            self.add(f"i += 4 + {name}", f"c += 5 + {name}")
+        else:
+            name = self._length()
             self.add(
                 f"if not {name}:",  # some serializers leave the null byte of an empty string out
                 " add(ZEROS[4])",
@@ -383,86 +228,94 @@ class _ToRos1(_Writer):
                 f" add(s[i + 4:i + 3 + {name}])",
                 f" i += 4 + {name}",
             )
-        else:
-            self.add(f"i += 4 + {name}")
-        self.forget()
+        if part.in2:
+            self._forget()
 
-    def sequence(self, part: Items) -> None:
-        if part.side is Side.ROS1:
-            self.add("add(bytes(4))")
+    def _sequence(self, part: LayoutPart, items: tuple[LayoutPart, ...]) -> None:
+        sides = self._sides(part)
+        if part.in2:
+            self._align(4)
+        name = self._length() if sides[1] else ""
+        self._pass(4, sides)
+        if part.in2:
+            self._moved(4)
+        if not name:
             return
-        self.align(4)
-        name = self.name()
-        self.add(f"{name} = U(s, i)[0]")
-        if part.side is Side.BOTH:
-            self.add("add(s[i:i + 4])")
-        self.add("i += 4")
-        self.moved(4)
-        stride = _stride(part)
+        self._check_bound(part, name, "elements")
+        stride = _stride(part, items)
         if stride is None:
-            self.add(
-                f"if {name} * {_least(part.parts, Side.ROS2)} > end - i: raise ValueError('an array is too long')"
-            )
-            self.check_work(part, name)
-            self.loop(part, name)
+            least = _least(items, in1=self._to_cdr)
+            self.add(f"if {name} * {least} > end - i: raise ValueError('an array is too long')")
+            # Few bytes may claim many elements, each of which the other side fills up.
+            self.add(f"t += {name} * {1 + _work(items, to_cdr=self._to_cdr)}")
+            self.add(f"if t > {limits.ROS2_WORK_MAX}: raise ValueError('its arrays have too many elements')")
+            self._loop(items, name)
             return
         size, alignment = stride
-        if self.padding(alignment) != 0:
-            self.add(f"if {name}: i += -i & {alignment - 1}")
+        if part.in2:
+            self._align(alignment, when=name)
         self.add(f"{name} *= {size}")
-        if part.side is Side.BOTH:
-            self.add(f"add(s[i:i + {name}])")
-        self.add(f"i += {name}")
-        self.forget(min(4, size & -size))
+        self._pass(name, sides)
+        if part.in2:
+            self._forget(min(4, size & -size))
+
+    def _loop(self, items: tuple[LayoutPart, ...], count: str) -> None:
+        self.add(f"for _ in range({count}):", " pass")
+        self._indent += 1
+        self._forget()
+        self._parts(items)
+        self._indent -= 1
+        self._forget()
+
+    def _check_bound(self, part: LayoutPart, name: str, what: str) -> None:
+        if part.bound and self._to_cdr:
+            self.texts.append(part.name)
+            text = f"{{TEXTS[{len(self.texts) - 1}]}} has {{{name}}} {what}; ROS 2 allows {part.bound}"
+            self.add(f"if {name} > {part.bound}: raise ValueError(f'{text}')")
 
 
-def _stride(array: Items) -> tuple[int, int] | None:
+def _stride(part: LayoutPart, items: tuple[LayoutPart, ...]) -> tuple[int, int] | None:
     """Size and alignment of an element that is the same bytes in ROS 1 and in CDR; ``None`` if it is not."""
-    numbers = [part for part in array.parts if isinstance(part, Number) and part.side is array.side]
-    if not numbers or len(numbers) < len(array.parts):
+    if not items or not all(each.size and (each.in1, each.in2) == (part.in1, part.in2) for each in items):
         return None
-    alignment, place = numbers[0].size, 0
-    for part in numbers:
-        if part.size > alignment or place % part.size:
+    alignment, place = items[0].size, 0
+    for each in items:
+        if each.size > alignment or place % each.size:
             return None
-        place += part.size * part.count
+        place += each.bytes
     return (place, alignment) if place % alignment == 0 else None
 
 
-def _least(parts: Sequence[Part], side: Side) -> int:
+def _least(parts: Iterable[LayoutPart], *, in1: bool) -> int:
     """The fewest bytes of an element at one side, but at least 1: none may be claimed without end."""
     total = 0
     for part in parts:
-        if part.side in (Side.BOTH, side):
-            if isinstance(part, Number):
-                total += part.size * part.count
-            elif isinstance(part, Text) or part.count is None:
-                total += 4
-            else:
-                total += part.count * _least(part.parts, side)
+        if not (part.in1 if in1 else part.in2):
+            continue
+        if part.items is not None and part.count is not None:
+            total += part.count * _least(part.items, in1=in1)
+        else:
+            total += part.bytes if part.size else 4
     return max(total, 1)
 
 
-def _work(parts: Iterable[Part], made: Side) -> int:
+def _work(parts: Iterable[LayoutPart], *, to_cdr: bool) -> int:
     """What a message, or an element, costs beyond its own bytes: turns of loops, and 64 bytes that are filled up.
 
     Arrays whose length each message says count by themselves.
     """
     total = 0
     for part in parts:
-        if isinstance(part, Number):
-            total += part.size * part.count // 64 if part.side is made else 0
-        elif isinstance(part, Items) and part.count is not None:
-            total += part.count * (1 + _work(part.parts, made))
+        if part.items is not None:
+            total += (part.count or 0) * (1 + _work(part.items, to_cdr=to_cdr))
+        elif part.in1 != part.in2 and part.in2 == to_cdr:
+            total += part.bytes // 64
     return total
 
 
-_U32: Final = struct.Struct("<I")
-
-
-def _compile(writer: _Writer, parts: Sequence[Part]) -> Callable[[Buffer, int], bytes]:
-    """Make a function of its lines, which have nothing of the types but numbers."""
-    lines = writer.write(parts)
+def _compile(parts: Sequence[LayoutPart], *, to_cdr: bool) -> Callable[[Buffer, int], bytes]:
+    writer = FunctionText(to_cdr=to_cdr)
+    text = writer.text(parts)
     names: dict[str, Any] = {
         "HEAD": HEAD,
         "NULL": b"\0",
@@ -472,6 +325,6 @@ def _compile(writer: _Writer, parts: Sequence[Part]) -> Callable[[Buffer, int], 
         "P": _U32.pack,
         "TEXTS": writer.texts,
     }
-    exec("\n".join(("def convert(s, end):", *lines)), names)  # noqa: S102 - see above
+    exec(text, names)  # noqa: S102 - see the class's docstring
     made: Callable[[Buffer, int], bytes] = names["convert"]
     return made

@@ -10,6 +10,7 @@ import pytest
 
 from rmpa.config.rules import GatewaySettings
 from rmpa.gateway.neighbour import ZenohQos
+from rmpa.gateway.ros2.action_messages import parse_outcome
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import (
@@ -21,7 +22,7 @@ from rmpa.gateway.ros2.format import (
     data_key,
     parse_token,
 )
-from rmpa.gateway.ros2.mapping import ActionRule, parse_outcome
+from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.definitions import SEPARATOR, known_text
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
-TYPES = ActionPair(TEST, ActionRule("actionlib/action/Test"), JAZZY).types
+TYPES = ActionPair(TEST, TypePair("actionlib/action/Test"), JAZZY).types
 ACTION = {part: MessageType(f"actionlib/TestAction{part.title()}") for part in ("goal", "feedback", "result")}
 ACTION["status"] = MessageType("actionlib_msgs/GoalStatusArray")
 ACTION["cancel"] = MessageType("actionlib_msgs/GoalID")
@@ -205,7 +206,7 @@ DOCK = [
 async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed: Bed) -> None:
     theirs = Ros2Types("jazzy")
     action = "dock_msgs/action/Dock"
-    pair = ActionPair(DOCK, ActionRule(action), theirs)
+    pair = ActionPair(DOCK, TypePair(action), theirs)
     types, session = pair.types, bed.network.session()
     node = Ros2Node(0, session.zid, 0, "/docker")
     goals: list[MemoryQuery] = []
