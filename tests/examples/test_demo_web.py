@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from lab.bed.processes import Process
-from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from tests.examples.test_demo import DEMO, all_linked, flows, views, wait_for_view
+from tests.web.monitor.patches import apply
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,8 +17,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from lab.bed.agents import RMPA
 from lab.bed.chromium import BINARY
 from lab.bed.processes import DEADLINE, Process
-from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.messages import SUBPROTOCOL
+from tests.web.monitor.patches import apply
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

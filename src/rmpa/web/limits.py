@@ -285,8 +285,6 @@ AGENT_SETTLES: Final = 10.0
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster is still shown."""
-STEADY: Final = 0.03
-"""Share by which a figure must change before it is shown anew, so that noise moves nothing."""
 RATE_SMOOTHING: Final = 1.0
 """Time constant of a link's byte rates."""
 ORDER_AGE: Final = 5.0

@@ -23,12 +23,12 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.web import limits
 from rmpa.web.hub.node_link import FULL, READ_ONLY
-from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.server.agent_watch import AgentWatch
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.gateways.server import running_server
 from tests.web.hub.client import node
+from tests.web.monitor.patches import apply
 from tests.web.snapshots import FULL as SNAPSHOT
 
 if TYPE_CHECKING:

@@ -33,15 +33,14 @@ from rmpa.web.hub import requests
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from rmpa.web.monitor.questions import node_detail, node_key
 from rmpa.web.monitor.resources import ResourceFacts
-from rmpa.web.monitor.view import StateBuilder, details
+from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.monitor.live import Tree
+    from rmpa.web.monitor.messages import Tree
 
 FIXTURES = Path(__file__).with_name("fixtures")
 STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"

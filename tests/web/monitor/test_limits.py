@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rmpa.core.limits import KIB
 from rmpa.web import limits
-from rmpa.web.monitor import messages, session
+from rmpa.web.monitor import messages, questions, session
 
 PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
 
@@ -24,7 +24,7 @@ def test_each_state_is_of_a_new_snapshot() -> None:
 
 
 def test_the_page_has_each_question_and_message() -> None:
-    for what in session.QUESTIONS:
+    for what in questions.QUESTIONS:
         assert f"`{what}`" in PAGE
     for right in session.RIGHTS:
         assert f"`{right}`" in PAGE

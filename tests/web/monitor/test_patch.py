@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rmpa.web.monitor.live import apply, difference, without_nulls
+from rmpa.web.monitor.messages import difference, without_nulls
+from tests.web.monitor.patches import apply
 
 SCALARS = st.booleans() | st.integers(-3, 3) | st.sampled_from((0.0, 1.0, 1.5, -2.0)) | st.text(max_size=3)
 KEYS = st.sampled_from(("a", "b", "/odom", "__proto__", ""))

@@ -11,8 +11,8 @@ import pytest
 from rmpa.web import limits
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
-from rmpa.web.monitor.live import apply
 from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
+from tests.web.monitor.patches import apply
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

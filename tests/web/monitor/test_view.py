@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.web import limits
-from rmpa.web.monitor.live import Tree, apply, difference
+from rmpa.web.monitor.messages import Tree, difference
 from rmpa.web.monitor.resources import ResourceFacts
-from rmpa.web.monitor.view import StateBuilder, details, module_state
+from rmpa.web.monitor.state import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots
+from tests.web.monitor.patches import apply
 from tests.web.snapshots import AGENT, FULL, LINK, peer
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ import asyncio
 import json
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
@@ -29,7 +30,6 @@ from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
-from rmpa.web.monitor.session import Question
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
@@ -244,7 +244,7 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none()
         answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
 
         async def ask(what: str, **args: object) -> Any:
-            return await answers.answer(Question(1, what, args))
+            return await answers.answer(what, args)
 
         shown = await ask("params")
         assert shown["values"]["name"] == "base"
@@ -303,8 +303,7 @@ async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_r
         await until(reading.is_set)
         boss = FakeClient(hub)
         answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
-        question = Question(1, "delete_param", {"name": "/motors"})
-        page = asyncio.ensure_future(answers.answer(question))
+        page = asyncio.ensure_future(answers.answer("delete_param", {"name": "/motors"}))
         for request in (SetParam(1, "/motors", 5), DeleteParam(2, "/motors"), SetParam(3, "/speed", 1)):
             boss.ask(request)
         go_on.set()
@@ -341,12 +340,13 @@ class Peer:
 async def test_a_peers_parameters_are_judged_by_what_the_peer_has(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = Peer()
     monkeypatch.setattr(questions, "PeerParams", lambda _client, _peer: peer)
-    monkeypatch.setattr(Answers, "_control", lambda _self: nullcontext())
+    monkeypatch.setattr(questions, "choose_agent", lambda *_: SimpleNamespace(path=""))
+    monkeypatch.setattr(questions, "ControlClient", lambda *_: nullcontext())
     async with local_core() as core, running_hub(core, CAREFUL) as hub:
         answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
 
         async def ask(what: str, **args: object) -> Any:
-            return await answers.answer(Question(1, what, {"peer": "arm", **args}))
+            return await answers.answer(what, {"peer": "arm", **args})
 
         for what, args in (
             ("delete_param", {"name": "/motors"}),

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.hub.requests import Answer
-    from rmpa.web.monitor.live import Tree
+    from rmpa.web.monitor.messages import Tree
     from rmpa.web.monitor.monitor import Monitor
     from rmpa.web.monitor.session import Output as MonitorOutput
     from rmpa.web.rosbridge.protocol import RosbridgeFrame
@@ -340,7 +340,7 @@ class MonitorConnection(ClientConnection):
     def _ask(self, question: Question) -> None:
         async def answer() -> None:
             try:
-                value = await self._monitor.answers.answer(question)
+                value = await self._monitor.answers.answer(question.what, question.args)
             except RmpaError as error:
                 failed = Failed.of(0, error)
                 self._act(self._session.refuse(question.id, failed.error, failed.remedy))

@@ -1,7 +1,4 @@
-"""Live messages of a page: watched, thinned, patched, and the joystick's commands.
-
-Live messages as a page shows them: values cut to a size, numbers by a path, scans and images thinned.
-"""
+"""Live messages as a page shows them: values cut to a size, numbers by a path, scans and images thinned; paced."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import re
 import struct
 from array import array
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from rmpa.web.hub.requests import Payload, ReceivedMessage
-    from rmpa.web.monitor.messages import Drive, Watch
+    from rmpa.web.monitor.messages import Watch
 
     Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
@@ -201,217 +198,7 @@ def _depth_picture(width: int, height: int, encoding: str, step: int, data: Payl
     return Picture("mono8", -(-width // every), len(rows), pixels, every)
 
 
-# Which commands of a page's joystick drive the robot; no I/O.
-#
-# TCP keeps over a cut what the page has sent, and delivers all of it when the cable is back, long after the stick
-# was
-# let go. So each command says when it was made, and what may be older than ``limits.DRIVE_TIMEOUT`` is dropped.
-#
-# The two clocks need not agree. Each ``tick`` has the server's clock; the page takes the one that came fastest
-# among
-# the last few, and its own clock counts on from it. A command's ``at`` is then the server's clock at its making,
-# less
-# the time that this tick took: ``now - at`` is never less than the command's age, and in a steady network it is the
-# round trip. A tick that was held up, or a clock that stood still while the page's machine slept, makes commands
-# seem
-# older, never newer.
-
-
-class Joystick:
-    """The holds of one page's stick. A hold is from the touch of the stick until it is let go."""
-
-    def __init__(self) -> None:
-        self._hold = 0
-        self._number = 0
-        self._released = 0
-        self._until = 0.0
-        self._topic = ""
-        self._told_late = False
-
-    @property
-    def topic(self) -> str:
-        """The topic that is driven; empty while the robot is stopped."""
-        return self._topic
-
-    @property
-    def due(self) -> float | None:
-        """When the robot is to be stopped, if no further command comes."""
-        return self._until if self._topic else None
-
-    def takes(self, command: Drive, now: float) -> bool:
-        """Whether a command is to be obeyed: it is not too old, and of the present hold or a later one."""
-        if abs(now - command.at) > limits.DRIVE_TIMEOUT:
-            return False
-        if command.hold <= self._released or (command.hold, command.n) <= (self._hold, self._number):
-            return False
-        self._hold, self._number = command.hold, command.n
-        self._told_late = False
-        return True
-
-    def drive(self, topic: str, now: float) -> bool:
-        """A command is obeyed; returns whether it may move the robot.
-
-        The first one after a stop only arms: one command alone, whatever kept it, moves nothing.
-        """
-        armed, self._topic = self._topic == topic, topic
-        self._until = now + limits.DRIVE_TIMEOUT
-        return armed
-
-    def is_new_late(self, command: Drive, now: float) -> bool:
-        """Whether a refused command is the first since the last obeyed one that came too late."""
-        told, self._told_late = self._told_late, self._told_late or now - command.at > limits.DRIVE_TIMEOUT
-        return self._told_late and not told
-
-    def release(self, hold: int) -> None:
-        """The stick was let go: nothing more of that hold is obeyed."""
-        self._released = max(self._released, hold)
-
-    def stop(self) -> str:
-        """The robot stops; returns the topic that was driven, or nothing."""
-        topic, self._topic = self._topic, ""
-        return topic
-
-
-# Differences of two states as JSON merge patches (RFC 7396).
-#
-# A state is a tree of JSON values whose objects have no member that is null: there a missing member says "not
-# known".
-# So a null in a patch always removes. Arrays are replaced as a whole.
-
-
-Value: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
-    bool, int, float, str, list["Value"], dict[str, "Value"], None
-]
-Tree: TypeAlias = dict[str, Value]
-
-_MISSING: Final = object()
-
-
-def difference(old: Mapping[str, Value], new: Mapping[str, Value]) -> Tree:
-    """The merge patch that makes ``new`` of ``old``; empty where they are equal.
-
-    Parts that are the same object in both cost nothing. ``1``, ``1.0`` and ``True`` are different values.
-    """
-    patch: Tree = {}
-    for key, value in new.items():
-        before = old.get(key, _MISSING)
-        if before is value:
-            continue
-        if isinstance(value, dict) and isinstance(before, dict):
-            if inner := difference(before, value):
-                patch[key] = inner
-        elif not _same(before, value):
-            patch[key] = value
-    patch.update((key, None) for key in old if key not in new)
-    return patch
-
-
-def apply(state: Value, patch: Value) -> Value:
-    """``state`` with a merge patch applied, as RFC 7396 describes it; neither argument is changed."""
-    if not isinstance(patch, dict):
-        return patch
-    result: Tree = dict(state) if isinstance(state, dict) else {}
-    for key, value in patch.items():
-        if value is None:
-            result.pop(key, None)
-        else:
-            result[key] = apply(result.get(key), value)
-    return result
-
-
-def without_nulls(value: object) -> Value:
-    """A value for a state: without members that are null, arrays as lists, NaN and infinities left out as unknown.
-
-    In an array, what is unknown stays, as null.
-    """
-    if isinstance(value, dict):
-        members = ((str(key), without_nulls(inner)) for key, inner in value.items())
-        return {key: inner for key, inner in members if inner is not None}
-    if isinstance(value, list | tuple):
-        return [without_nulls(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return str(value)
-
-
-def _same(one: object, other: object) -> bool:
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_same, one, other))
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
-    return one == other
-
-
-# Figures that change only when there is something to see.
-
-
-def rounded(value: float, digits: int = 3) -> float:
-    """``value`` with so many significant digits."""
-    if value == 0 or not math.isfinite(value):
-        return 0.0
-    return float(f"{value:.{digits}g}")
-
-
-def steady_figure(
-    before: float | None, value: float | None, share: float = limits.STEADY, least: float = 0.0
-) -> float | None:
-    """The figure to show in place of ``before``, which is shown now.
-
-    Args:
-        before: What is shown; ``None`` for nothing.
-        value: The new value; ``None`` where it is not known.
-        share: Of the figure that is shown; a smaller change is not shown.
-        least: A smaller change than this is not shown either.
-    """
-    if value is None or not math.isfinite(value):
-        return None
-    if before is not None and before != 0:
-        change = abs(value - before)
-        if change <= abs(before) * share or change <= least:
-            return before
-    return rounded(value)
-
-
-class Steady:
-    """Keeps the figures that are shown, by key, and gives a new one only for a change that can be seen."""
-
-    def __init__(self) -> None:
-        self._shown: dict[str, float] = {}
-        self._used: set[str] = set()
-
-    def figure(self, key: str, value: float | None, share: float = limits.STEADY, least: float = 0.0) -> float | None:
-        """The figure to show under this key; the other arguments are those of ``steady_figure``."""
-        shown = steady_figure(self._shown.get(key), value, share, least)
-        if shown is None:
-            self._shown.pop(key, None)
-        else:
-            self._used.add(key)
-            self._shown[key] = shown
-        return shown
-
-    def moment(self, key: str, value: float | None) -> float | None:
-        """A moment in seconds since the epoch, which is computed from a moving age; kept within half a second."""
-        if value is None:
-            return None
-        self._used.add(key)
-        before = self._shown.get(key)
-        if before is not None and abs(value - before) < 0.5:
-            return before
-        self._shown[key] = shown = round(value, 1)
-        return shown
-
-    def sweep(self) -> None:
-        """Forget what was not shown since the last call."""
-        self._shown = {key: value for key, value in self._shown.items() if key in self._used}
-        self._used.clear()
-
-
-# Samples of a plot between two messages to the browser: bounded, and without losing a peak.
-
+# --- watches ------------------------------------------------------------------------------------------------------
 
 Sample: TypeAlias = tuple[float, list[float | None]]
 """A moment in seconds since the epoch, and a value for each line; ``None`` where there is none."""
@@ -472,9 +259,6 @@ class SampleBuffer:
                 last.append(late[0])
             made += [(part[0][0], first), (part[-1][0], last)]
         return made
-
-
-# What one client sees of the messages of topics: paced, newest first, bounded.
 
 
 class WatchState:

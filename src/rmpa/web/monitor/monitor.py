@@ -18,7 +18,7 @@ from rmpa.web.hub.node_link import OWN_CLIENT
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
-from rmpa.web.monitor.view import StateBuilder, details
+from rmpa.web.monitor.state import StateBuilder, details
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import ReceivedMessage
-    from rmpa.web.monitor.live import Tree
+    from rmpa.web.monitor.messages import Tree
     from rmpa.web.server.agent_watch import AgentWatch, Reading
 
 

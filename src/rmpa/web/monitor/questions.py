@@ -22,122 +22,17 @@ from rmpa.observe.operations import PeerParams, parameters_in
 from rmpa.resource.run.reconfigure import SERVICE_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
+from rmpa.web.monitor.state import node_key
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
+    from collections.abc import Awaitable, Callable
 
-    from rmpa.observe.snapshot import Snapshot, TopicInfo
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import NodeRules
     from rmpa.web.hub.requests import ParamValue
-    from rmpa.web.monitor.live import Tree
     from rmpa.web.monitor.resources import ResourceWatch
-    from rmpa.web.monitor.session import Question
-
-
-# The nodes of all modules, as a snapshot tells of them: of a peer those that publish or serve something here.
-
-
-_COUNTS: Final = ("publishes", "subscribes", "serves")
-_Registered: TypeAlias = tuple[tuple[str, ...], tuple[str, ...], tuple[tuple[str, str], ...]]
-"""Of a topic: this module's publishers and subscribers, and those that publish it in other modules, by module."""
-
-
-def node_key(module: str, node: str) -> str:
-    """``module:/name`` for a node of a peer, ``/name`` for one of this module, whose ``module`` is empty."""
-    return f"{module}:{node}" if module else node
-
-
-class NodeEntries:
-    """The nodes of each snapshot; they are counted again only where something was registered or withdrawn."""
-
-    def __init__(self) -> None:
-        self._registered: dict[str, tuple[TopicInfo, _Registered]] = {}
-        self._others: tuple[object, ...] = ()
-        self._entries: dict[str, Tree] = {}
-
-    def build(self, snapshot: Snapshot) -> dict[str, Tree]:
-        """All nodes by ``node_key``, each with ``name``, ``module`` (a peer's) and how much it publishes and so on.
-
-        The same object where nothing has changed; not to be changed by the caller.
-        """
-        before, now = self._registered, {}
-        same = True
-        for topic in snapshot.topics:
-            known = before.get(topic.name)
-            if known is None or known[0] is not topic:
-                registered = _registered(topic)
-                same = same and known is not None and known[1] == registered
-                known = topic, registered
-            now[topic.name] = known
-        served = tuple((service.peer, service.node) for service in snapshot.services if service.node)
-        problems = {info.node: info.problem for info in snapshot.unreachable}
-        others = (served, problems)
-        if not same or len(now) != len(before) or others != self._others:
-            self._entries = _count([registered for _, registered in now.values()], served, problems)
-        self._registered, self._others = now, others
-        return self._entries
-
-
-def _registered(topic: TopicInfo) -> _Registered:
-    incoming = tuple((route.peer, route.node) for route in topic.routes if route.direction == "in")
-    return topic.publishers, topic.subscribers, incoming
-
-
-def _count(
-    topics: Iterable[_Registered], served: Iterable[tuple[str, str]], problems: Mapping[str, str]
-) -> dict[str, Tree]:
-    counts: dict[tuple[str, str], list[int]] = {}
-
-    def add(module: str, node: str, at: int) -> None:
-        counts.setdefault((module, node), [0] * len(_COUNTS))[at] += 1
-
-    for publishers, subscribers, incoming in topics:
-        for node in publishers:
-            add("", node, 0)
-        for node in subscribers:
-            add("", node, 1)
-        for module, node in incoming:
-            add(module, node, 0)
-    for module, node in served:
-        add(module, node, 2)
-    return {
-        node_key(module, node): _entry(module, node, counts[module, node], "" if module else problems.get(node, ""))
-        for module, node in sorted(counts)
-    }
-
-
-def _entry(module: str, node: str, counts: Iterable[int], problem: str) -> Tree:
-    told: Tree = {"name": node, "module": module, **dict(zip(_COUNTS, counts, strict=True)), "problem": problem}
-    return {key: value for key, value in told.items() if value}
-
-
-def node_detail(snapshot: Snapshot, key: str) -> Tree | None:
-    """The topics and services of one node by its ``node_key``; ``None`` where it has none."""
-    head, colon, tail = key.partition(":")
-    module, node = (head, tail) if colon else ("", key)
-    publishes = [
-        topic.name
-        for topic in snapshot.topics
-        if (not module and node in topic.publishers)
-        or any(
-            route.direction == "in" and (route.peer, route.node) == (module, node)
-            for route in (topic.routes if module else ())
-        )
-    ]
-    subscribes = [topic.name for topic in snapshot.topics if not module and node in topic.subscribers]
-    services = [
-        node_key(service.peer, service.name)
-        for service in snapshot.services
-        if (service.peer, service.node) == (module, node)
-    ]
-    if not publishes and not subscribes and not services:
-        return None
-    found: Tree = {"publishes": [*publishes], "subscribes": [*subscribes], "services": [*services]}
-    problem = next((str(info) for info in snapshot.unreachable if not module and info.node == node), "")
-    return {**found, "problem": problem} if problem else found
 
 
 def shown_node(own: str) -> str:
@@ -146,7 +41,10 @@ def shown_node(own: str) -> str:
     return node_key(*peer) if peer is not None else own
 
 
-Args = dict[str, Any]
+Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
+_Answer: TypeAlias = "Callable[[Answers, Args], Awaitable[Any]]"
+QUESTIONS: Final[dict[str, tuple[str, _Answer]]] = {}
+"""All questions: the right (``Rights``) that a page needs for each, and what answers it."""
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service", "module")
@@ -154,6 +52,16 @@ _SET_PARAMETERS: Final = "set_parameters"
 """The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
 """The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
+
+
+def question(what: str, *, needs: str = "") -> Callable[[_Answer], _Answer]:
+    """A method of ``Answers`` that answers the question ``what``; with an empty ``needs`` every page may ask it."""
+
+    def add(method: _Answer) -> _Answer:
+        QUESTIONS[what] = needs, method
+        return method
+
+    return add
 
 
 class Answers:
@@ -175,16 +83,13 @@ class Answers:
         self._agent_name = agent
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
 
-    async def answer(self, question: Question) -> Any:
-        """The answer, as values for JSON.
-
-        Args:
-            question: One that the page may ask (``QUESTIONS``): the method of its name answers.
+    async def answer(self, what: str, args: Args) -> Any:
+        """The answer to one of ``QUESTIONS`` that the page may ask, as values for JSON.
 
         Raises:
             RmpaError: There is none, or the rules deny it; the text says why.
         """
-        return await getattr(self, f"_{question.what}")(question.args)
+        return await QUESTIONS[what][1](self, args)
 
     def close(self) -> None:
         """End the threads, once what the agent was asked is answered or has timed out."""
@@ -192,6 +97,7 @@ class Answers:
 
     # --- what only looks --------------------------------------------------------------------------------------
 
+    @question("why")
     async def _why(self, args: Args) -> Any:
         kind = args.get("kind")
         if kind not in _KINDS:
@@ -201,12 +107,15 @@ class Answers:
         name, peer = _name(args, "name"), _text(args, "peer")
         return await self._control_call("why", name=name, peer=peer or None, service=kind == "service")
 
+    @question("agent")
     async def _agent(self, args: Args) -> Any:
         return await self._control_call("agent", peer=_text(args, "peer"))
 
+    @question("contract")
     async def _contract(self, args: Args) -> Any:
         return await self._control_call("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
+    @question("node")
     async def _node(self, args: Args) -> Any:
         """The facts about a node, with names of nodes as pages have them."""
         name, peer = _name(args, "name"), _text(args, "peer")
@@ -219,14 +128,21 @@ class Answers:
         return about
 
     async def _control_call(self, op: str, **args: object) -> Any:
-        """Call an operation of the agent, in a thread."""
+        """Call an operation of the agent."""
+        return await self._in_thread(lambda client: client.call(op, object, **args))
 
+    async def _of_peer(self, peer: str, do: Callable[[PeerParams], Any]) -> Any:
+        return await self._in_thread(lambda client: do(PeerParams(client, peer)))
+
+    async def _in_thread(self, do: Callable[[ControlClient], Any]) -> Any:
         def ask() -> Any:
-            with self._control() as client:
-                return client.call(op, object, **args)
+            agent = choose_agent(self._environ, self._agent_name() or None)
+            with ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
+                return do(client)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
 
+    @question("describe")
     async def _describe(self, args: Args) -> Any:
         kind = await self._type_of(self._service(args))
         empty = codec_for(kind.request)
@@ -239,6 +155,7 @@ class Answers:
 
     # --- parameters -------------------------------------------------------------------------------------------
 
+    @question("params", needs="view")
     async def _params(self, args: Args) -> Any:
         """All parameters that the rules let a page see; a peer's count by their names there."""
         peer = _text(args, "peer")
@@ -250,11 +167,13 @@ class Answers:
         await _in_time(self._hub.params.loaded.wait())
         return self._hub.params.tree
 
+    @question("param_names", needs="view")
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
         names = islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN)
         return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
+    @question("set_param", needs="control")
     async def _set_param(self, args: Args) -> Any:
         name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
         if value is None:
@@ -274,6 +193,7 @@ class Answers:
             await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
         return await self._params(args)
 
+    @question("delete_param", needs="control")
     async def _delete_param(self, args: Args) -> Any:
         name, peer = _name(args, "name"), _text(args, "peer")
         if name == "/":
@@ -289,19 +209,9 @@ class Answers:
             await _in_time(self._hub.params.delete(name))
         return await self._params(args)
 
-    async def _of_peer(self, peer: str, do: Callable[[PeerParams], Any]) -> Any:
-        def ask() -> Any:
-            with self._control() as client:
-                return do(PeerParams(client, peer))
-
-        return await asyncio.get_running_loop().run_in_executor(self._threads, ask)
-
-    def _control(self) -> ControlClient:
-        agent = choose_agent(self._environ, self._agent_name() or None)
-        return ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT)
-
     # --- services and resources -------------------------------------------------------------------------------
 
+    @question("call", needs="control")
     async def _call(self, args: Args) -> Any:
         service = self._service(args)
         request = args.get("request", {})
@@ -313,20 +223,18 @@ class Answers:
         values = codec_for(kind.response).json(memoryview(response))
         return {"response": _json(values), "seconds": round(took, 6)}
 
+    @question("profile", needs="control")
     async def _profile(self, args: Args) -> Any:
         return await self._choose(args, "profile")
 
+    @question("context", needs="control")
     async def _context(self, args: Args) -> Any:
         return await self._choose(args, "context")
 
+    @question("configure", needs="control")
     async def _configure(self, args: Args) -> Any:
-        resource, peer, name, value = (
-            _name(args, "resource"),
-            _text(args, "peer"),
-            _text(args, "name"),
-            args.get("value"),
-        )
-        facts = self._resources.facts.get(f"{peer}:{resource}" if peer else resource)
+        resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
+        facts = self._resources.facts.get(node_key(_text(args, "peer"), resource))
         known = facts.descriptor.get("parameters", ()) if facts is not None else ()
         kind = next((each["type"] for each in known if each.get("name") == name), None)
         if kind not in _LISTS:

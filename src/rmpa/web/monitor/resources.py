@@ -1,13 +1,9 @@
-"""Smart Resources on the page, from the topics that they publish about themselves.
-
-The Smart Resources of all modules, from the topics that they publish about themselves.
-"""
+"""The Smart Resources of all modules, from the topics that they publish about themselves."""
 
 from __future__ import annotations
 
 import itertools
 import time
-from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,17 +20,13 @@ from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web import limits
 from rmpa.web.hub.node_link import OWN_CLIENT
-from rmpa.web.monitor.live import without_nulls
+from rmpa.web.monitor.messages import Tree, without_nulls
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Sequence
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.requests import GraphTopic, Payload, ReceivedMessage
-    from rmpa.web.monitor.live import Steady, Tree
-
-
-# What the monitor knows of a Smart Resource, from the topics that it publishes about itself.
 
 
 class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
@@ -125,35 +117,25 @@ def resource_detail(facts: ResourceFacts, own: str) -> Tree:
     return (made if isinstance(made, dict) else {}) | {"module": facts.peer or own}
 
 
-def resource_flows(facts: Iterable[ResourceFacts], own: str, steady: Steady) -> dict[str, Tree]:
+def resource_flows(facts: Sequence[ResourceFacts], own: str) -> dict[str, Tree]:
     """Flows between modules, by what resources declare and measure: ``from>to`` with rate and topics.
 
     The agent sees the messages of its own links alone. What flows between two other modules is known from the
     descriptors: an input of a resource of one that is an output of a resource of the other. The rate is measured by
     the resource that has the input.
     """
-    known = list(facts)
-    producers = [(one.peer or own, topic) for one in known for topic in sorted(one.topics("outputs"))]
-    found: dict[str, Tree] = {}
-    for consumer in known:
-        here = consumer.peer or own
+    producers = [(one.peer, topic) for one in facts for topic in sorted(one.topics("outputs"))]
+    found: dict[str, Any] = {}
+    for consumer in facts:
         wanted = consumer.topics("inputs")
         for module, topic in producers:
-            if module == here or topic not in wanted or own in (module, here):
-                continue
-            short = topic.rpartition("/")[2]
-            key = f"{module}>{here}"
-            rate = steady.figure(f"declared {key} {topic}", consumer.quality(f"{short}.rate"))
-            flow = found.setdefault(key, {"by": "resource", "topics": []})
-            topics, sum_ = flow["topics"], flow.get("rate")
-            if isinstance(topics, list):
-                topics.append(topic)
-            if rate is not None:
-                flow["rate"] = rate + (sum_ if isinstance(sum_, float) else 0.0)
-    return found
-
-
-# The values of messages, decoded once for all pages.
+            if module and consumer.peer and module != consumer.peer and topic in wanted:
+                flow = found.setdefault(f"{module}>{consumer.peer}", {"by": "resource", "topics": []})
+                flow["topics"].append(topic)
+                rate = consumer.quality(f"{topic.rpartition('/')[2]}.rate")
+                if rate is not None:
+                    flow["rate"] = rate + flow.get("rate", 0.0)
+    return {key: flow for key, flow in found.items() if own not in key.split(">")}
 
 
 _OVERHEAD: Final = 64 * KIB
@@ -161,7 +143,7 @@ _OVERHEAD: Final = 64 * KIB
 
 
 class MessageValues:
-    """Decodes messages of the hub. Pages that watch the same topic get its message at nearly the same time.
+    """Decodes messages of the hub, once for all pages: these get a topic's message at nearly the same time.
 
     Args:
         hub: Knows the types.
@@ -169,8 +151,7 @@ class MessageValues:
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._last: OrderedDict[int, tuple[Payload, Any]] = OrderedDict()
-        self._bytes = 0
+        self._last: dict[int, tuple[Payload, Any]] = {}
 
     def of(self, message: ReceivedMessage) -> Any:
         """The values of a message; they are shared, and must not be changed.
@@ -178,29 +159,31 @@ class MessageValues:
         Raises:
             RmpaError: Its type is not known, or its bytes are not a message of that type.
         """
-        key = id(message.payload)
-        known = self._last.get(key)
-        if known is not None and known[0] is message.payload:  # an object's id is used again once it has gone
-            return known[1]
-        values = codec_for(self._hub.types.version(message.type, message.md5sum)).json_values(message.payload)
-        if known is not None:
-            self._bytes -= len(known[0]) + _OVERHEAD
-        self._last[key] = message.payload, values
-        self._last.move_to_end(key)
-        self._bytes += len(message.payload) + _OVERHEAD
-        while self._bytes > limits.VALUES_BYTES:
-            _, (payload, _) = self._last.popitem(last=False)
-            self._bytes -= len(payload) + _OVERHEAD
-        return values
+        last, key = self._last, id(message.payload)
+        known = last.pop(key, None)
+        if known is None or known[0] is not message.payload:  # an object's id is used again once it has gone
+            codec = codec_for(self._hub.types.version(message.type, message.md5sum))
+            known = message.payload, codec.json_values(message.payload)
+        last[key] = known
+        while sum(len(payload) + _OVERHEAD for payload, _ in last.values()) > limits.VALUES_BYTES:
+            del last[next(iter(last))]
+        return known[1]
 
 
 _TEXT: Final = "std_msgs/String"
-_ALWAYS: Final = {DESCRIPTOR: _TEXT}
-"""Topics below each resource, with their types, that are always followed."""
-_SHOWN: Final = {"state": _TEXT, "profile": _TEXT, "context": _TEXT, "quality": ARRAY_TYPE}
-"""Those that are followed while pages are open."""
-_LOOKED_AT: Final = {"decision": _TEXT, "responses": ARRAY_TYPE, "parameter_updates": CONFIG_TYPE}
-"""Those of a resource that a page shows."""
+_ALWAYS, _SHOWN, _LOOKED_AT = range(3)
+"""When a topic of a resource is followed: always, while pages are open, while a page shows the resource."""
+_TOPICS: Final = {
+    DESCRIPTOR: (_TEXT, _ALWAYS),
+    "state": (_TEXT, _SHOWN),
+    "profile": (_TEXT, _SHOWN),
+    "context": (_TEXT, _SHOWN),
+    "quality": (ARRAY_TYPE, _SHOWN),
+    "decision": (_TEXT, _LOOKED_AT),
+    "responses": (ARRAY_TYPE, _LOOKED_AT),
+    "parameter_updates": (CONFIG_TYPE, _LOOKED_AT),
+}
+"""The topics below each resource, with their types."""
 _FIRST_HANDLE: Final = 1000
 _GRAPH: Final = 999
 _BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
@@ -334,11 +317,9 @@ class ResourceWatch:
             self._follow(name, path)
 
     def _follow(self, name: str, path: _Path) -> None:
-        wanted = dict(_ALWAYS)
-        if self._wanted:
-            wanted |= _SHOWN
-            if self._clock() - path.looked < limits.LOOK_KEPT:
-                wanted |= _LOOKED_AT
+        looked = self._clock() - path.looked < limits.LOOK_KEPT
+        most = (_LOOKED_AT if looked else _SHOWN) if self._wanted else _ALWAYS
+        wanted = {topic: type_ for topic, (type_, when) in _TOPICS.items() if when <= most}
         for topic in path.handles.keys() - wanted.keys():
             self._hub.topics.unsubscribe((OWN_CLIENT, path.handles.pop(topic)), f"{name}/{topic}")
         for topic in wanted.keys() - path.handles.keys():

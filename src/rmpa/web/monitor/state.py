@@ -1,0 +1,436 @@
+"""The state that all pages show, made of the agent's snapshots: small, steady, and the same for all clients.
+
+An entry says what a snapshot says, rounded. Its figures are new only where there is something to see (``_STEADY``),
+and an entry of which nothing is new is the same object as before, so a difference costs little. Counters and
+distributions are in the details, which a client gets of what it looks at alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+
+import msgspec
+
+from rmpa.web import limits
+from rmpa.web.monitor.messages import Tree, without_nulls
+from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.snapshot import AgentInfo, ServiceInfo, Snapshot, TopicInfo
+    from rmpa.web.monitor.resources import ResourceFacts
+
+_T = TypeVar("_T")
+_SMALL: Final = 0.03
+_STEADY: Final[Mapping[str, tuple[float, float]]] = {
+    "since": (0.0, 0.5),
+    "cpu": (0.15, 1.0),
+    "rss": (_SMALL, 0.0),
+    "files_open": (_SMALL, 2.0),
+    "rate": (_SMALL, 0.0),
+    "bandwidth": (0.1, 0.0),
+    "latency": (0.25, 1e-4),
+    "rtt": (0.25, 5e-5),
+    "offset": (0.1, 2e-5),
+    "offset_error": (0.25, 2e-5),
+    "queued": (0.25, 0.0),
+    "bytes_in": (0.1, 20.0),
+    "bytes_out": (0.1, 20.0),
+}
+"""Figures by their member's name: a change is shown that is larger than this share of what is shown, and than this
+amount, so that noise moves nothing."""
+_MOMENT: Final = "since"
+"""Is computed from a moving age: seconds since the epoch, of which three digits would say nothing."""
+_AGENT: Final = (
+    "name",
+    "guid",
+    "version",
+    "domain",
+    "core_uri",
+    "pid",
+    "started",
+    "cpu",
+    "rss",
+    "addresses",
+    "config_file",
+    "realtime",
+    "proxies",
+    "core_memory",
+)
+_GONE: Final = "has left the roster: no beacon and no link"
+_LOST: Final = frozenset({"linking", "refused", "away"})
+"""States of a module of which nothing comes any more."""
+
+
+def steady_entry(before: Mapping[str, Any] | None, entry: Tree) -> Tree:
+    """An entry with the figures that are to be shown; ``before`` itself, which is shown now, where nothing is new."""
+    for name in entry.keys() & _STEADY.keys():
+        value, shown = cast("float", entry[name]), before.get(name) if before is not None else None
+        share, least = _STEADY[name]
+        if not math.isfinite(value):
+            del entry[name]
+        elif shown and abs(value - shown) <= max(share * abs(shown), least):
+            entry[name] = shown
+        else:
+            entry[name] = round(value, 1) if name == _MOMENT else float(f"{value:.3g}")
+    return cast("Tree", before) if before == entry else entry
+
+
+class StateBuilder:
+    """Makes the state of each snapshot.
+
+    Args:
+        own: The name of the agent's module.
+    """
+
+    def __init__(self, own: str) -> None:
+        self.own = own
+        """The name of the agent's module."""
+        self._seen: dict[str, float] = {}
+        """When each module was in the roster last, those included that have left it."""
+        self._links: dict[str, tuple[tuple[float, int, int], list[float]]] = {}
+        """The last counts of each link, and its bytes a second in and out."""
+        self._entries: dict[str, dict[str, tuple[object, Tree]]] = {}
+        """By section and key, the entries that are shown, with what they were made of."""
+        self._state: Tree = {"agent": {"name": own}, "modules": {}, "topics": {}}
+
+    def build(
+        self,
+        snapshot: Snapshot,
+        resources: Sequence[ResourceFacts] = (),
+        alarms: Sequence[Tree] = (),
+        parameters: int = 0,
+    ) -> Tree:
+        """The state of ``snapshot``.
+
+        Args:
+            snapshot: The newest.
+            resources: The Smart Resources of all modules.
+            alarms: The alarms that stand, each with ``id``, ``module`` (empty: this one), ``resource``, ``level``,
+                ``text`` and ``at``.
+            parameters: How often the parameters of this module's core have changed.
+        """
+        modules = dict(self._modules(snapshot))
+        lost = {name for name, module in modules.items() if module["state"] in _LOST}
+        flows = self._flows(snapshot.topics) | resource_flows(resources, self.own)
+        nodes = node_entries(snapshot)
+        topics, services = snapshot.topics[: limits.TOPICS_SHOWN], snapshot.services[: limits.SERVICES_SHOWN]
+        hidden = {
+            "topics": len(snapshot.topics) - len(topics) + snapshot.topics_left,
+            "services": len(snapshot.services) - len(services) + snapshot.services_left,
+            "modules": max(0, len(snapshot.peers) - limits.MODULES_SHOWN),
+            "nodes": max(0, len(nodes) - limits.NODES_SHOWN),
+        }
+        self._state = {
+            "reach": {"ok": True},
+            "agent": self._steady("agent", [("", snapshot.agent)], _agent)[""],
+            "modules": self._steady("modules", modules.items()),
+            "flows": self._steady("flows", flows.items()),
+            "topics": self._steady("topics", ((each.name, each) for each in topics), self._topic),
+            "services": self._steady("services", ((service_key(each), each) for each in services), _service),
+            "nodes": self._steady("nodes", islice(nodes.items(), limits.NODES_SHOWN)),
+            "resources": self._steady(
+                "resources", ((one.key, resource_entry(one, self.own, lost=one.peer in lost)) for one in resources)
+            ),
+            "alarms": {
+                str(alarm.get("id", index)): {**alarm, "module": alarm.get("module") or self.own}
+                for index, alarm in enumerate(alarms)
+                if alarm.get("module") not in lost
+            },
+            "parameters": parameters,
+            "notes": [
+                *snapshot.notes[:100],
+                *(f"{one.name}: {one.last_error}" for one in snapshot.strangers),
+            ],
+            "unreachable": [str(each) for each in snapshot.unreachable[:100]],
+            "hidden": {kind: count for kind, count in hidden.items() if count},
+        }
+        return self._state
+
+    def unreachable(self, since: float, error: str, remedy: str) -> Tree:
+        """The state while the agent does not answer: what was last known, marked as such."""
+        return self._state | {"reach": {"ok": False, "since": round(since, 1), "error": error, "remedy": remedy}}
+
+    def _steady(
+        self,
+        section: str,
+        sources: Iterable[tuple[str, _T]],
+        make: Callable[[_T], Tree] = lambda entry: entry,  # type: ignore[assignment,return-value]
+    ) -> Tree:
+        """The entries of a section by key; one whose source is the object of last time is not made again."""
+        before, now = self._entries.get(section, {}), {}
+        for key, source in sources:
+            known = before.get(key)
+            if known is None or known[0] is not source:
+                known = source, steady_entry(known[1] if known is not None else None, make(source))
+            now[key] = known
+        self._entries[section] = now
+        return {key: entry for key, (_, entry) in now.items()}
+
+    # --- modules ----------------------------------------------------------------------------------------------
+
+    def _modules(self, snapshot: Snapshot) -> Iterable[tuple[str, Tree]]:
+        taken, peers = snapshot.taken, snapshot.peers[: limits.MODULES_SHOWN]
+        # Modules that have left the roster are kept for a while, as many as can be shown.
+        seen = self._seen | {peer.name: taken for peer in peers}
+        newest = sorted(seen, key=seen.__getitem__, reverse=True)[: limits.MODULES_SHOWN]
+        self._seen = {name: seen[name] for name in newest if taken - seen[name] <= limits.FORGET_AFTER}
+        started = round(snapshot.agent.started, 1)
+        yield self.own, {"state": "here", "since": started}
+        links, self._links = self._links, {}
+        for peer in peers:
+            rates = self._rates(peer.name, taken, peer.link, links) if peer.link is not None else []
+            yield peer.name, _module(peer, taken, rates)
+        for name in sorted(self._seen.keys() - {peer.name for peer in snapshot.peers}):
+            if snapshot.agent.uptime < limits.AGENT_SETTLES:
+                text = "not found yet: the agent of this module has just started"
+                yield name, {"state": "linking", "since": started, "error": text}
+            else:
+                before = self._entries.get("modules", {}).get(name, (None, {}))[1]
+                since = before.get("since") if before.get("state") in _LOST else None
+                yield name, {"state": "away", "since": since or self._seen[name], "error": _GONE}
+
+    def _rates(
+        self, name: str, taken: float, link: LinkInfo, links: Mapping[str, tuple[tuple[float, int, int], list[float]]]
+    ) -> list[float]:
+        """Bytes a second in and out, smoothed; empty before there are two counts of one link."""
+        counts = taken, link.bytes_in, link.bytes_out
+        before, rates = links.get(name, (counts, []))
+        span = taken - before[0]
+        if counts[1] < before[1] or counts[2] < before[2]:
+            rates = []  # another link
+        elif span > 0:
+            fresh = [(counts[way] - before[way]) / span for way in (1, 2)]
+            share = 1 - math.exp(-span / limits.RATE_SMOOTHING)
+            rates = [old + share * (new - old) for old, new in zip(rates or fresh, fresh, strict=True)]
+        self._links[name] = counts, rates
+        return rates
+
+    # --- topics -----------------------------------------------------------------------------------------------
+
+    def _flows(self, topics: Iterable[TopicInfo]) -> dict[str, Tree]:
+        """What flows on the own links, by ``from>to``: messages and bytes a second, and the busiest topics."""
+        parts: dict[str, list[tuple[float, float, str]]] = {}
+        for topic in topics:
+            for route in topic.routes:
+                if route.rate:
+                    key = f"{route.peer}>{self.own}" if route.direction == "in" else f"{self.own}>{route.peer}"
+                    parts.setdefault(key, []).append((-route.rate, route.bandwidth or 0.0, topic.name))
+        return {
+            key: {
+                "rate": -sum(rate for rate, _, _ in busiest),
+                "bandwidth": sum(bandwidth for _, bandwidth, _ in busiest),
+                "topics": [*sorted([*dict.fromkeys(name for _, _, name in sorted(busiest))][: limits.FLOW_TOPICS])],
+            }
+            for key, busiest in parts.items()
+        }
+
+    def _topic(self, topic: TopicInfo) -> Tree:
+        sources = {self.own} if topic.publishers else set()
+        targets = {self.own} if topic.subscribers else set()
+        rate = bandwidth = latency = 0.0
+        lost = dropped = 0
+        problem = next(iter((*topic.mismatches, *topic.unreachable)), "")
+        for route in topic.routes:  # of thousands of topics: one loop is half as long as one for each figure
+            if route.direction == "in":
+                sources.add(route.peer)
+                if route.latency is not None and route.latency.p50 > latency:
+                    latency = route.latency.p50
+            elif route.state == "open" or any(each.transport == "direct" for each in route.subscribers):
+                targets.add(route.peer)
+            rate = max(rate, route.rate or 0.0)
+            bandwidth += route.bandwidth or 0.0
+            lost += route.lost + route.expired
+            dropped += route.dropped + route.oversized
+            problem = problem or route.problem
+        return _told({
+            "type": topic.type,
+            "from": sorted(sources),
+            "to": sorted(targets),
+            "rate": rate,
+            "bandwidth": bandwidth,
+            "latency": latency,
+            "lost": lost,
+            "dropped": dropped,
+            "problem": problem,
+            "crosses": topic.crosses,
+        })  # fmt: skip
+
+
+def _agent(agent: AgentInfo) -> Tree:
+    built, files = msgspec.to_builtins(agent), agent.files
+    told = {key: built.get(key) for key in _AGENT}
+    if files is not None:
+        told |= {"files_open": files.open, "files_limit": files.limit, "files_problem": files.problem}
+    return _tree(told)
+
+
+def module_state(peer: PeerInfo) -> str:
+    """The word for a peer: ``up``, ``silent``, ``linking``, ``refused``, ``relayed`` or ``away``."""
+    if peer.state == "linked":
+        if peer.link is None or peer.link.heard_ago is None:
+            return "up"
+        after = peer.link.lease / 2 if peer.link.rests else limits.SILENT_AFTER
+        return "silent" if peer.link.heard_ago > after else "up"
+    if peer.state in ("refused", "conflict"):
+        return "refused"
+    if peer.state == "relayed":
+        return "relayed"
+    return "linking" if peer.beacon_ago is not None and peer.beacon_ago <= limits.AWAY_AFTER else "away"
+
+
+def _module(peer: PeerInfo, taken: float, rates: Sequence[float]) -> Tree:
+    link, state, ago = peer.link, module_state(peer), peer.since_ago
+    if state == "silent" and link is not None and link.heard_ago is not None:
+        ago = link.heard_ago
+    entry = {
+        "state": state,
+        "since": taken - ago,
+        "error": "; ".join(filter(None, ("" if link else peer.last_error, *peer.conflicts))),
+        "guid": peer.guid,
+        "source": peer.source,
+        "via": peer.via,
+        "topics_in": peer.topics_in,
+        "topics_out": peer.topics_out,
+        "hidden": [bound.text for bound in peer.beyond],
+        "direct_in": peer.direct_in,
+        "direct_out": peer.direct_out,
+        **dict(zip(("bytes_in", "bytes_out"), rates, strict=False)),
+    }
+    if link is not None:
+        entry |= {
+            "remote": link.remote,
+            "rtt": link.rtt,
+            "offset": link.clock_offset,
+            "offset_error": link.clock_error,
+            "queued": link.queued,
+            "dropped": link.dropped,
+        }
+    return _told(entry, zeros=True)
+
+
+def _told(entry: Mapping[str, object], *, zeros: bool = False) -> Tree:
+    """Without what says nothing: no, none, nothing, not known. A page takes a missing member as that."""
+    return cast("Tree", {key: value for key, value in entry.items() if value or (zeros and value == 0)})
+
+
+def service_key(service: ServiceInfo) -> str:
+    """``module:/name`` for a peer's service, ``/name`` for one of this module."""
+    return node_key(service.peer, service.name)
+
+
+def _service(service: ServiceInfo) -> Tree:
+    return _told({
+        "name": service.name,
+        "module": service.peer,
+        "node": service.node,
+        "type": service.type,
+        "state": service.state,
+        "calls": service.calls,
+        "failed": service.failed,
+        "transport": service.transport,
+        "problem": service.problem or service.hidden,
+    })  # fmt: skip
+
+
+# --- nodes --------------------------------------------------------------------------------------------------------
+
+
+def node_key(module: str, node: str) -> str:
+    """``module:/name`` for a node of a peer, ``/name`` for one of this module, whose ``module`` is empty."""
+    return f"{module}:{node}" if module else node
+
+
+def node_entries(snapshot: Snapshot) -> dict[str, Tree]:
+    """The nodes of all modules by ``node_key``: how many topics each publishes and subscribes to, what it serves.
+
+    Of a peer those that publish or serve something here.
+    """
+    publishes: dict[tuple[str, str], int] = defaultdict(int)
+    subscribes, serves = publishes.copy(), publishes.copy()
+    for topic in snapshot.topics:
+        for node in topic.publishers:
+            publishes["", node] += 1
+        for node in topic.subscribers:
+            subscribes["", node] += 1
+        for route in topic.routes:
+            if route.direction == "in":
+                publishes[route.peer, route.node] += 1
+    for service in snapshot.services:
+        if service.node:
+            serves[service.peer, service.node] += 1
+    problems = {info.node: info.problem for info in snapshot.unreachable}
+    return {
+        node_key(*key): _told({
+            "name": key[1],
+            "module": key[0],
+            "publishes": publishes.get(key),
+            "subscribes": subscribes.get(key),
+            "serves": serves.get(key),
+            "problem": "" if key[0] else problems.get(key[1]),
+        })
+        for key in sorted(publishes.keys() | subscribes.keys() | serves.keys())
+    }  # fmt: skip
+
+
+def node_detail(snapshot: Snapshot, key: str) -> Tree | None:
+    """The topics and services of one node by its ``node_key``; ``None`` where it has none."""
+    module, _, node = key.rpartition(":")
+    publishes = [
+        topic.name
+        for topic in snapshot.topics
+        if (not module and node in topic.publishers)
+        or (module and any((each.direction, each.peer, each.node) == ("in", module, node) for each in topic.routes))
+    ]
+    subscribes = [topic.name for topic in snapshot.topics if not module and node in topic.subscribers]
+    services = [service_key(each) for each in snapshot.services if (each.peer, each.node) == (module, node)]
+    if not publishes and not subscribes and not services:
+        return None
+    found: Tree = {"publishes": [*publishes], "subscribes": [*subscribes], "services": [*services]}
+    problem = next((str(info) for info in snapshot.unreachable if not module and info.node == node), "")
+    return {**found, "problem": problem} if problem else found
+
+
+# --- details ------------------------------------------------------------------------------------------------------
+
+
+def details(snapshot: Snapshot, resources: Mapping[str, ResourceFacts], kind: str, name: str) -> Tree | None:
+    """All that is known of one thing, for its page; ``None`` where there is no such thing.
+
+    Args:
+        snapshot: The newest.
+        resources: By ``ResourceFacts.key``.
+        kind: ``module``, ``topic``, ``service``, ``node`` or ``resource``; or ``counters``, without a name.
+        name: A module's or topic's name; ``service_key`` of a service; ``node_key``; ``key`` of a resource.
+    """
+    agent = snapshot.agent
+    if kind == "counters":
+        return dict(sorted(snapshot.counters.items()))
+    if kind == "resource":
+        return resource_detail(resources[name], agent.name) if name in resources else None
+    if kind == "node":
+        return node_detail(snapshot, name)
+    things: dict[str, list[tuple[str, msgspec.Struct]]] = {
+        "module": [(agent.name, agent), *((each.name, each) for each in snapshot.peers)],
+        "service": [(service_key(each), each) for each in snapshot.services],
+        "topic": [(each.name, each) for each in snapshot.topics],
+    }
+    found = next((thing for key, thing in things.get(kind, ()) if key == name), None)
+    if found is None:
+        return None
+    made: Any = _tree(msgspec.to_builtins(found))
+    if kind == "topic":
+        for route in made["routes"]:
+            for event in route.get("recent", ()):
+                event["at"] = round(snapshot.taken - event.pop("ago"), 1)  # an age would change all the time
+        made["routes"] = {f"{each['direction']} {each['peer']} {each['node']}": each for each in made["routes"]}
+    return cast("Tree", made)
+
+
+def _tree(value: Mapping[str, object]) -> Tree:
+    return cast("Tree", without_nulls(dict(value)))
