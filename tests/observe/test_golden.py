@@ -18,16 +18,15 @@ from rmpa.cli.agent import _json as doctor_json
 from rmpa.cli.agent import _lines as doctor_lines
 from rmpa.cli.agent import _stage_lines as why_lines
 from rmpa.cli.agent import _summary as doctor_summary
-from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_rights, judge_shell
+from rmpa.observe.doctor.checks import judge_agents
+from rmpa.observe.doctor.facts import NetworkInterface
+from rmpa.observe.doctor.machine import judge_clock, judge_rights, judge_shell
 from rmpa.observe.doctor.network import (
     MulticastEcho,
-    NetworkInterface,
     Port,
-    Radio,
     judge_interfaces,
     judge_multicast,
-    judge_ports,
+    judge_port,
     judge_radio,
     judge_routes,
     judge_rp_filter,
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import Check, PeerInfo
     from rmpa.observe.why.diagnosis import Diagnosis
 
-RADIO: Final = Radio("wlan0", "10.0.0.0/24")
+RADIO: Final = ("wlan0", "10.0.0.0/24", "")
 GOLDEN: Final = Path(__file__).with_name("golden")
 JOYSTICK, PC = SNAPSHOT.peers
 (ROUTE,) = SNAPSHOT.topics[0].routes
@@ -119,20 +118,21 @@ def findings() -> Iterator[Check]:
     ):
         yield judge_rules(rules, "UDP port 11411")
     for values in ({}, {"all": 1, "wlan0": 0, "eth0": 0}, {"all": 2}):
-        yield from judge_rp_filter(values, (LO, WLAN, ETH))
-    marked = Radio("wlan0", "10.0.0.0/24", "40ms")
+        yield judge_rp_filter(values, (LO, WLAN, ETH))
+    marked = (*RADIO[:2], "40ms")
     for radios, quick in ((), True), ((RADIO,), True), ((RADIO, marked), False):
         yield from judge_radio(radios, quick=quick, bbr=quick)
     yield from judge_routes({})
     yield from judge_routes({"10.1.0.2 (arm)": "Network is unreachable", "10.0.0.2 (base)": ""})
-    yield from judge_ports(
+    yield from map(
+        judge_port,
         (
             Port("the ROS core", 11311, "Address already in use", "roscore (pid 7)"),
             Port("the ROS core", 11312, "Address already in use"),
             Port("the mesh (TCP)", 40001, "Address already in use", "agent base", ours=True),
             Port("beacons (UDP)", 11411),
             Port("beacons (UDP)", 11412, owner="agent base and python3 (pid 7)"),
-        )
+        ),
     )
     for environ in (
         {"ROS_MASTER_URI": "http://10.0.0.1:11311", "ROS_IP": "127.0.0.1", "ROS_DOMAIN_ID": "0"},
@@ -149,15 +149,12 @@ def findings() -> Iterator[Check]:
     for answers in (True, False):
         shell = replace(alone, external="http://robot2:11311/", answers=answers)
         yield from judge_shell(replace(shell, environ={"ROS_MASTER_URI": "http://robot2:11311"}))
-    good = WallClock(stepped=0.00001, synchronised=True, error=0.004, year=2026)
-    for clock in (good, WallClock(-0.2, False, 0.0, 1970), replace(good, synchronised=None)):
-        yield from judge_clock(clock)
-    for rights in (
-        KernelRights(fifo="", memlock=None, wanted=True, files=65536),
-        KernelRights(fifo="Operation not permitted", memlock=65536, wanted=True, files=1024),
-        KernelRights(fifo="Operation not permitted", memlock=65536, wanted=False, files=None),
-    ):
-        yield from judge_rights(rights)
+    yield from judge_clock(0.00001, True, 0.004, 2026)
+    yield from judge_clock(-0.2, False, 0.0, 1970)
+    yield from judge_clock(0.00001, None, 0.004, 2026)
+    yield from judge_rights("", None, 65536, wanted=True)
+    yield from judge_rights("Operation not permitted", 65536, 1024, wanted=True)
+    yield from judge_rights("Operation not permitted", 65536, None, wanted=False)
 
 
 def doctor() -> bytes:
@@ -184,7 +181,7 @@ def diagnoses() -> Iterator[Diagnosis]:
     for here, there, *_ in test_services.FAILURES.values():
         yield test_services.walk(here, there)
     yield test_services.walk(there=None)
-    yield test_services.walk(replace(test_services.HERE, failed=1, problem="took more than 60 s"))
+    yield test_services.walk(test_services.told(failed=1, problem="took more than 60 s"))
 
 
 def why() -> bytes:

@@ -229,7 +229,7 @@ class Agent:
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
         self.sites = SiteRequests(self.bridge)
         """Answers questions about other sites; a gateway answers them itself."""
-        self.why = WhyService(settings.name, self.core, self.bridge, self.services, self.snapshots, self.sites)
+        self.why = WhyService(settings.name, parts, self.snapshots, self.sites)
         self.operations = ControlOperations(
             settings.name, self.bridge, self.params, self.snapshots, nodes, self.sites
         )

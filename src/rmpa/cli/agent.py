@@ -303,7 +303,8 @@ def doctor(config: str | None, quiet: bool, listen: float | None, as_json: bool)
     checks that it comes back. To see whether a switch or a firewall in between drops it, run it with --listen on one
     machine and meanwhile without on the other, then the other way round.
     """
-    from rmpa.observe.doctor.checks import examine, look_at
+    from rmpa.observe.doctor.checks import examine
+    from rmpa.observe.doctor.facts import look_at
 
     found, shown = [], []
     for check in examine(look_at(os.environ, config, listen or 0.0)):

@@ -35,7 +35,7 @@ def direct(here: SubscriberTransport = HERE, *, relayed: bool = False) -> Case:
     case = replace(case, route=route, later=route)
     if not relayed:
         return case
-    flowing, readers = Case(), (connected("/rec", messages=100),)
+    flowing, readers = Case(), (connected("/rec"),)
     assert flowing.route is not None
     assert flowing.later is not None
     both = {"transport": "both", "subscribers": (here,)}

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from rmpa.observe.peer_info import BoundInfo, LaneInfo, PeerAgent, PeerInfo
-from rmpa.observe.why.why import diagnose_module
+from rmpa.observe.why.services import diagnose_module
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why.test_topics import LINK, PEER
 

@@ -9,19 +9,27 @@ import msgspec
 import pytest
 
 from rmpa.observe.peer_info import Check, CheckLevel
-from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, ServiceTransport, diagnose_service
+from rmpa.observe.snapshot import ServiceInfo
+from rmpa.observe.why.diagnosis import Diagnosis, ServiceAtServer
+from rmpa.observe.why.services import ServiceHere, diagnose_service
 
 BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
 THERE = ServiceAtServer(node="/arm", service="/move", rule="services.allow has '/**'")
-HERE = ServiceAtClient(wire="/move", offered=True, node="/arm", registered=True, answer="a/Move, md5 123", calls=3)
+INFO = ServiceInfo(name="/move", node="/arm", direction="in", peer="robot", calls=3)
+HERE = ServiceHere(INFO, registered=True, answer="a/Move, md5 123")
 ORDER = ("peer", "link", "server", "policy there", "offer", "shown", "graph", "transport", "answer", "calls")
 
 
 def walk(
-    here: ServiceAtClient = HERE, there: ServiceAtServer | None = THERE, begin: tuple[Check, ...] = BEGIN
+    here: ServiceHere = HERE, there: ServiceAtServer | None = THERE, begin: tuple[Check, ...] = BEGIN
 ) -> Diagnosis:
-    return diagnose_service(begin, "base", "robot", "/move", here, there, "" if there else "it is older")
+    refusal = "" if there else "it is older"
+    return diagnose_service(begin, "base", "robot", "/move", "/move", here, there, refusal)
+
+
+def told(**changes: object) -> ServiceHere:
+    """What is known here, with other facts in the snapshot."""
+    return replace(HERE, info=msgspec.structs.replace(INFO, **changes))
 
 
 def test_a_service_that_can_be_called() -> None:
@@ -33,34 +41,29 @@ def test_a_service_that_can_be_called() -> None:
     assert msgspec.convert(msgspec.to_builtins(found), Diagnosis) == found
 
 
-TRANSPORTS: dict[str, tuple[ServiceTransport, CheckLevel, str]] = {
-    "by rule": (ServiceTransport(), CheckLevel.OK, 'transport is "relay" here'),
-    "direct": (ServiceTransport("auto", "rosrpc://10.0.0.1:9"), CheckLevel.OK, "direct: .* at rosrpc://10.0.0.1:9"),
-    "asked": (ServiceTransport("direct"), CheckLevel.OK, "robot is being asked"),
-    "auto": (
-        ServiceTransport("auto", "", "listening", "on loopback only"),
-        CheckLevel.OK,
-        "relayed.*listening.*only",
-    ),
-    "direct in vain": (
-        ServiceTransport("direct", "", "listening", "on loopback only"),
-        CheckLevel.WARN,
-        "although .*listening.*only",
-    ),
-}
+LOOPBACK = {"condition": "listening", "relayed_because": "on loopback only"}
 
 
-@pytest.mark.parametrize("name", TRANSPORTS)
-def test_the_transport_is_named_with_its_condition(name: str) -> None:
-    transport, level, text = TRANSPORTS[name]
-    found = walk(replace(HERE, transport=transport))
+@pytest.mark.parametrize(
+    ("facts", "level", "text"),
+    [
+        ({}, CheckLevel.OK, 'transport is "relay" here'),
+        ({"wanted": "auto", "address": "rosrpc://10.0.0.1:9"}, CheckLevel.OK, "direct: .* at rosrpc://10.0.0.1:9"),
+        ({"wanted": "direct"}, CheckLevel.OK, "robot is being asked"),
+        ({"wanted": "auto", **LOOPBACK}, CheckLevel.OK, "relayed.*listening.*only"),
+        ({"wanted": "direct", **LOOPBACK}, CheckLevel.WARN, "although .*listening.*only"),
+    ],
+    ids=["by rule", "direct", "asked", "auto", "direct in vain"],
+)
+def test_the_transport_is_named_with_its_condition(facts: dict[str, str], level: CheckLevel, text: str) -> None:
+    found = walk(told(**facts))
     assert found.flows
     [stage] = [stage for stage in found.stages if stage.name == "transport"]
     assert stage.level is level
     assert re.search(text, stage.text)
 
 
-FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str]] = {
+FAILURES: dict[str, tuple[ServiceHere, ServiceAtServer | None, str, str, str]] = {
     "nobody provides it": (HERE, ServiceAtServer(), "server", "no node of robot provides /move", "start its server"),
     "nearly its name": (HERE, ServiceAtServer(similar="/mov"), "server", "no node", "did you mean /mov?"),
     "its server is stuck": (
@@ -70,7 +73,7 @@ FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str
         "/arm on robot is registered for it, and does not answer: no answer within 2 s",
         "rosnode ping /arm",
     ),
-    "an older agent": (ServiceAtClient(), None, "server", "it is older", "rosservice info /move"),
+    "an older agent": (ServiceHere(), None, "server", "it is older", "rosservice info /move"),
     "policy there": (
         HERE,
         msgspec.structs.replace(THERE, crosses=False, rule="services.deny has '/move'"),
@@ -78,16 +81,16 @@ FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str
         "services.deny has '/move'",
         "rmpa.toml of robot",
     ),
-    "not offered yet": (ServiceAtClient(wire="/move"), THERE, "offer", "has not come here", "both logs"),
+    "not offered yet": (ServiceHere(), THERE, "offer", "has not come here", "both logs"),
     "policy here": (
-        replace(HERE, hidden="policy: services.deny has '/move'"),
+        told(hidden="policy: services.deny has '/move'"),
         THERE,
         "shown",
         "services.deny has '/move'",
         "rmpa reload",
     ),
     "another provider": (
-        replace(HERE, hidden="/local of this module provides it itself"),
+        told(hidden="/local of this module provides it itself"),
         THERE,
         "shown",
         "/local of this module",
@@ -106,7 +109,7 @@ FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str
 
 @pytest.mark.parametrize(("here", "there", "stage", "text", "remedy"), FAILURES.values(), ids=FAILURES)
 def test_the_first_stage_that_fails(
-    here: ServiceAtClient, there: ServiceAtServer | None, stage: str, text: str, remedy: str
+    here: ServiceHere, there: ServiceAtServer | None, stage: str, text: str, remedy: str
 ) -> None:
     found = walk(here, there)
     assert not found.flows
@@ -128,8 +131,8 @@ def test_without_a_link_nothing_else_is_judged() -> None:
 
 def test_failed_calls_and_mismatches_are_warnings() -> None:
     for here, text in (
-        (replace(HERE, failed=1, problem="took more than 60 s"), "took more than 60 s"),
-        (replace(HERE, mismatch="/client wants 456"), "/client wants 456"),
+        (told(failed=1, problem="took more than 60 s"), "took more than 60 s"),
+        (replace(told(problem="/client wants 456"), mismatched=True), "/client wants 456"),
     ):
         found = walk(here)
         assert found.flows

@@ -13,17 +13,9 @@ from hypothesis import strategies as st
 from rmpa.config import limits as config_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import Check, CheckLevel, LinkInfo, PeerInfo
-from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot, TopicInfo
-from rmpa.observe.why.diagnosis import (
-    BothEnds,
-    Diagnosis,
-    ProxyState,
-    PublisherReport,
-    SubscriberConnection,
-    TopicAtPublisher,
-    TopicAtSubscriber,
-)
-from rmpa.observe.why.topics import diagnose_topic
+from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot
+from rmpa.observe.why.diagnosis import Diagnosis, PublisherReport, TopicAtPublisher
+from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -66,8 +58,11 @@ ROUTE_LATER = msgspec.structs.replace(ROUTE, messages=120, age=0.03)
 SOURCE_LATER = msgspec.structs.replace(SOURCE, messages=120)
 
 
-def connected(node: str, number: int = 1, **changes: Any) -> SubscriberConnection:
-    return SubscriberConnection(number=number, node=node, **changes)
+Reader = tuple[str, int, int]
+
+
+def connected(node: str, waiting: int = 0, dropped: int = 0) -> Reader:
+    return node, waiting, dropped
 
 
 @dataclass(frozen=True)
@@ -84,40 +79,34 @@ class Case:
     registered: bool = True
     conflict: bool = False
     subscribers: tuple[str, ...] = ("/base",)
-    readers: tuple[SubscriberConnection, ...] = (connected("/base", messages=100),)
-    readers_later: tuple[SubscriberConnection, ...] | None = (connected("/base", messages=120),)
+    readers: tuple[Reader, ...] = (connected("/base"),)
+    readers_later: tuple[Reader, ...] | None = (connected("/base"),)
     mismatches: tuple[str, ...] = ()
     known: bool = True
-    carrier: str = ""
+    wire: str = "/cmd"
     files: FilesInfo | None = None
     stranger: PeerInfo | None = None
 
-    def ends(
-        self, route: RouteInfo | None, source: PublisherReport | None, readers: tuple[SubscriberConnection, ...]
-    ) -> BothEnds:
-        topic = TopicInfo(
-            name="/cmd",
-            type="sensor_msgs/Joy",
-            subscribers=self.subscribers,
-            routes=(route,) if route is not None else (),
-        )
-        agent = msgspec.structs.replace(SNAPSHOT.agent, files=self.files)
+    def ends(self, route: RouteInfo | None, source: PublisherReport | None, readers: tuple[Reader, ...]) -> Ends:
         snapshot = Snapshot(
-            agent=agent,
+            agent=msgspec.structs.replace(SNAPSHOT.agent, files=self.files),
             taken=0.0,
             peers=(self.peer,) if self.peer else (),
             strangers=(self.stranger,) if self.stranger else (),
-            topics=(topic,),
         )
         there = self.there
         if there is not None and source is not None:
             there = msgspec.structs.replace(there, sources=(source,))
-        proxy = ProxyState(
-            registered=self.registered, conflict=self.conflict, connections=readers, mismatches=self.mismatches
-        )
-        proxies = {"/joy": proxy} if self.known else {}
-        here = TopicAtSubscriber(snapshot, "/cmd", self.carrier, proxies)
-        return BothEnds(here, there, self.refusal)
+        arrivals = {}
+        if route is not None and self.known:
+            arrivals["/joy"] = Arrival(
+                route,
+                registered=self.registered,
+                cause="conflict" if self.conflict else "",
+                readers=dict(enumerate(readers)),
+                mismatches=self.mismatches,
+            )
+        return Ends(snapshot, "/cmd", self.wire, self.subscribers, arrivals, there, self.refusal)
 
     def walk(self, peer: str = "joystick") -> tuple[Diagnosis, ...]:
         first = self.ends(self.route, self.source, self.readers)
@@ -449,11 +438,11 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
         Case(
             readers=(
                 connected("/base"),
-                connected("/slow", number=2, waiting=1),
+                connected("/slow", waiting=1),
             ),
             readers_later=(
                 connected("/base"),
-                connected("/slow", number=2, waiting=1),
+                connected("/slow", waiting=1),
             ),
         ),
         "reader",
@@ -532,19 +521,18 @@ def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
 
 def test_a_relayed_module_has_no_link_of_its_own() -> None:
     relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
-    found = one(Case(peer=relayed, carrier="joystick"), "arm")
+    found = one(Case(peer=relayed), "arm")
     assert found.flows
     assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
     # What the relay brings of other modules is not this one's.
-    nothing = one(Case(peer=relayed, carrier="joystick", known=False, source=None, source_later=None), "arm")
+    nothing = one(Case(peer=relayed, known=False, source=None, source_later=None), "arm")
     assert nothing.failed is not None
     assert nothing.failed.name == "publisher"
 
 
 def test_names_at_both_ends_are_shown() -> None:
-    renamed = Case(**route(wire="/stick"), source=msgspec.structs.replace(SOURCE, topic="/joy/stick"))
-    first = renamed.ends(renamed.route, renamed.source, renamed.readers)
-    (found,) = diagnose_topic(first, "joystick", None, "/stick")
+    source = msgspec.structs.replace(SOURCE, topic="/joy/stick")
+    found = one(Case(**route(wire="/stick"), source=source, wire="/stick", readers_later=None))
     texts = {stage.name: stage.text for stage in found.stages}
     assert texts["publisher"] == "/joy on joystick publishes /stick (/joy/stick over there)"
     assert texts["policy here"] == "this module takes it as /cmd (its /stick)"

@@ -28,7 +28,7 @@ from aiohttp import WSMsgType, web
 from rmpa.core.contract import ContractRule, Contracts
 from rmpa.observe.peer_info import LaneInfo, PeerAgent
 from rmpa.observe.snapshot import Snapshot
-from rmpa.observe.why.why import diagnose_module
+from rmpa.observe.why.services import diagnose_module
 from rmpa.web.hub import requests
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.monitor import session as monitor

@@ -1,418 +1,176 @@
-"""All checks of ``rmpa doctor``, with the facts of the network that they read. A new check goes here.
+"""All checks of ``rmpa doctor``, and those of this machine's agents and of the nodes that the network can reach.
 
-All checks of ``rmpa doctor``. A new check goes here.
-
-A check is a function of ``DoctorInput``. It reads something of this machine, by a module of this folder, and has a
-pure ``judge_…`` function of the folder above say what that means. ``CHECKS`` lists them.
+A check is a function of ``DoctorInput``, in a module of this folder: it reads something of this machine, and has a
+pure ``judge_…`` function say what that means. ``CHECKS`` lists them; a new check is a row there.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import secrets
-import select
-import socket
-import struct
-import time
-from dataclasses import dataclass
-from ipaddress import IPv4Interface
-from pathlib import Path
+import asyncio
+from collections import Counter
+from functools import partial
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
 import psutil
 
 import rmpa
-from rmpa.config.read import load_settings
-from rmpa.config.settings import Settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError
-from rmpa.discovery import limits as discovery_limits
-from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.network import choose, join_group, list_interfaces, open_receiver, receive
-from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
+from rmpa.core.counters import remedy as raise_file_limit
+from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
-from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.observe.doctor import machine
-from rmpa.observe.doctor.agents import exposed_nodes, judge_agents, judge_exposed_nodes
-from rmpa.observe.doctor.machine import (
-    RosShell,
-    ask_program,
-    judge_clock,
-    judge_rights,
-    judge_shell,
-    judge_sim_time,
-    names_of,
-    resolve,
-)
-from rmpa.observe.doctor.network import (
-    MulticastEcho,
-    NetworkInterface,
-    Port,
-    Radio,
-    check_firewall,
-    judge_interfaces,
-    judge_multicast,
-    judge_ports,
-    judge_radio,
-    judge_routes,
-    judge_rp_filter,
-)
+from rmpa.observe.doctor import machine, network
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.observe.snapshot import Snapshot
-from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
-from rmpa.runtime.kernel_tcp import program_at
+from rmpa.observe.why.diagnosis import misplaced, remedy_for, subscriber_text
+from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.discovery.network import Interface
+    from rmpa.observe.doctor.facts import DoctorInput
+    from rmpa.observe.peer_info import PeerInfo
+    from rmpa.observe.snapshot import AgentInfo, Snapshot, UnreachableInfo
+    from rmpa.trust.permissions import TrustStatus
 
-
-# Sends and receives multicast packets on chosen interfaces.
-
-
-_PKTINFO: Final = struct.Struct("@i4s4s")
-_IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python
-_NO_DOMAIN: Final = 0xFFFF
-"""Greater than every domain: agents ignore beacons of it without logging."""
+_PERMISSION: Final = "permission."
+"""The counters of what ``[[permission]]`` refused begin so."""
 
 
-def hear(interfaces: Iterable[Interface], group: str, port: int, listen: float = 0.0) -> tuple[MulticastEcho, ...]:
-    """Send one packet on each interface, and receive it there as an agent does.
-
-    The packets are beacons of a domain that cannot exist, so agents ignore them.
+def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> Iterator[Check]:
+    """Whether agents run, are healthy, and have found peers.
 
     Args:
-        interfaces: Where to send.
-        group: The multicast group.
-        port: Its port, which is shared with agents and others.
-        listen: Seconds to listen for packets of other machines; 0: only until the own ones are back.
-
-    Raises:
-        StartError: Another program has the port and does not share it.
+        agents: The snapshot of each by its name, or why it does not answer.
+        version: The version of this program.
     """
-    wanted = {interface.index: interface for interface in interfaces}
-    own = {str(address) for interface in wanted.values() for address in interface.addresses}
-    try:
-        receiver = open_receiver(group, port)
-    except OSError as error:
-        problem = f"cannot be opened ({error.strerror})"
-        raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows the program that has it") from None
-    found: dict[str, MulticastEcho] = {}
-    with receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
-        refused = join_group(receiver, group, wanted.values(), set())
-        sent: dict[bytes, tuple[str, float]] = {}
-        for interface in wanted.values():
-            token = struct.pack(">4sBBH", MAGIC, VERSION, BeaconKind.HEARTBEAT, _NO_DOMAIN) + secrets.token_bytes(16)
-            why = refused.get(interface.name) or _send(sender, interface, token, (group, port))
-            found[interface.name] = MulticastEcho(interface.name, (why.strerror or str(why)) if why else "")
-            if why is None:
-                sent[token] = interface.name, time.monotonic()
-        until = time.monotonic() + max(limits.DOCTOR_HEAR, listen)
-        while (sent or listen) and (rest := until - time.monotonic()) > 0:
-            if not select.select([receiver], [], [], rest)[0]:
-                break
-            try:
-                data, (host, _), index = receive(receiver)
-            except BlockingIOError:
-                continue  # the kernel dropped it: its checksum was wrong
-            name = wanted[index].name if index in wanted else ""
-            # If two interfaces share a network, the packet is received on the other one too.
-            if data in sent and sent[data][0] == name:
-                found[name].after = time.monotonic() - sent.pop(data)[1]
-            elif name and host not in own and data.startswith(MAGIC):
-                found[name].others.add(host)
-    return tuple(found.values())
+    if not agents:
+        text = "none runs here, so what only an agent knows was not looked at"
+        yield Check("agent", SKIPPED, text, "start it with `rmpa up`, and ask again")
+    for name, shown in agents.items():
+        if isinstance(shown, str):
+            yield Check("agent", FAIL, shown, "is it stopped? its log may tell", where=name)
+        else:
+            yield from _agent(shown, version)
 
 
-def _send(sender: socket.socket, interface: Interface, data: bytes, to: tuple[str, int]) -> OSError | None:
-    """Send one packet on an interface; return why that failed."""
-    source = interface.addresses[0].packed if interface.addresses else bytes(4)
-    ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, bytes(4)))]
-    try:
-        sender.sendmsg([data], ancillary, 0, to)
-    except OSError as error:
-        return error
-    return None
-
-
-# Reads the network of this machine: interfaces, filters of the kernel, routes, ports.
-
-
-_CONF: Final = Path("/proc/sys/net/ipv4/conf")
-_INTERFACES: Final = Path("/sys/class/net")
-_CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
-
-
-def read_interfaces(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
-    """All interfaces; ``wanted`` are the names that the settings give, none for all that can be used."""
-    there = list_interfaces()
-    used = {interface.name for interface in choose(there, wanted)}
-    masks = {
-        (name, address.address): address.netmask or "255.255.255.255"
-        for name, addresses in psutil.net_if_addrs().items()
-        for address in addresses
-        if address.family == socket.AF_INET
-    }
-    return tuple(
-        NetworkInterface(
-            interface.name,
-            tuple(
-                IPv4Interface(f"{a}/{masks.get((interface.name, str(a)), '255.255.255.255')}")
-                for a in interface.addresses
-            ),
-            interface.up,
-            interface.multicast,
-            interface.loopback,
-            interface.name in used,
+def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
+    agent, trust = snapshot.agent, snapshot.trust
+    check = partial(Check, where=agent.name)
+    mesh = agent.guid.partition("#")[0] or "not joined"
+    yield check("agent", OK, f"domain {agent.domain}, core {agent.core_uri}, mesh {mesh}")
+    if agent.core_memory:
+        yield check("core memory", OK, agent.core_memory)
+    if agent.version != version:
+        text = f"it is RMPA {agent.version}, this command is {version}"
+        yield check("agent", WARN, text, "start it again with this version")
+    # What checks of their own show is left out.
+    shown = {agent.files.problem if agent.files is not None else "", *(trust.problems if trust is not None else ())}
+    yield from (check("agent", WARN, note) for note in snapshot.notes if note not in shown)
+    counters = snapshot.counters.items()
+    refused = [f"{count} {n.removeprefix(_PERMISSION)}" for n, count in counters if n.startswith(_PERMISSION)]
+    if refused:
+        yield check("permissions", OK, f"refused so far: {', '.join(refused)}; its log names the rules")
+    yield from map(_unreachable, snapshot.unreachable)
+    yield from _files(agent)
+    text = f"{agent.proxies} nodes of peers, {agent.proxy_sockets} listening sockets: {agent.proxy_listening}"
+    yield check("proxies", OK, text)
+    for stranger in snapshot.strangers[: limits.DOCTOR_PEERS_LISTED]:
+        yield Check.from_message("peer", WARN, stranger.last_error, where=f"{agent.name}-{stranger.name}")
+    if not snapshot.peers and not snapshot.strangers:
+        text = f"knows no peer (domain {agent.domain}, looking on {', '.join(agent.interfaces) or 'no interface'})"
+        remedy = (
+            f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa doctor --listen 30` tries the way"
         )
-        for interface in there
+        yield check("peer", WARN, text, remedy)
+    if trust is not None:
+        yield judge_membership(trust, snapshot.taken)
+    yield from _peers(agent.name, snapshot.peers)
+    # Subscribers that are relayed although a contract says "direct", or are direct although they must not be.
+    for topic in snapshot.topics:
+        for route in topic.routes:
+            for one in misplaced(route):
+                text = f"of {route.peer}: {subscriber_text(one)}"
+                yield Check("transport", WARN, text, remedy_for(one), where=topic.name)
+
+
+def judge_membership(trust: TrustStatus, wall: float) -> Check:
+    """How a module's part in its secured mesh is.
+
+    Args:
+        trust: Its state.
+        wall: Seconds since 1970.
+    """
+    if trust.problems:
+        text, _, remedy = trust.problems[0].partition("; ")
+        ended = trust.clock_set and wall >= trust.expires
+        return Check("trust", FAIL if ended else WARN, text, remedy or "rmpa trust status", where=trust.module)
+    left = (trust.expires - wall) / 3600
+    text = f"its certificate is valid for {left:.0f} h more; group key {trust.key}, deny list {trust.deny_number}"
+    return Check("trust", OK, text, where=trust.module)
+
+
+def _unreachable(info: UnreachableInfo) -> Check:
+    remedy = (
+        "if it is alive, start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME (nodes talk over loopback, the "
+        "agent carries what is for others); if it is dead, `rosnode cleanup` removes it"
     )
+    return Check("node", FAIL if info.withdrawn else WARN, str(info), remedy, where=info.node)
 
 
-def in_container() -> bool:
-    """Whether this is a container with a network namespace of its own."""
-    if "container" not in os.environ and not any(mark.exists() for mark in _CONTAINER_MARKS):
-        return False
-    with contextlib.suppress(OSError, ValueError):
-        link, own = (
-            int(Path(f"/sys/class/net/eth0/{name}").read_text(encoding="ascii")) for name in ("iflink", "ifindex")
-        )
-        return link != own  # a veth: its other end is outside
-    return False
+def _files(agent: AgentInfo) -> Iterator[Check]:
+    if (files := agent.files) is None:
+        return
+    text, level, remedy = f"{files.open} of {files.limit} file descriptors are open; ", OK, ""
+    text += f"the last {files.reserved} are kept for the core and the links"
+    if files.problem:
+        problem, _, remedy = files.problem.partition("; ")
+        text, level = f"{problem}; {files.open} are open", FAIL
+    elif files.near:
+        level, remedy = WARN, raise_file_limit(agent.pid)
+    yield Check("files", level, text, remedy, where=agent.name)
 
 
-def read_rp_filter() -> dict[str, int]:
-    """``net.ipv4.conf.NAME.rp_filter`` by name, ``all`` among them; empty where the kernel has none."""
-    found = {}
-    for path in _CONF.glob("*/rp_filter") if _CONF.is_dir() else ():
-        with contextlib.suppress(OSError, ValueError):
-            found[path.parent.name] = int(path.read_text(encoding="ascii"))
-    return found
+def _peers(agent: str, peers: Sequence[PeerInfo]) -> Iterator[Check]:
+    """All results about a few peers; of many peers the problems, and how many have none."""
+    well = Counter[str]()
+    for peer in peers:
+        checks = [*_peer(agent, peer)]
+        bad = [check for check in checks if check.level is not OK]
+        yield from checks if len(peers) <= limits.DOCTOR_PEERS_LISTED else bad
+        well[peer.state] += not bad
+    if len(peers) > limits.DOCTOR_PEERS_LISTED and well.total():
+        states = ", ".join(f"{count:,} {state}" for state, count in well.most_common() if count)
+        yield Check("peer", OK, f"{well.total():,} of {len(peers):,} have no problem: {states}", where=agent)
 
 
-def read_radios(interfaces: Iterable[NetworkInterface]) -> list[Radio]:
-    """The wireless ones of these interfaces that an agent would use, with what their routes say."""
-    found = []
-    for interface in interfaces:
-        if interface.used and interface.networks and (_INTERFACES / interface.name / "phy80211").exists():
-            network = str(interface.networks[0].network)
-            route = ask_program("ip", "-4", "route", "show", network, "dev", interface.name) or ""
-            words = route.partition(" rto_min ")[2].removeprefix("lock ").split()
-            found.append(Radio(interface.name, network, words[0] if words else ""))
-    return found
-
-
-def probe_route(host: str) -> str:
-    """Why the kernel has no route to an address, or an empty string. Sends nothing."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect((host, 9))
-        except OSError as error:
-            return error.strerror or str(error)
-    return ""
-
-
-def probe_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int, str]) -> tuple[Port, ...]:
-    """Try to bind the ports of an agent with these settings.
-
-    Args:
-        settings: The settings.
-        ours: The owners of the ports that agents of this machine have, ready to read.
-        agents: The names of the agents of this machine that answer, by process id.
-    """
-    ports: list[Port] = []
-    if settings.core_mode == "embedded":  # an external core has its port already
-        ports.append(_tcp("the ROS core", settings.core_host, settings.core_port, ours))
-    if settings.port:
-        ports.append(_tcp("the mesh (TCP)", "", settings.port, ours))
-    number = settings.discovery_port
-    try:
-        open_receiver(settings.multicast.group, number).close()
-    except OSError as error:
-        ports.append(Port("beacons (UDP)", number, error.strerror or str(error), program_at(number)))
+def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
+    link, check = peer.link, partial(Check, "peer", where=f"{agent}-{peer.name}")
+    for conflict in peer.conflicts:
+        level = FAIL if peer.state == "conflict" else WARN
+        remedy = "give each module a --name of its own"
+        yield Check.from_message("peer", level, conflict, remedy, f"{agent}-{peer.name}")
+    if peer.state == "relayed":
+        yield check(OK, "relayed: another peer passes on its topics")
+    elif link is None:
+        text = f"{peer.state}: {peer.last_error or 'no TCP connection yet'}"
+        remedy = "see that TCP gets through on both machines: firewall, routes; or do what the text says"
+        yield check(FAIL if peer.state == "refused" else WARN, text, remedy)
     else:
-        ports.append(Port("beacons (UDP)", number, owner=_users(number, agents)))
-    return tuple(ports)
+        rest = ", at rest" if link.rests else ""
+        yield check(OK, f"linked by {link.remote}{rest}, found by {peer.source or 'its link'}")
+        if link.dropped:
+            text = f"{link.dropped} messages were given up, for the link is slower than what it should carry"
+            remedy = "`rmpa peer info` shows of which topics; contracts.md tells what to do (max_rate, priority)"
+            yield check(WARN, text, remedy)
+        if link.clock_offset is not None:
+            yield machine.judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)
 
 
-def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Port:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, number))
-        except OSError as error:
-            owner = ours.get(number, "")
-            return Port(what, number, error.strerror or str(error), owner or program_at(number), ours=bool(owner))
-    return Port(what, number)
+# --- which nodes of a secured module listen beyond this machine: what ROS 1 leaves open (docs/security.md) ----------
 
-
-def _users(number: int, agents: Mapping[int, str]) -> str:
-    """The programs that share a UDP port, ready to read; empty for none."""
-    names: dict[str, None] = {}
-    with contextlib.suppress(psutil.Error, OSError):
-        for connection in psutil.net_connections("udp4"):
-            if connection.laddr and connection.laddr.port == number:
-                names[_name(connection.pid, agents)] = None
-    return " and ".join(names)
-
-
-def _name(pid: int | None, agents: Mapping[int, str]) -> str:
-    if pid is None:
-        return "a program of another user"
-    if pid in agents:
-        return f"agent {agents[pid]}"
-    with contextlib.suppress(psutil.Error):
-        return f"{psutil.Process(pid).name()} (pid {pid})"
-    return f"a program (pid {pid})"
-
-
-@dataclass(frozen=True, slots=True)
-class DoctorInput:
-    """What several checks need, read once.
-
-    Args:
-        environ: The shell's variables.
-        settings: What an agent that is started here would have; the defaults where they cannot be read.
-        settings_checks: The results of reading the settings.
-        agents: The snapshot of each agent of this machine by its name, or why it does not answer.
-        interfaces: All network interfaces.
-        listen: Seconds to listen for multicast packets of other machines; 0: not at all.
-    """
-
-    environ: Mapping[str, str]
-    settings: Settings
-    settings_checks: tuple[Check, ...]
-    agents: Mapping[str, Snapshot | str]
-    interfaces: tuple[NetworkInterface, ...]
-    listen: float = 0.0
-
-    @property
-    def snapshots(self) -> dict[str, Snapshot]:
-        """Of the agents that answer."""
-        return {name: shown for name, shown in self.agents.items() if isinstance(shown, Snapshot)}
-
-
-def look_at(environ: Mapping[str, str], config: str | None = None, listen: float = 0.0) -> DoctorInput:
-    """Read the settings and the interfaces, and ask the agents.
-
-    Args:
-        environ: The shell's variables.
-        config: The settings' file; the usual places by default.
-        listen: Seconds to listen for multicast packets of other machines.
-    """
-    settings, checks = _settings(environ, config)
-    agents: dict[str, Snapshot | str] = {}
-    for found in find_agents(environ):
-        try:
-            with ControlClient(found.path) as client:
-                agents[found.name] = client.snapshot(most=0)  # topics in use
-        except RmpaError as error:
-            agents[found.name] = str(error)
-    return DoctorInput(environ, settings, checks, agents, read_interfaces(settings.interfaces), listen)
-
-
-def _settings(environ: Mapping[str, str], config: str | None) -> tuple[Settings, tuple[Check, ...]]:
-    try:
-        loaded = load_settings({"config": config}, environ, host_name=socket.gethostname())
-    except ConfigError as error:
-        return Settings(), (Check("settings", FAIL, str(error), "`rmpa up` will not start", where=error.source),)
-    settings = loaded.settings
-    where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
-    read = Check("settings", OK, f"{where}: name {settings.name}, domain {settings.domain}")
-    return settings, (read, *(Check("settings", WARN, note) for note in loaded.notes))
-
-
-def examine(given: DoctorInput) -> Iterator[Check]:
-    """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
-    for check in CHECKS.values():
-        yield from check(given)
-
-
-def _interfaces(given: DoctorInput) -> Iterable[Check]:
-    return judge_interfaces(given.interfaces, given.settings.interfaces, container=in_container())
-
-
-def _multicast(given: DoctorInput) -> Iterable[Check]:
-    """Send and receive on each interface that an agent would use, at the agents' own port."""
-    settings = given.settings
-    if not settings.multicast.enabled:
-        return [Check("multicast", SKIPPED, "the settings switch it off (discovery.multicast)")]
-    usable = choose(list_interfaces(), settings.interfaces)
-    try:
-        echoes = hear(usable, settings.multicast.group, settings.discovery_port, given.listen)
-    except StartError as error:
-        return [Check("multicast", FAIL, f"{error.what} {error.problem}", error.remedy)]
-    return judge_multicast(echoes, settings.multicast.group, settings.discovery_port, given.listen)
-
-
-def _radio(given: DoctorInput) -> Iterable[Check]:
-    return judge_radio(read_radios(given.interfaces), quick=repeats_quickly(), bbr=may_use_bbr())
-
-
-def _routes(given: DoctorInput) -> Iterable[Check]:
-    targets = {
-        address.partition(":")[0]: f"{address.partition(':')[0]} ({peer.name})"
-        for snapshot in given.snapshots.values()
-        for peer in snapshot.peers
-        for address in peer.addresses[:1]
-    }
-    names = [seed.host for seed in given.settings.seeds]
-    known = resolve(names)
-    for seed, addresses in known.items():
-        targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
-    found = {text: probe_route(host) for host, text in targets.items()}
-    return judge_routes(found | {f"seed {name}": "the name cannot be resolved" for name in names if not known[name]})
-
-
-def _ports(given: DoctorInput) -> Iterable[Check]:
-    ours, processes = {}, {}
-    for name, snapshot in given.snapshots.items():
-        processes[snapshot.agent.pid] = name
-        core = snapshot.agent.core_uri.rstrip("/").rpartition(":")[2]
-        mesh = snapshot.agent.guid.partition("#")[0].rpartition(":")[2]
-        for number, what in ((core, "the core of agent"), (mesh, "agent")):
-            if number.isdecimal():
-                ours[int(number)] = f"{what} {name}"
-    return judge_ports(probe_ports(given.settings, ours, processes))
-
-
-def _shell(given: DoctorInput) -> Iterable[Check]:
-    host_name, settings = socket.gethostname(), given.settings
-    own = {str(of.ip) for interface in given.interfaces for of in interface.networks}
-    shell = RosShell(
-        environ=given.environ,
-        host_name=host_name,
-        addresses=frozenset({*own, "127.0.0.1"}),
-        resolved=resolve(names_of(given.environ, host_name)),
-        cores={name: snapshot.agent.core_uri for name, snapshot in given.snapshots.items()},
-        domains={name: snapshot.agent.domain for name, snapshot in given.snapshots.items()},
-        answers=_accepts(given.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI),
-        external=(settings.core_master or DEFAULT_MASTER_URI) if settings.core_mode == "external" else "",
-    )
-    return judge_shell(shell)
-
-
-def _accepts(uri: str) -> bool:
-    """Whether TCP connections are accepted at a URI's host and port."""
-    host, port = host_of(uri), uri.rstrip("/").rpartition(":")[2]
-    try:
-        with socket.create_connection((host, int(port)), limits.CONTROL_LOOK_TIMEOUT):
-            return True
-    except (OSError, ValueError, OverflowError):
-        return False
-
-
-def _clock(given: DoctorInput) -> Iterable[Check]:
-    yield from judge_clock(machine.read_clock())
-    for name, shown in given.snapshots.items():
-        yield from judge_sim_time(name, machine.read_sim_time(shown.agent.core_uri))
-
-
-def _rights(given: DoctorInput) -> Iterable[Check]:
-    rights = machine.probe_rights(wanted=given.settings.realtime.enabled, agents=bool(given.snapshots))
-    return judge_rights(rights)
+_LISTED: Final = 5
+_AGENTS_OWN: Final = ("/rmpa", "/rosout")
 
 
 def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
@@ -424,19 +182,105 @@ def _exposed_nodes(given: DoctorInput) -> Iterable[Check]:
         yield Check("exposed nodes", SKIPPED, "no agent runs")
 
 
+def judge_exposed_nodes(
+    agent: str, exposed: Mapping[str, tuple[int, ...]] | None, *, trusted: bool, direct: bool = False
+) -> Check:
+    """Whether other machines reach the nodes of one agent's core past the agent.
+
+    Args:
+        agent: The agent's name.
+        exposed: The TCP ports, beyond loopback, of each node that has some; ``None``: they cannot be read.
+        trusted: Whether the module is in a secured mesh; else nothing is protected, and no ports are listed.
+        direct: Whether the settings allow direct transport.
+    """
+    check = partial(Check, "exposed nodes", where=agent)
+    if not trusted:
+        return check(SKIPPED, "trust is off: the mesh is open too (rmpa trust init)")
+    if exposed is None:
+        return check(SKIPPED, "the core or the kernel does not tell the nodes' ports")
+    if not exposed:
+        return check(OK, "every node listens on loopback alone")
+    listed = [f"{node} ({', '.join(map(str, ports))})" for node, ports in sorted(exposed.items())]
+    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    remedy = (
+        "start them with ROS_IP=127.0.0.1 (roscpp's XML-RPC port stays open), and let a firewall drop what comes "
+        "from outside to them (docs/security.md)"
+    )
+    remedy += "; direct transport needs them open, and crosses the network unprotected" if direct else ""
+    return check(WARN, f"other machines reach {', '.join(listed[:_LISTED])}{more} without any check", remedy)
+
+
+def is_beyond_loopback(address: str) -> bool:
+    """Whether a socket that listens at an address is reached from other machines."""
+    try:
+        return not ip_address(address).is_loopback
+    except ValueError:
+        return True
+
+
+def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] | None:
+    """The TCP ports, beyond loopback, of each node of a core; those of the agent and its proxies are left out.
+
+    A node is found by the port of its slave API; its other ports are those of the same process, where this user may
+    see its descriptors.
+
+    Returns:
+        Ports by node; ``None`` where the core or the kernel does not tell.
+    """
+    try:
+        nodes = asyncio.run(_slave_ports(core_uri))
+        sockets = [
+            (at.laddr.ip, at.laddr.port, at.pid)
+            for at in psutil.net_connections("tcp")
+            if at.laddr and at.status == psutil.CONN_LISTEN
+        ]
+    except (RmpaError, OSError, ValueError, TimeoutError, psutil.Error):
+        return None
+    found = {}
+    for node, port in nodes.items():
+        processes = {pid for _, at, pid in sockets if at == port and pid is not None}
+        its = [(address, at) for address, at, pid in sockets if at == port or pid in processes]
+        ports = {at for address, at in its if is_beyond_loopback(address)}
+        if ports and agent_pid not in processes:
+            found[node] = tuple(sorted(ports))
+    return found
+
+
+async def _slave_ports(core_uri: str) -> dict[str, int]:
+    async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
+        state = (await call_api(core_uri, "getSystemState", machine.CALLER)).value
+        kinds = state if isinstance(state, list) else []
+        rows = [row for kind in kinds if isinstance(kind, list) for row in kind if isinstance(row, list)]
+        names = {str(node) for row in rows if len(row) == 2 and isinstance(row[1], list) for node in row[1]}
+        own = [name for name in names if proxied_peer(name) is None and name not in _AGENTS_OWN]
+        found = {}
+        for name in sorted(own)[: limits.DOCTOR_NODES_MAX]:
+            uri = (await call_api(core_uri, "lookupNode", machine.CALLER, name)).value
+            port = urlsplit(uri).port if isinstance(uri, str) else None
+            if port:
+                found[name] = port
+        return found
+
+
 CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "settings": lambda given: given.settings_checks,
     "agent": lambda given: judge_agents(given.agents, rmpa.__version__),
-    "interface": _interfaces,
-    "multicast": _multicast,
-    "firewall": lambda given: check_firewall(given.settings),
-    "rp_filter": lambda given: judge_rp_filter(read_rp_filter(), given.interfaces),
-    "radio": _radio,
-    "route": _routes,
-    "port": _ports,
-    "ROS": _shell,
-    "clock": _clock,
-    "realtime": _rights,
+    "interface": network.interfaces,
+    "multicast": network.multicast,
+    "firewall": network.firewall,
+    "rp_filter": network.rp_filter,
+    "radio": network.radio,
+    "route": network.routes,
+    "port": network.ports,
+    "ROS": machine.shell,
+    "clock": machine.clocks,
+    "realtime": machine.rights,
     "exposed nodes": _exposed_nodes,
 }
 """All checks, in the order of the output; at least one result of each has its name. Each takes 2 s at most."""
+
+
+def examine(given: DoctorInput) -> Iterator[Check]:
+    """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
+    for check in CHECKS.values():
+        yield from check(given)

@@ -1,29 +1,25 @@
-"""Reads and judges the clock, the rights, the limits and the ROS environment of this machine.
-
-Reads the clock, the rights and the limits of this machine.
-"""
+"""Reads and judges the clock, the rights, the limits and the ROS environment of this machine."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import ctypes
 import os
 import resource
-import shutil
 import socket
-import subprocess
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.limits import KIB
 from rmpa.observe import limits
+from rmpa.observe.doctor.facts import resolve
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
 from rmpa.ros.http.rpc import call_api
@@ -31,163 +27,188 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.process import REMEDY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from rmpa.observe.doctor.facts import DoctorInput
+
+CALLER: Final = "/rmpa_doctor"
+"""The name under which a core is asked."""
+
+# --- clocks ---------------------------------------------------------------------------------------------------------
+
+_UNSYNCHRONISED: Final = 0x40
+"""STA_UNSYNC of adjtimex(2)."""
 
 
-# Runs programs of the system, and asks the resolver, each with a time-out.
+class _Timex(ctypes.Structure):
+    """The beginning of ``struct timex`` (adjtimex(2)), with room for the rest of it."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 512),
+    )
 
 
-def ask_program(*words: str) -> str | None:
-    """What a program prints; ``None`` if it is missing, fails, or takes more than ``limits.DOCTOR_PROGRAM``."""
-    path = shutil.which(words[0], path="/usr/sbin:/sbin:/usr/bin:/bin")
-    if path is None:
-        return None
+def clocks(given: DoctorInput) -> Iterable[Check]:
+    """The check of the wall clock, and of simulated time.
+
+    The wall clock is watched for ``limits.DOCTOR_CLOCK_LOOK``, and the kernel is asked whether it is synchronised.
+    """
+    before = time.time() - time.monotonic()
+    time.sleep(limits.DOCTOR_CLOCK_LOOK)
+    stepped = time.time() - time.monotonic() - before
+    told, synchronised = _Timex(), None
     try:
-        done = subprocess.run(  # noqa: S603 - fixed arguments, and a program of the system's folders
-            [path, *words[1:]],
-            capture_output=True,
-            timeout=limits.DOCTOR_PROGRAM,
-            check=False,
-            stdin=subprocess.DEVNULL,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout[: limits.DOCTOR_OUTPUT_MAX].decode("utf-8", "replace") if done.returncode == 0 else None
+        if ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told)) >= 0:
+            synchronised = not told.status & _UNSYNCHRONISED
+    except (OSError, AttributeError):
+        pass
+    yield from judge_clock(stepped, synchronised, told.maxerror * 1e-6, time.gmtime().tm_year)
+    for name, shown in given.snapshots.items():
+        yield from judge_sim_time(name, read_sim_time(shown.agent.core_uri))
 
 
-def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """The IPv4 addresses of host names; none for a name that is not resolved within ``limits.DOCTOR_NAME``."""
-    found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
-
-    def look(name: str) -> None:
-        with contextlib.suppress(OSError, UnicodeError):
-            found[name] = tuple(dict.fromkeys(str(a[4][0]) for a in socket.getaddrinfo(name, None, socket.AF_INET)))
-
-    # The resolver cannot be interrupted: a thread that still waits ends with the program.
-    threads = [threading.Thread(target=look, args=(name,), daemon=True) for name in found]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(limits.DOCTOR_NAME)
-    return dict(found)
-
-
-# Judges the machine: wall clock, rights for real time, limit of open files.
-
-
-@dataclass(frozen=True, slots=True)
-class WallClock:
-    """The state of the wall clock.
+def judge_clock(stepped: float, synchronised: bool | None, error: float, year: int) -> Iterator[Check]:
+    """Whether time stamps made here can be trusted.
 
     Args:
-        stepped: Seconds by which it moved against the monotonic clock while it was watched.
+        stepped: Seconds by which the wall clock moved against the monotonic clock while it was watched.
         synchronised: Whether it follows another clock (NTP), as the kernel says; ``None`` if it does not say.
         error: The bound of its error, as the kernel says; seconds.
         year: The year that it shows.
     """
-
-    stepped: float
-    synchronised: bool | None
-    error: float
-    year: int
-
-
-def judge_clock(clock: WallClock) -> list[Check]:
-    """Whether time stamps made here can be trusted."""
-    found = []
-    if clock.year < 2020:  # without a battery a board starts in 1970, or at its image's date
-        text = f"it is the year {clock.year} here: this machine has no clock that outlives its power"
-        found.append(Check("clock", FAIL, text, "let chrony or systemd-timesyncd set it", where="date"))
-    if abs(clock.stepped) > limits.DOCTOR_CLOCK_STEP:
-        text = f"the wall clock was set by {clock.stepped * 1e3:+.1f} ms while we looked"
+    clock = partial(Check, "clock")
+    if year < 2020:  # without a battery a board starts in 1970, or at its image's date
+        text = f"it is the year {year} here: this machine has no clock that outlives its power"
+        yield clock(FAIL, text, "let chrony or systemd-timesyncd set it", where="date")
+    if abs(stepped) > limits.DOCTOR_CLOCK_STEP:
+        text = f"the wall clock was set by {stepped * 1e3:+.1f} ms while we looked"
         remedy = "is something setting it again and again? one of chrony, ntpd and timesyncd alone, please"
-        found.append(Check("clock", WARN, text, remedy, where="step"))
+        yield clock(WARN, text, remedy, where="step")
     else:
-        found.append(Check("clock", OK, "runs evenly", where="step"))
-    if clock.synchronised is None:
-        found.append(Check("clock", SKIPPED, "the kernel does not tell", where="synchronised"))
-    elif clock.synchronised:
-        found.append(Check("clock", OK, f"within ±{clock.error * 1e3:.1f} ms, says the kernel", where="synchronised"))
+        yield clock(OK, "runs evenly", where="step")
+    if synchronised is None:
+        yield clock(SKIPPED, "the kernel does not tell", where="synchronised")
+    elif synchronised:
+        yield clock(OK, f"within ±{error * 1e3:.1f} ms, says the kernel", where="synchronised")
     else:
         text = "follows no other clock: stamps of this module drift from those of the others (tf: extrapolation)"
         remedy = "install chrony, and let all modules follow one of them; latencies are right all the same"
-        found.append(Check("clock", WARN, text, remedy, where="synchronised"))
-    return found
+        yield clock(WARN, text, remedy, where="synchronised")
 
 
-def judge_sim_time(agent: str, clocks: Sequence[str] | None) -> list[Check]:
+def judge_sim_time(agent: str, publishers: Sequence[str] | None) -> Iterator[Check]:
     """Whether a module's simulated time runs.
 
     Args:
         agent: Its name.
-        clocks: The nodes that publish ``/clock``; ``None`` if its ``/use_sim_time`` is not set.
+        publishers: The nodes that publish ``/clock``; ``None`` if its ``/use_sim_time`` is not set.
     """
     where = f"simulated time of {agent}"
-    if clocks is None:
-        return []
-    if clocks:
-        return [Check("clock", OK, f"/clock comes from {', '.join(clocks)}", where=where)]
-    text = "/use_sim_time is true, and no node publishes /clock: nodes that start stand still at time 0"
-    return [Check("clock", WARN, text, "start the simulator, or `rosparam delete /use_sim_time`", where=where)]
+    if publishers:
+        yield Check("clock", OK, f"/clock comes from {', '.join(publishers)}", where=where)
+    elif publishers is not None:
+        text = "/use_sim_time is true, and no node publishes /clock: nodes that start stand still at time 0"
+        yield Check("clock", WARN, text, "start the simulator, or `rosparam delete /use_sim_time`", where=where)
+
+
+def read_sim_time(core_uri: str) -> list[str] | None:
+    """The nodes that publish ``/clock`` at a core with ``/use_sim_time``; ``None`` without, or if it is silent."""
+    try:
+        return asyncio.run(_clock_publishers(core_uri))
+    except (RmpaError, TimeoutError):
+        return None
+
+
+async def _clock_publishers(core_uri: str) -> list[str] | None:
+    async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
+        used = await call_api(core_uri, "getParam", CALLER, "/use_sim_time")
+        if used.code != 1 or not used.value:
+            return None
+        match (await call_api(core_uri, "getSystemState", CALLER)).value:
+            case [list(publishers), *_]:
+                found = [row[1] for row in publishers if isinstance(row, list) and row[:1] == ["/clock"]]
+                return [str(node) for nodes in found if isinstance(nodes, list) for node in nodes]
+    return []
 
 
 def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) -> Check:
     """Whether two modules' clocks agree well enough for tf and message filters; both in seconds."""
-    subject = f"{agent}-{peer}"
     bound = f" ±{error * 1e3:.1f} ms" if error is not None else ""
     text = f"{peer}'s clock is {abs(offset) * 1e3:.1f} ms{bound} {'ahead of' if offset > 0 else 'behind'} ours"
-    if abs(offset) - (error or 0.0) > limits.DOCTOR_CLOCK_APART:
-        remedy = "let both follow one clock (chrony); until then tf says 'extrapolation into the future'"
-        return Check("clock", WARN, text, remedy, where=subject)
-    return Check("clock", OK, text, where=subject)
+    if abs(offset) - (error or 0.0) <= limits.DOCTOR_CLOCK_APART:
+        return Check("clock", OK, text, where=f"{agent}-{peer}")
+    remedy = "let both follow one clock (chrony); until then tf says 'extrapolation into the future'"
+    return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")
 
 
-@dataclass(frozen=True, slots=True)
-class KernelRights:
-    """What the kernel allows this user.
+# --- rights for real time, and the limit of open files --------------------------------------------------------------
+
+
+def rights(given: DoctorInput) -> Iterable[Check]:
+    """The check of what the kernel allows this user. SCHED_FIFO is tried in a thread of its own."""
+    refusal = ["it was not tried"]
+
+    def attempt() -> None:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            refusal[0] = ""
+        except OSError as error:
+            refusal[0] = error.strerror or str(error)
+
+    thread = threading.Thread(target=attempt)
+    thread.start()
+    thread.join()
+    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    return judge_rights(
+        refusal[0],
+        None if memlock == resource.RLIM_INFINITY or _may_lock() else memlock,
+        None if given.snapshots else runtime_limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
+        wanted=given.settings.realtime.enabled,
+    )
+
+
+def _may_lock() -> bool:
+    """Whether this process has CAP_IPC_LOCK, which the limit of locked memory does not bind."""
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("CapEff:"):
+            return bool(int(line.split()[1], 16) >> 14 & 1)
+    return False
+
+
+def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: bool) -> Iterator[Check]:
+    """Whether ``rmpa up --realtime`` would get what it asks for, and whether an agent may open enough files.
 
     Args:
         fifo: Why SCHED_FIFO is refused, or empty.
         memlock: Bytes that may be locked in memory; ``None`` for any number.
-        wanted: Whether the settings ask for real time.
         files: Files that a program started here may open; ``None`` where an agent runs, whose snapshot has its own
             limit.
+        wanted: Whether the settings ask for real time.
     """
-
-    fifo: str
-    memlock: int | None
-    wanted: bool
-    files: int | None
-
-
-def judge_rights(rights: KernelRights) -> list[Check]:
-    """Whether ``rmpa up --realtime`` would get what it asks for, and whether an agent may open enough files."""
-    missing = []
-    if rights.fifo:
-        missing.append(f"no SCHED_FIFO ({rights.fifo})")
-    if rights.memlock is not None:
-        missing.append(f"only {rights.memlock // KIB} KiB may be locked in memory")
+    missing = [f"no SCHED_FIFO ({fifo})"] if fifo else []
+    missing += [f"only {memlock // KIB} KiB may be locked in memory"] if memlock is not None else []
     if not missing:
-        found = [Check("realtime", OK, "SCHED_FIFO and locked memory are allowed")]
+        yield Check("realtime", OK, "SCHED_FIFO and locked memory are allowed")
+    elif wanted:
+        yield Check("realtime", WARN, "; ".join(missing), REMEDY)
     else:
-        level = WARN if rights.wanted else OK
-        asked = "" if rights.wanted else "; not asked for (rmpa up --realtime)"
-        found = [Check("realtime", level, "; ".join(missing) + asked, REMEDY if rights.wanted else "")]
-    if rights.files is None:
-        return found
-    if rights.files < limits.DOCTOR_FILES_LOW:
-        text = f"an agent started here may have {rights.files} open: a graph of some hundred nodes takes more"
+        yield Check("realtime", OK, f"{'; '.join(missing)}; not asked for (rmpa up --realtime)")
+    if files is not None and files < limits.DOCTOR_FILES_LOW:
+        text = f"an agent started here may have {files} open: a graph of some hundred nodes takes more"
         remedy = "systemd: LimitNOFILE=65536; a log-in: 'USER - nofile 65536' in /etc/security/limits.d/rmpa.conf"
-        found.append(Check("files", WARN, text, remedy))
-    else:
-        found.append(Check("files", OK, f"an agent started here may have {rights.files} open"))
-    return found
+        yield Check("files", WARN, text, remedy)
+    elif files is not None:
+        yield Check("files", OK, f"an agent started here may have {files} open")
 
 
-# Judges the ROS_* variables of a shell: whether nodes started in it find the module's core, and can be reached.
-
-
-_CHECK: Final = "ROS"
+# --- the ROS_* variables of a shell: whether nodes started in it find the module's core, and can be reached ---------
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,36 +235,44 @@ class RosShell:
     answers: bool | None = None
     external: str = ""
 
+    def addresses_of(self, host: str) -> tuple[str, ...]:
+        """The IPv4 addresses of a host."""
+        return (host,) if _is_address(host) else self.resolved.get(host, ())
+
+    def is_here(self, host: str) -> bool:
+        """Whether a host is this machine."""
+        known = self.addresses_of(host)
+        return bool(known) and all(address in self.addresses or is_loopback(address) for address in known)
+
+
+def shell(given: DoctorInput) -> Iterable[Check]:
+    """The check of the shell's ROS_* variables."""
+    host_name, settings = socket.gethostname(), given.settings
+    own = {str(of.ip) for interface in given.interfaces for of in interface.networks}
+    uri = given.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI
+    try:
+        at = host_of(uri), int(uri.rstrip("/").rpartition(":")[2])
+        socket.create_connection(at, limits.CONTROL_LOOK_TIMEOUT).close()
+        answers = True
+    except (OSError, ValueError, OverflowError):
+        answers = False
+    facts = RosShell(
+        environ=given.environ,
+        host_name=host_name,
+        addresses=frozenset({*own, "127.0.0.1"}),
+        resolved=resolve(names_of(given.environ, host_name)),
+        cores={name: snapshot.agent.core_uri for name, snapshot in given.snapshots.items()},
+        domains={name: snapshot.agent.domain for name, snapshot in given.snapshots.items()},
+        answers=answers,
+        external=(settings.core_master or DEFAULT_MASTER_URI) if settings.core_mode == "external" else "",
+    )
+    return judge_shell(facts)
+
 
 def names_of(environ: Mapping[str, str], host_name: str) -> tuple[str, ...]:
     """The host names that must be resolved before a shell can be judged."""
     names = [host_of(environ.get("ROS_MASTER_URI", "")), environ.get("ROS_HOSTNAME", ""), host_name]
     return tuple(dict.fromkeys(name for name in names if name and not _is_address(name)))
-
-
-def judge_shell(shell: RosShell) -> list[Check]:
-    """The variables that would mislead a node or an agent started in this shell, and those that are right."""
-    found = [*_master(shell), *_own_name(shell), *_domain(shell)]
-    environ = shell.environ
-    if environ.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"):
-        text = "is a variable of older ROS 2 and changes nothing here"
-        remedy = "to keep an agent to this machine: ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or --interface lo"
-        found.append(_check("ROS_LOCALHOST_ONLY", WARN, text, remedy))
-    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    if reach in ("OFF", "LOCALHOST"):
-        what = "sends no beacons at all" if reach == "OFF" else "looks for others on this machine only"
-        text = f"{reach}: an agent that is started in this shell {what}"
-        found.append(_check("ROS_AUTOMATIC_DISCOVERY_RANGE", WARN, text, "unset it, if that is not meant"))
-    if environ.get("ROS_NAMESPACE", "").strip("/"):
-        text = (
-            f"nodes that are started in this shell, and their relative names, live below {environ['ROS_NAMESPACE']}"
-        )
-        found.append(_check("ROS_NAMESPACE", WARN, text, "unset it, if that is not meant"))
-    return found
-
-
-def _check(variable: str, level: CheckLevel, text: str, remedy: str = "") -> Check:
-    return Check(_CHECK, level, text, remedy, where=variable)
 
 
 def _is_address(host: str) -> bool:
@@ -254,200 +283,118 @@ def _is_address(host: str) -> bool:
     return True
 
 
-def _addresses(shell: RosShell, host: str) -> tuple[str, ...]:
-    return (host,) if _is_address(host) else shell.resolved.get(host, ())
+def judge_shell(shell: RosShell) -> Iterator[Check]:
+    """The variables that would mislead a node or an agent started in this shell, and those that are right."""
+    environ, unset = shell.environ, "unset it, if that is not meant"
+    yield _variable("ROS_MASTER_URI", *_master(shell))
+    yield from _own_name(shell)
+    yield from _domain(shell)
+    if environ.get("ROS_LOCALHOST_ONLY", "0") not in ("", "0"):
+        text = "is a variable of older ROS 2 and changes nothing here"
+        remedy = "to keep an agent to this machine: ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or --interface lo"
+        yield _variable("ROS_LOCALHOST_ONLY", WARN, text, remedy)
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    if reach in ("OFF", "LOCALHOST"):
+        what = "sends no beacons at all" if reach == "OFF" else "looks for others on this machine only"
+        text = f"{reach}: an agent that is started in this shell {what}"
+        yield _variable("ROS_AUTOMATIC_DISCOVERY_RANGE", WARN, text, unset)
+    if (namespace := environ.get("ROS_NAMESPACE", "")).strip("/"):
+        text = f"nodes that are started in this shell, and their relative names, live below {namespace}"
+        yield _variable("ROS_NAMESPACE", WARN, text, unset)
 
 
-def _is_here(shell: RosShell, addresses: tuple[str, ...]) -> bool:
-    return bool(addresses) and all(address in shell.addresses or is_loopback(address) for address in addresses)
+def _variable(name: str, level: CheckLevel, text: str, remedy: str = "") -> Check:
+    return Check("ROS", level, text, remedy, where=name)
 
 
-def _master(shell: RosShell) -> list[Check]:
+def _master(shell: RosShell) -> tuple[Any, ...]:
     """ROS_MASTER_URI: where nodes of this shell look for their master."""
-    variable = "ROS_MASTER_URI"
-    given = shell.environ.get(variable, "")
+    given = shell.environ.get("ROS_MASTER_URI", "")
     try:
-        uri = RosEnvironment.read({variable: given}).master_uri
+        uri = RosEnvironment.read({"ROS_MASTER_URI": given}).master_uri.rstrip("/")
     except ConfigError as error:
-        return [_check(variable, FAIL, error.problem, error.remedy)]
-    host, port = host_of(uri), uri.rstrip("/").rpartition(":")[2]
+        return FAIL, error.problem, error.remedy
+    host, port = host_of(uri), uri.rpartition(":")[2]
     said = given or f"{DEFAULT_MASTER_URI} (it is not set)"
-    ours = [name for name, core in shell.cores.items() if core.rstrip("/").rpartition(":")[2] == port]
-    addresses = _addresses(shell, host)
+    cores = {name: core.rstrip("/") for name, core in shell.cores.items()}
+    ours = [name for name, core in cores.items() if core.rpartition(":")[2] == port]
     export = next((f"export ROS_MASTER_URI={core}" for core in shell.cores.values()), "unset ROS_MASTER_URI")
-    if any(core.rstrip("/") == uri.rstrip("/") for core in shell.cores.values()):
-        return [_check(variable, OK, f"{said} is the core of {ours[0]}" if ours else said)]
-    if shell.external and shell.external.rstrip("/") == uri.rstrip("/"):
-        if shell.answers:
-            return [_check(variable, OK, f"{said} is the roscore that `rmpa up` will use")]
-        text = f"{said} does not answer, and is the roscore that `rmpa up` should use"
-        return [_check(variable, WARN, text, "start it: roscore")]
-    if host != "localhost" and not addresses:
-        text = f"{said}: the name {host} cannot be resolved, so nodes of this shell find no master"
-        return [_check(variable, FAIL, text, export)]
-    if host != "localhost" and not _is_here(shell, addresses):
-        text = (
-            f"{said} is another machine ({addresses[0]}): nodes of this shell join its graph, and this module's not"
-        )
-        return [_check(variable, FAIL, text, export)]
+    if uri not in cores.values():
+        if shell.external.rstrip("/") == uri and shell.answers:
+            return OK, f"{said} is the roscore that `rmpa up` will use"
+        if shell.external.rstrip("/") == uri:
+            return WARN, f"{said} does not answer, and is the roscore that `rmpa up` should use", "start it: roscore"
+        if host != "localhost" and not shell.addresses_of(host):
+            text = f"{said}: the name {host} cannot be resolved, so nodes of this shell find no master"
+            return FAIL, text, export
+        if host != "localhost" and not shell.is_here(host):
+            text = f"{said} is another machine ({shell.addresses_of(host)[0]}): nodes of this shell join its graph, "
+            return FAIL, text + "and this module's not", export
     if ours:
-        return [_check(variable, OK, f"{said} is the core of {ours[0]}")]
+        return OK, f"{said} is the core of {ours[0]}"
     if shell.cores:
         listed = ", ".join(f"{name}'s is {core}" for name, core in shell.cores.items())
-        text = f"{said} is not the core of an agent here ({listed})"
-        return [_check(variable, WARN, text, export)]
+        return WARN, f"{said} is not the core of an agent here ({listed})", export
     if shell.answers:
-        text = f"{said} answers, but no agent of ours runs here"
-        return [_check(variable, WARN, text, "end that roscore before `rmpa up`, or let it be the agent's")]
-    return [_check(variable, OK, f"{said}: no master answers there yet; `rmpa up` will be there")]
+        remedy = "end that roscore before `rmpa up`, or let it be the agent's"
+        return WARN, f"{said} answers, but no agent of ours runs here", remedy
+    return OK, f"{said}: no master answers there yet; `rmpa up` will be there"
 
 
-def _own_name(shell: RosShell) -> list[Check]:
+def _own_name(shell: RosShell) -> Iterator[Check]:
     """ROS_HOSTNAME and ROS_IP: the name under which nodes of this shell are to be reached."""
     host_name, ip = shell.environ.get("ROS_HOSTNAME", ""), shell.environ.get("ROS_IP", "")
-    found = []
     if host_name and ip and host_name != ip:
         text = f"both are set, and ROS_HOSTNAME={host_name} counts"
-        found.append(_check("ROS_IP", WARN, text, "unset one of them"))
-    variable, value = ("ROS_HOSTNAME", host_name) if host_name else ("ROS_IP", ip)
+        yield _variable("ROS_IP", WARN, text, "unset one of them")
+    named = partial(_variable, "ROS_HOSTNAME" if host_name else "ROS_IP")
+    value, known = host_name or ip, shell.addresses_of(host_name or ip)
     loopback = "export ROS_IP=127.0.0.1 (nodes talk over loopback; the agent carries what is for others)"
     if not value:
-        return [*found, _host_name(shell, loopback)]
-    if "://" in value:
-        return [*found, _check(variable, FAIL, f"{value} is a URI", f"the host alone; or {loopback}")]
-    if variable == "ROS_IP" and not _is_address(value):
-        return [*found, _check(variable, FAIL, f"{value} is no IPv4 address", loopback)]
-    addresses = _addresses(shell, value)
-    if value != "localhost" and not addresses:
+        yield _variable("host name", *_host_name(shell, loopback))
+    elif "://" in value:
+        yield named(FAIL, f"{value} is a URI", f"the host alone; or {loopback}")
+    elif not host_name and not _is_address(value):
+        yield named(FAIL, f"{value} is no IPv4 address", loopback)
+    elif value != "localhost" and not known:
         text = f"the name {value} cannot be resolved: other nodes of this machine cannot reach those of this shell"
-        return [*found, _check(variable, FAIL, text, loopback)]
-    if value != "localhost" and not _is_here(shell, addresses):
+        yield named(FAIL, text, loopback)
+    elif value != "localhost" and not shell.is_here(value):
         have = ", ".join(sorted(shell.addresses))
         text = f"{value} is not an address of this machine (it has {have}): nodes of this shell cannot be reached"
-        return [*found, _check(variable, FAIL, text, loopback)]
-    return [*found, _check(variable, OK, f"{value} is this machine")]
+        yield named(FAIL, text, loopback)
+    else:
+        yield named(OK, f"{value} is this machine")
 
 
-def _host_name(shell: RosShell, remedy: str) -> Check:
+def _host_name(shell: RosShell, remedy: str) -> tuple[Any, ...]:
     """Without those variables nodes are to be reached under the host's name."""
-    name = shell.host_name
-    addresses = shell.resolved.get(name, ())
+    name, addresses = shell.host_name, shell.resolved.get(shell.host_name, ())
+    told = f"nodes tell others to reach them at {name}"
     if name == "localhost":
-        return _check("host name", OK, "nodes are reached by this machine's address")
+        return OK, "nodes are reached by this machine's address"
     if not addresses:
-        text = f"nodes tell others to reach them at {name}, and that name cannot be resolved"
-        return _check("host name", FAIL, text, f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}")
-    if not _is_here(shell, addresses):
-        text = f"nodes tell others to reach them at {name}, which is said to be {addresses[0]}: not this machine"
-        return _check("host name", FAIL, text, f"correct /etc/hosts, or {remedy}")
-    return _check("host name", OK, f"{name} is this machine ({addresses[0]})")
+        return (
+            FAIL,
+            f"{told}, and that name cannot be resolved",
+            f"put '127.0.1.1 {name}' into /etc/hosts, or {remedy}",
+        )
+    if not shell.is_here(name):
+        return (
+            FAIL,
+            f"{told}, which is said to be {addresses[0]}: not this machine",
+            f"correct /etc/hosts, or {remedy}",
+        )
+    return OK, f"{name} is this machine ({addresses[0]})"
 
 
-def _domain(shell: RosShell) -> list[Check]:
+def _domain(shell: RosShell) -> Iterator[Check]:
     given = shell.environ.get("ROS_DOMAIN_ID", "")
-    if not given:
-        return []
-    if not given.isdecimal() or int(given) > core_limits.DOMAIN_MAX:
+    if given and (not given.isdecimal() or int(given) > core_limits.DOMAIN_MAX):
         text = f"{given!r} is not a domain: `rmpa up` will refuse it"
-        return [_check("ROS_DOMAIN_ID", FAIL, text, f"0 to {core_limits.DOMAIN_MAX}")]
-    others = [f"{name} is in {domain}" for name, domain in shell.domains.items() if domain != int(given)]
-    if others:
+        yield _variable("ROS_DOMAIN_ID", FAIL, text, f"0 to {core_limits.DOMAIN_MAX}")
+    elif others := [f"{name} is in {at}" for name, at in shell.domains.items() if given and at != int(given)]:
         text = f"{given}, but {', '.join(others)}: agents of different domains do not see each other"
-        return [_check("ROS_DOMAIN_ID", WARN, text, "start all modules of a robot with one domain")]
-    return [_check("ROS_DOMAIN_ID", OK, given)]
-
-
-_CALLER: Final = "/rmpa_doctor"
-
-_UNSYNCHRONISED: Final = 0x40
-"""STA_UNSYNC of adjtimex(2)."""
-
-
-class _Timex(ctypes.Structure):
-    """The beginning of ``struct timex`` (adjtimex(2)), with room for the rest of it."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_char * 512),
-    )
-
-
-def read_clock() -> WallClock:
-    """Watch the wall clock for ``limits.DOCTOR_CLOCK_LOOK``, and ask the kernel whether it is synchronised."""
-    before = time.time() - time.monotonic()
-    time.sleep(limits.DOCTOR_CLOCK_LOOK)
-    after = time.time() - time.monotonic()
-    told = _Timex()
-    try:
-        answered: bool = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told)) >= 0
-    except (OSError, AttributeError):
-        answered = False
-    return WallClock(
-        stepped=after - before,
-        synchronised=not told.status & _UNSYNCHRONISED if answered else None,
-        error=told.maxerror * 1e-6,
-        year=time.gmtime().tm_year,
-    )
-
-
-def read_sim_time(core_uri: str) -> list[str] | None:
-    """The nodes that publish ``/clock`` at a core with ``/use_sim_time``; ``None`` without, or if it is silent."""
-    try:
-        return asyncio.run(_clocks(core_uri))
-    except (RmpaError, TimeoutError):
-        return None
-
-
-async def _clocks(core_uri: str) -> list[str] | None:
-    async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
-        used = await call_api(core_uri, "getParam", _CALLER, "/use_sim_time")
-        if used.code != 1 or not used.value:
-            return None
-        match (await call_api(core_uri, "getSystemState", _CALLER)).value:
-            case [list(publishers), *_]:
-                found = [row[1] for row in publishers if isinstance(row, list) and row[:1] == ["/clock"]]
-                return [str(node) for nodes in found if isinstance(nodes, list) for node in nodes]
-    return []
-
-
-def probe_rights(*, wanted: bool, agents: bool) -> KernelRights:
-    """Try SCHED_FIFO in a thread of its own, and read the limits.
-
-    Args:
-        wanted: Whether the settings ask for real time.
-        agents: Whether an agent runs: its snapshot has its own limit of open files.
-    """
-    refusal = ["it was not tried"]
-
-    def attempt() -> None:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-            refusal[0] = ""
-        except OSError as error:
-            refusal[0] = error.strerror or str(error)
-
-    thread = threading.Thread(target=attempt)
-    thread.start()
-    thread.join()
-    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    free = memlock == resource.RLIM_INFINITY or _may_lock()
-    return KernelRights(
-        fifo=refusal[0],
-        memlock=None if free else memlock,
-        wanted=wanted,
-        files=None if agents else runtime_limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
-    )
-
-
-def _may_lock() -> bool:
-    """Whether this process has CAP_IPC_LOCK, which the limit of locked memory does not bind."""
-    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
-        if line.startswith("CapEff:"):
-            return bool(int(line.split()[1], 16) >> 14 & 1)
-    return False
+        yield _variable("ROS_DOMAIN_ID", WARN, text, "start all modules of a robot with one domain")
+    elif given:
+        yield _variable("ROS_DOMAIN_ID", OK, given)

@@ -1,23 +1,19 @@
-"""What ``rmpa why`` is made of: stages, what both ends know, and why a topic is direct or relayed.
-
-What ``rmpa why`` is made of: the stages of a path, and what the agents at its two ends know.
-"""
+"""What ``rmpa why`` is made of: the stages of a path, what the peers tell of it, and transports in words."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.observe.peer_info import FAIL, OK, WARN, Check
+from rmpa.observe.peer_info import FAIL, OK, Check
 from rmpa.trust.permissions import prohibition, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
-    from rmpa.observe.snapshot import RouteInfo, Snapshot, SubscriberTransport
+    from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 
 PERMISSION_THERE: Final = "permission there"
 """The stage of what the publisher's (server's) module lets this one do."""
@@ -97,16 +93,11 @@ def permission_here(peer: str, access: Access, name: str, rule: str) -> Check:
 
 def without_rules(found: Diagnosis) -> Diagnosis:
     """A diagnosis for the peer whose topic it is: whether it may publish, but not by which rule."""
-    return msgspec.structs.replace(
-        found,
-        stages=tuple(_outcome(found, stage) if stage.name == PERMISSION_HERE else stage for stage in found.stages),
-    )
-
-
-def _outcome(found: Diagnosis, stage: Check) -> Check:
-    if stage.level is FAIL:
-        return permission_there(found.to, found.peer, Access.PUBLISH, found.name)
-    return Check(stage.name, OK, f"{found.to} lets {found.peer} publish it")
+    denied = permission_there(found.to, found.peer, Access.PUBLISH, found.name)
+    allowed = Check(PERMISSION_HERE, OK, f"{found.to} lets {found.peer} publish it")
+    ruled = ((stage, stage.name == PERMISSION_HERE) for stage in found.stages)
+    told = (stage if not by_rule else denied if stage.level is FAIL else allowed for stage, by_rule in ruled)
+    return msgspec.structs.replace(found, stages=tuple(told))
 
 
 def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
@@ -173,83 +164,27 @@ class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
     permitted: bool | None = None
 
 
-class SubscriberConnection(msgspec.Struct, frozen=True, kw_only=True):
-    """A local subscriber's connection to a proxy.
+class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
+    """What the server's agent knows of a service; its answer to ``why.service``.
 
     Attributes:
-        number: The proxy's number for the connection.
-        node: The subscriber's name.
-        held: Whether it waits for the header, because the route is not open yet.
-        messages: Messages handed to the connection, including dropped ones.
-        waiting: Bytes in its queue.
-        dropped: Messages dropped because the subscriber read too slowly.
+        node: The node of its module that provides the service; empty if none does.
+        service: The service's name in its own graph.
+        crosses: Whether the policy of its module lets it cross to the agent that asks.
+        rule: The rule that says so.
+        refusal: Why the server did not answer its own agent's probe, or empty.
+        similar: A service of that module with nearly this name, or empty; ``near`` on the wire.
+        permitted: Whether the permissions of its module let the module that asks call it; ``None``: trust is off
+            there. If not, nothing else is told, also not whether there is such a service.
     """
 
-    number: int
-    node: str
-    held: bool = False
-    messages: int = 0
-    waiting: int = 0
-    dropped: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ProxyState:
-    """What the subscribers' agent knows of the proxy for one publisher.
-
-    Args:
-        name: The proxy's name.
-        registered: Whether it is a publisher of the topic in the local graph.
-        permission: The rule by which the module may publish it here, or may not; empty: trust is off.
-        denied: Whether it may not.
-        conflict: Whether the publisher's type differs from that of the local publishers.
-        connections: Those of local subscribers.
-        mismatches: The subscribers that were refused here or at the peer, ready to read.
-    """
-
-    name: str = ""
-    registered: bool = False
-    permission: str = ""
-    denied: bool = False
-    conflict: bool = False
-    connections: tuple[SubscriberConnection, ...] = ()
-    mismatches: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class TopicAtSubscriber:
-    """What the subscribers' agent knows of a topic of one peer.
-
-    Args:
-        snapshot: The agent's, of this topic at least.
-        topic: The topic's name here.
-        carrier: The peer whose link carries it; another one where a relay passes it on.
-        proxies: Those of the peer's publishers, by the publisher's name; ``None`` without a link.
-    """
-
-    snapshot: Snapshot
-    topic: str
-    carrier: str = ""
-    proxies: Mapping[str, ProxyState] | None = None
-
-    def proxy(self, node: str) -> ProxyState:
-        """The proxy for a publisher."""
-        return (self.proxies or {}).get(node, ProxyState())
-
-
-@dataclass(frozen=True, slots=True)
-class BothEnds:
-    """What is known at both ends of a topic's path at one moment.
-
-    Args:
-        here: At the subscribers' agent.
-        there: At the publisher's agent; ``None`` if it did not answer.
-        refusal: Why it did not.
-    """
-
-    here: TopicAtSubscriber
-    there: TopicAtPublisher | None = None
+    node: str = ""
+    service: str = ""
+    crosses: bool = True
+    rule: str = ""
     refusal: str = ""
+    similar: str = msgspec.field(default="", name="near")
+    permitted: bool | None = None
 
 
 # The transport of routes and of their subscribers in words, for the command line, ``rmpa why`` and health. Pure.
@@ -270,12 +205,8 @@ _REMEDIES: Final = {
     "trust": "trust.direct = true in both modules allows it, where the network is trusted (docs/permissions.md)",
 }
 """What a user may do about some of the conditions; the others say it themselves, or pass."""
-REMEDY: Final = "docs/contracts.md explains the conditions"
 UNMEASURED: Final = "not measured: the nodes are connected directly"
 """In place of figures."""
-_STAYS_DIRECT: Final = (
-    "if it stays so, give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
-)
 _WAITS: Final = {
     "asking": "the peer's agent is asked for a direct connection, and its node is tried",
     "direct": "it may connect directly, and has not asked for the topic yet",
@@ -316,9 +247,11 @@ def route_texts(route: RouteInfo) -> list[str]:
     return []
 
 
-def remedy(one: SubscriberTransport) -> str:
+def remedy_for(one: SubscriberTransport) -> str:
     """What to do about a subscriber that is relayed, or has to be."""
-    return _STAYS_DIRECT if one.transport == "direct" else _REMEDIES.get(one.condition, REMEDY)
+    if one.transport == "direct":
+        return "if it stays so, give the agent CAP_NET_ADMIN (docs/systemd.md), or start that subscriber again"
+    return _REMEDIES.get(one.condition, "docs/contracts.md explains the conditions")
 
 
 def misplaced(route: RouteInfo) -> list[SubscriberTransport]:
@@ -334,40 +267,6 @@ def misplaced(route: RouteInfo) -> list[SubscriberTransport]:
     ]
 
 
-# The stages of ``rmpa why`` for subscribers that are connected to the publisher directly. Pure.
-#
-# Their messages do not pass the agents: after the transport there is the connection alone.
-
-
 def connected_directly(route: RouteInfo) -> list[SubscriberTransport]:
     """The subscribers of a route that were answered the publisher's own address."""
     return [one for one in route.subscribers if one.transport == "direct"]
-
-
-def transport(route: RouteInfo) -> Check:
-    """The transport of each subscriber, and by which condition it is relayed. It is never the stage that fails."""
-    text = "; ".join(route_texts(route)) or "relayed"
-    if troubled := misplaced(route):
-        return Check("transport", WARN, text, remedy(troubled[0]))
-    return Check("transport", OK, text)
-
-
-def connection(route: RouteInfo) -> Check:
-    """The direct subscribers of a route; their agent looks each second whether the connections stand."""
-    text = ", ".join(f"{one.node} is connected to {one.endpoint}" for one in connected_directly(route))
-    return Check("connection", OK, f"{text}; {UNMEASURED}")
-
-
-def adrift_stages(link: Check, route: RouteInfo) -> tuple[Check, ...]:
-    """Judge the direct subscribers of a peer whose agent has died: their messages go on without it.
-
-    Args:
-        link: The stage of the link, which fails.
-        route: The route.
-    """
-    text = f"{link.text}; without its agent only what is connected directly goes on"
-    return (
-        Check("link", WARN, text, f"start the agent of {route.peer} again: it takes the direct connections over"),
-        transport(route),
-        connection(route),
-    )

@@ -4,138 +4,48 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.bridge.messages import Source
+from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs
+from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
+from rmpa.core.contract import Reliability
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
-from rmpa.core.identity import is_global_name
+from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.doctor.machine import judge_peer_clock
 from rmpa.observe.operations import WHY as WHY_SITES
-from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check, PeerAgent
+from rmpa.observe.peer_info import FAIL, OK, Check, PeerAgent
 from rmpa.observe.peer_info import INFO as AGENT_INFO
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
-    BothEnds,
     Diagnosis,
+    PublisherReport,
+    ServiceAtServer,
     TopicAtPublisher,
     connected_directly,
-    until_failure,
     without_rules,
 )
-from rmpa.observe.why.services import ServiceAtServer, ServiceEvidence, TopicEvidence, diagnose_service, name_in
-from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
+from rmpa.observe.why.services import ServiceHere, diagnose_module, diagnose_service
+from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic, find_peer, peer_stages
+from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
+    from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.observe.operations import SiteRequests
-    from rmpa.observe.peer_info import LinkInfo, PeerInfo
+    from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.core.external import Core
-
-
-# Why a module is reached or not: the stages from its beacon to what crosses its link, in order.
-#
-# Pure: the snapshot of this agent, and what the peer's agent tells of itself, go in; stages come out::
-#
-#     peer ─ link ─ path ─ lanes ─ answer ─ clock ─ load ─ limits ─ offers
-
-
-_BUSY: Final = 90.0
-"""Percent of a core from which on an agent counts as busy: it has one thread for all messages."""
-_FILES: Final = 0.9
-"""Share of its file descriptors from which on an agent is warned of."""
-
-
-def diagnose_module(snapshot: Snapshot, name: str, told: PeerAgent | None = None, refusal: str = "") -> Diagnosis:
-    """Judge all stages for one module.
-
-    Args:
-        snapshot: This agent's.
-        name: The module's name or GUID.
-        told: What its agent tells of itself; ``None`` if it did not.
-        refusal: Why it did not, ready to read.
-    """
-    own = snapshot.agent
-    if name in (own.name, own.guid, own.guid.partition("#")[0]):
-        here = Check("peer", OK, f"{own.name} is this module ({own.guid}); its agent has answered")
-        return Diagnosis.of((here,), name=own.name, peer=own.name, to=own.name, kind="module")
-    peer = find_peer(snapshot, name)
-    stages = peer_stages(snapshot, name)
-    if peer is not None:
-        stages = until_failure(chain(stages, _further(snapshot, peer, told, refusal)))
-    shown = peer.name if peer is not None else name
-    return Diagnosis.of(stages, name=shown, peer=shown, to=own.name, kind="module")
-
-
-def _further(snapshot: Snapshot, peer: PeerInfo, told: PeerAgent | None, refusal: str) -> Iterator[Check]:
-    link = peer.link
-    if link is not None:
-        yield from _lanes(link)
-        yield _answer(peer, snapshot.agent.version, told, refusal)
-        if link.clock_offset is not None:
-            yield judge_peer_clock(snapshot.agent.name, peer.name, link.clock_offset, link.clock_error)
-        if told is not None:
-            yield from _load(peer.name, told)
-    for bound in peer.beyond:
-        yield Check.from_message("limits", WARN, bound.text)
-    text = f"{peer.name} offers {peer.topics_in} topics, and is offered {peer.topics_out}"
-    if peer.topics_in or peer.state == "relayed":
-        yield Check("offers", OK, text)
-    else:
-        remedy = f"does a node of {peer.name} publish anything? Its [bridge] rules, and the ones here, may deny it"
-        yield Check("offers", WARN, text, remedy)
-
-
-def _lanes(link: LinkInfo) -> Iterator[Check]:
-    for lane in link.lanes:
-        if not lane.connected and not lane.unneeded:
-            text = f"the {lane.name} lane has no connection: {lane.queued} bytes wait"
-            yield Check("lanes", WARN, text, "it is dialled again by itself; is a firewall between the modules?")
-    if link.dropped:
-        text = f"{link.dropped} messages were dropped, because the link is slower than what it should carry"
-        yield Check("lanes", WARN, text, "contracts with max_rate or priority say what may be left out")
-    elif all(lane.connected for lane in link.lanes):
-        yield Check("lanes", OK, f"{len(link.lanes) or 'all'} lanes are connected, nothing was dropped")
-    elif all(lane.connected or lane.unneeded for lane in link.lanes):
-        idle = ", ".join(lane.name for lane in link.lanes if not lane.connected)
-        yield Check("lanes", OK, f"nothing was dropped; the {idle} lane is connected when a message wants it")
-
-
-def _answer(peer: PeerInfo, version: str, told: PeerAgent | None, refusal: str) -> Check:
-    if told is None:
-        return Check(
-            "answer", UNKNOWN, f"the agent of {peer.name} does not tell about itself: {refusal or 'not asked'}"
-        )
-    if told.version != version:
-        text = f"its agent answers, and is of version {told.version or '?'}; this one is of {version}"
-        return Check("answer", WARN, text, "install the same release on both, if something does not work")
-    return Check("answer", OK, f"its agent answers, and is of version {told.version}, as this one")
-
-
-def _load(name: str, told: PeerAgent) -> Iterator[Check]:
-    if told.cpu is not None and told.cpu >= _BUSY:
-        text = f"the agent of {name} uses {told.cpu:.0f} % of a core: messages wait"
-        yield Check(
-            "load", WARN, text, "`rmpa topic hz` there shows what is so much; direct transport relieves agents"
-        )
-    elif told.cpu is not None:
-        yield Check("load", OK, f"the agent of {name} uses {told.cpu:.0f} % of a core")
-    if told.files_open is not None and told.files_limit and told.files_open >= _FILES * told.files_limit:
-        text = f"the agent of {name} has {told.files_open} of {told.files_limit} files open"
-        yield Check("files", WARN, text, "raise its limit: ulimit -n, or LimitNOFILE of its service")
-
+    from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
 
 _T = TypeVar("_T")
 TOPIC: Final = "why.topic"
@@ -156,35 +66,22 @@ class WhyService:
 
     Args:
         name: The module's.
-        core: Its ROS core.
-        bridge: Its bridge.
-        services: The bridge's part for services.
+        parts: The parts of its agent.
         snapshots: Its snapshots.
         sites: Asks gateways for the ways through them.
     """
 
-    def __init__(
-        self,
-        name: str,
-        core: Core,
-        bridge: Bridge,
-        services: Services,
-        snapshots: SnapshotBuilder,
-        sites: SiteRequests,
-    ) -> None:
-        self._core = core
+    def __init__(self, name: str, parts: AgentParts, snapshots: SnapshotBuilder, sites: SiteRequests) -> None:
         self._name = name
-        self._sites = sites
-        self._bridge = bridge
+        self._core, self._bridge, self._services = parts.core, parts.bridge, parts.services
         self._snapshots = snapshots
-        self._topics = TopicEvidence(core, bridge, snapshots)
-        self._services = ServiceEvidence(core, bridge, services)
-        rpc = bridge.rpc
-        rpc.on_request(TOPIC, self._topics.answer, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
-        rpc.on_request(SERVICE, self._services.answer, Needs((Access.CALL,), "the service, and those like it"))
+        self._sites = sites
+        rpc = parts.bridge.rpc
+        rpc.on_request(TOPIC, self._answer_topic, Needs((Access.SUBSCRIBE,), "the topic, and those like it"))
+        rpc.on_request(SERVICE, self._answer_service, Needs((Access.CALL,), "the service, and those like it"))
         rpc.on_request(HERE, self._answer_here, Needs((Access.PUBLISH,), "the topic, which the peer publishes"))
 
-    async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
+    async def answer(self, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
         """The control socket's op ``why``.
 
         Args:
@@ -195,18 +92,14 @@ class WhyService:
         Raises:
             ConfigError: The name is not a ROS name.
         """
-        name, peer = args.get("name"), args.get("peer")
+        name, peer, service = args.get("name"), args.get("peer"), args.get("service") is True
         if isinstance(module := args.get("module"), str) and module:
             return (await self._module(module),)
         if not isinstance(name, str) or not is_global_name(name):
             raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
         wanted = str(peer) if peer is not None else None
-        service = args.get("service") is True
-        if (
-            wanted is not None
-            and "/" in wanted
-            and (ways := await self._through_gateways(name, wanted, service=service))
-        ):
+        of_a_site = wanted is not None and "/" in wanted
+        if of_a_site and (ways := await self._through_gateways(name, wanted, service=service)):
             return ways
         # At once: a peer whose agent hangs holds up both.
         found, ways = await asyncio.gather(
@@ -231,8 +124,7 @@ class WhyService:
         if service or self._is_service(name):
             return await self._service(name, wanted)
         found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
-        failed = found[0].failed
-        if failed is not None and failed.name in _NO_PUBLISHER and not found[0].node:
+        if _has_no_publisher(found[0]) and not found[0].node:
             # No topic has this name anywhere; a service that does not cross may have it.
             calls = await self._service(name, wanted)
             if any(diagnosis.node for diagnosis in calls):
@@ -245,125 +137,167 @@ class WhyService:
     async def _module(self, name: str) -> Diagnosis:
         """A module itself: its link, and what its agent tells."""
         told, refusal = None, ""
-        snapshot = self._snapshots.build(frozenset())
-        found = find_peer(snapshot, name)
-        session = next((s for s in self._bridge.sessions.linked() if found and str(s.link.guid) == found.guid), None)
-        if session is not None:
+        peer = find_peer(self._snapshot(), name)
+        session = self._session(peer) if peer is not None else None
+        if peer is not None and session is not None and session.linked and str(session.link.guid) == peer.guid:
             try:
-                told = msgspec.convert(await self._bridge.rpc.request(session, AGENT_INFO, {}), PeerAgent)
-            except (RmpaError, msgspec.ValidationError) as error:
+                told = await self._ask(session, AGENT_INFO, {}, PeerAgent)
+            except RmpaError as error:
                 refusal = str(error)
-        return diagnose_module(self._snapshots.build(frozenset()), name, told, refusal)
+        return diagnose_module(self._snapshot(), name, told, refusal)
+
+    def _snapshot(self) -> Snapshot:
+        """Of the agent and its peers."""
+        return self._snapshots.build(())
+
+    def _reachable_peers(self) -> list[PeerInfo]:
+        return [peer for peer in self._snapshot().peers if peer.state in _REACHED]
 
     def _is_service(self, name: str) -> bool:
         state = self._core.state()
         if name in state.publishers or name in state.subscribers or any(self._bridge.topics.imports.at(name)):
             return False
-        return name in state.services or self._services.known(name)
+        return name in state.services or any(remote.name == name for _, remote in self._services.imports)
+
+    def _session(self, peer: PeerInfo) -> PeerSession | None:
+        """The session that carries what a peer publishes: its own, or that of the relay that passes it on.
+
+        One without a link stays while a part of the bridge keeps something for the peer.
+        """
+        sessions = sorted(self._bridge.sessions, key=lambda session: not session.linked)
+        fitting = (at for at in sessions if str(at.link.guid) == peer.guid or (peer.via and at.link.name == peer.via))
+        return next(fitting, None)
+
+    def _names(self, peer: str, name: str) -> tuple[str, str]:
+        """The names of a topic or service of a peer here and at the peer.
+
+        A user may write either: a name that nothing of the peer can have here is taken for the peer's own.
+        """
+        names = self._bridge.context.names.of(peer)
+        wires = names.wires_of(name)
+        return (name, wires[0]) if wires else (names.local_name(name), name)
 
     # --- topics of peers --------------------------------------------------------------------------------------
+
+    def _own(self, topic: str) -> list[str]:
+        """The module's own publishers of a topic."""
+        return [node for node in self._core.publishers(topic) if not is_own(node)]
 
     async def _one(self, peer: str, topic: str) -> tuple[Diagnosis, ...]:
         """A topic of one peer; or, where only this module has a publisher, its own topic on its path to that peer."""
         found = await self._arrives(peer, topic)
-        failed = found[0].failed
-        if failed is not None and failed.name in _NO_PUBLISHER and self._topics.own(topic):
-            return await self._leaves(topic, peer)
-        return found
-
-    def _carrier(self, peer: PeerInfo) -> PeerSession | None:
-        """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for session in self._bridge.sessions.linked():
-            if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
-                return session
-        return None
+        return await self._leaves(topic, peer) if _has_no_publisher(found[0]) and self._own(topic) else found
 
     async def _everywhere(self, topic: str) -> tuple[Diagnosis, ...]:
         """All paths of a topic, in and out; where there is none, what is known of it."""
-        peers = self._reachable_peers()
-        own = self._topics.own(topic)
-        coming = [peer.guid for peer in peers if self._offers(peer, topic)]
-        if not coming and not own and not self._adrift(topic):
+        known, own = self._snapshot().peers, self._own(topic)
+        peers = [peer for peer in known if peer.state in _REACHED]
+        coming = [peer.guid for peer in peers if any(self._arrivals(peer, topic))]
+        # Peers whose agent has died while a node of theirs is connected directly to a subscriber here.
+        adrift = [
+            peer.guid
+            for peer in known
+            if peer.state not in _REACHED
+            and any(connected_directly(arrival.route) for _, arrival in self._arrivals(peer, topic))
+        ]
+        if not coming and not own and not adrift:
             # No peer offers it; one may have it, and not let it cross.
-            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
-            told = [(p.guid, e.there) for p, e in zip(peers, known, strict=True) if e.there is not None]
+            ends = zip(peers, await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers)), strict=True)
+            told = [(peer.guid, end.there) for peer, end in ends if end.there is not None]
             coming = [guid for guid, there in told if there.sources]
             coming = coming or [guid for guid, there in told if there.permitted is False]
-        coming += self._adrift(topic)
-        ways = [self._arrives(guid, topic) for guid in coming]
-        to = [peer for peer in peers if own and peer.state == "linked"]
-        ways += [self._leaves(topic, peer.guid) for peer in to]
+        ways = [self._arrives(guid, topic) for guid in (*coming, *adrift)]
+        ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
         return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
 
-    def _reachable_peers(self) -> list[PeerInfo]:
-        return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in _REACHED]
-
-    def _adrift(self, topic: str) -> list[str]:
-        """The peers whose agent has died while a node of theirs is connected directly to a subscriber here."""
-        snapshot = self._snapshots.build(frozenset({topic}))
-        left = {r.peer for t in snapshot.topics for r in t.routes if r.direction == "in" and connected_directly(r)}
-        return [p.guid for p in snapshot.peers if p.name in left and p.state not in _REACHED]
-
-    def _offers(self, peer: PeerInfo, topic: str) -> bool:
-        session = self._carrier(peer)
-        return session is not None and bool(self._topics.here(session, peer, topic).proxies)
-
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
-        here = self._snapshots.build((), peers=False).agent.name
-        if self._topics.own(topic):
+        if self._own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
-            return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
+            return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=self._name, to="")
         state = self._core.state()
         similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers} - {topic})
-        text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
+        text = f"neither {self._name} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = "`rmpa topic list` shows the topics, `rmpa peer list` the modules"
         remedy = f"did you mean {similar}?" if similar else remedy
-        if not linked and (strangers := self._snapshots.build(()).strangers):
+        if not linked and (strangers := self._snapshot().strangers):
             remedy = f"{strangers[0].name} is {strangers[0].last_error}"
-        return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer="", to=here)
+        return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer="", to=self._name)
 
     async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
         """Judge the paths from a peer to here."""
-        peer = find_peer(self._snapshots.build(frozenset()), name)
+        snapshot = self._snapshot()
+        peer = find_peer(snapshot, name)
         if peer is None:
-            return diagnose_topic(BothEnds(self._topics.here(None, None, topic)), name)
-        topic, wire = self._topics.there(peer.name, topic)
-        ends = await self._both_ends(peer, topic)
-        later = None
-        routes = [r for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"]
-        if any(route.state in _MOVING for route in routes):
+            return diagnose_topic(Ends(snapshot, topic, topic), name)
+        topic, _ = self._names(peer.name, topic)
+        ends, later = await self._both_ends(peer, topic), None
+        if any(arrival.route.state in _MOVING for arrival in ends.arrivals.values()):
             # Only a second count shows whether messages flow.
             await asyncio.sleep(observe_limits.WHY_WINDOW)
             later = await self._both_ends(peer, topic)
-        return diagnose_topic(ends, peer.guid, later, wire)
+        return diagnose_topic(ends, peer.guid, later)
 
-    async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
+    async def _both_ends(self, peer: PeerInfo, topic: str) -> Ends:
         """What both ends know now."""
-        session = self._carrier(peer)
-        if session is None:
-            return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
-        _, wire = self._topics.there(peer.name, topic)
-        question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
-        try:
-            there, refusal = await self._ask(session, TOPIC, question, TopicAtPublisher), ""
-        except RmpaError as error:
-            there, refusal = None, str(error)
-        return BothEnds(self._topics.here(session, peer, topic), there, refusal)
+        session, (_, wire) = self._session(peer), self._names(peer.name, topic)
+        there, refusal = None, "it is not linked"
+        if session is not None and session.linked:
+            question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
+            try:
+                there = await self._ask(session, TOPIC, question, TopicAtPublisher)
+            except RmpaError as error:
+                refusal = str(error)
+        subscribers = tuple(node for node in self._core.state().subscribers.get(topic, ()) if not is_own(node))
+        arrivals = dict(self._arrivals(peer, topic))
+        return Ends(self._snapshot(), topic, wire, subscribers, arrivals, there, refusal)
+
+    def _arrivals(self, peer: PeerInfo, topic: str) -> Iterator[tuple[str, Arrival]]:
+        """What is known here of a peer's publishers of a topic, by node."""
+        if (session := self._session(peer)) is None:
+            return
+        topics, facts = self._bridge.topics, self._snapshots.topics
+        publishers, standing = self._core.publishers(topic), dict(session.proxies)
+        facts.follow_clocks()
+        for number, source in list(topics.imports.at(topic)):
+            entry = topics.imports.get(number, source)
+            if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
+                continue
+            node, publication = source.node, topics.of(session).publication(source)
+            name = session.proxies.name(node)
+            links = publication.connections() if publication is not None else ()
+            yield (
+                node,
+                Arrival(
+                    route=facts.incoming(session, source, entry),
+                    proxy=name,
+                    registered=node in standing and publishers.get(name) == standing[node].uri,
+                    cause=entry.cause,
+                    permission=self._permission(session.link.name, entry),
+                    readers={at.number: (printable(at.other), at.waiting, at.dropped) for at in links},
+                    mismatches=topics.mismatches(source),
+                ),
+            )
+
+    def _permission(self, peer: str, entry: RemoteTopic) -> str:
+        """The rule about which modules may publish a peer's topic; empty if trust is off."""
+        if not self._bridge.gate.on:
+            return ""
+        module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
+        return self._bridge.gate.judge(Access.PUBLISH, module, entry.topic, relay=relay).rule
 
     # --- topics of this module -------------------------------------------------------------------------------
 
     async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
         """Have a peer judge the paths from here to it."""
-        snapshot = self._snapshots.build(frozenset())
-        here = snapshot.agent.name
-        begin = peer_stages(snapshot, name)
-        peer = find_peer(snapshot, name)
-        session = self._carrier(peer) if peer is not None else None
-        to = peer.name if peer is not None else name
-        if session is None or session.link.name != to:
-            stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
-            return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
+        snapshot = self._snapshot()
+        begin, peer = peer_stages(snapshot, name), find_peer(snapshot, name)
+        session, to = (self._session(peer), peer.name) if peer is not None else (None, name)
+        if session is None or not session.linked or session.link.name != to:
+            remedy = "ask on its own machine; or try again in a moment"
+            no_link = Check("link", FAIL, f"there is no link to {to} that could be asked", remedy)
+            stages = begin if begin[-1].level is FAIL else (*begin, no_link)
+            return (Diagnosis.of(stages, name=topic, peer=self._name, to=to),)
         question = {"topic": self._bridge.context.names.wire_name(to, topic)}
         try:
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], observe_limits.WHY_TIMEOUT)
@@ -371,48 +305,174 @@ class WhyService:
                 raise RemoteProtocolError("it walked no way at all")
             return found[: observe_limits.WHY_SOURCES_MAX]
         except RmpaError as error:
-            remedy = f"run `rmpa why {here}:{topic}` there"
-            silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
-            return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
+            silent = Check("link", FAIL, f"{to} does not tell: {error}", f"run `rmpa why {self._name}:{topic}` there")
+            return (Diagnosis.of((*begin, silent), name=topic, peer=self._name, to=to),)
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        topic = self._bridge.context.names.local_name(session.link.name, name_in(args, "topic"))
+        topic = self._bridge.context.names.local_name(session.link.name, _name_in(args, "topic"))
         found = await self._arrives(str(session.link.guid), topic)
         return tuple(without_rules(one) for one in found[: observe_limits.WHY_SOURCES_MAX])
+
+    async def _answer_topic(self, session: PeerSession, args: dict[str, Any]) -> TopicAtPublisher:
+        """The reply to ``why.topic``.
+
+        Args:
+            session: The peer that asks.
+            args: ``topic``: its name on the wire; ``instance``: the instance id of its module, if this module only
+                relays it.
+        """
+        wire, instance, asker = _name_in(args, "topic"), args.get("instance") or "", session.link.name
+        names, state, gate = self._bridge.context.names.of(asker), self._core.state(), self._bridge.gate
+        topics = [topic for topic in names.locals_of(wire) if gate.judge(Access.SUBSCRIBE, asker, topic).allowed]
+        if not topics:
+            return TopicAtPublisher(permitted=False)
+        sources: list[PublisherReport] = []
+        subscribers: list[str] = []
+        for topic in topics:
+            nodes = self._relayed(topic, instance) if instance else self._own(topic)
+            sources += [self._report(session, Source(topic, node)) for node in nodes]
+            subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+        known = (topic for topic, nodes in state.publishers.items() if not all(map(is_own, nodes)))
+        similar = "" if sources else await self._similar(asker, Access.SUBSCRIBE, wire, known)
+        return TopicAtPublisher(
+            sources=tuple(sources[: observe_limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: observe_limits.WHY_SOURCES_MAX]),
+            similar=similar,
+            permitted=True if gate.on else None,
+        )
+
+    async def _similar(self, asker: str, access: Access, wire: str, names: Iterable[str]) -> str:
+        """Which of the names of this module, of those that a peer may know, is most like one on the wire."""
+        context, gate = self._bridge.context, self._bridge.gate
+        wire_name = context.services.wire_name if access is Access.CALL else context.names.wire_name
+        allowed = (name for name in yielding_to_data(list(names)) if gate.judge(access, asker, name).allowed)
+        known = {wire_name(asker, name) for name in allowed}
+        # In a thread: comparing thousands of names takes longer than a message may wait.
+        return await asyncio.to_thread(did_you_mean, wire, known) or ""
+
+    def _relayed(self, topic: str, instance: object) -> list[str]:
+        """The proxies of the nodes of a module whose topic this one relays."""
+        offered = self._bridge.topics.exports.offered
+        relayed = ((node, offered.get(Source(topic, node))) for node in self._core.publishers(topic))
+        return [node for node, local in relayed if local and local.origin and local.origin.instance == instance]
+
+    def _report(self, session: PeerSession, source: Source) -> PublisherReport:
+        exports, outbound = self._bridge.topics.exports, self._bridge.topics.outbound
+        local, flow = exports.seen.get(source), outbound.flows.get(source)
+        kind = local.type if local is not None else self._core.type_of(source.topic)
+        decision = exports.decision(session.peer, source)
+        if decision is None:  # it has just come, or cannot be reached
+            decision = self._bridge.context.policy.judge(source.topic, kind, source.node)
+        numbering, contract = outbound.numbering(source, session.peer), exports.contract(source, session.peer)
+        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        lost = self._core.unreachable().get(source.node) if flow is None or not flow.messages else None
+        figures = {} if flow is None else {n: getattr(flow, n) for n in ("messages", "oversized", "oversized_bytes")}
+        return PublisherReport(
+            node=source.node,
+            topic=source.topic,
+            type=kind,
+            crosses=decision.allowed,
+            rule=decision.rule,
+            offered=exports.offer(session.peer, source) is not None,
+            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            dropped=flow.dropped if flow is not None and not reliable else 0,
+            lost=numbering.lost if numbering is not None else 0,
+            beyond=exports.limit if source in exports.beyond else 0,
+            unreachable=f"{lost.api}: {lost.problem}" if lost is not None else "",
+            **figures,
+        )
 
     # --- services ---------------------------------------------------------------------------------------------
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Judge the path of a service from one peer, or from each, to here."""
+        if name is not None:
+            return (await self._calls(name, service),)
         peers = self._reachable_peers()
-        if name is None:
-            carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
-            offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
-            found = await asyncio.gather(
-                *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
-            )
-            served = tuple(diagnosis for diagnosis in found if diagnosis.node)
-            served = served or tuple(diagnosis for diagnosis in found if _is_denied(diagnosis))
-            here = self._snapshots.build((), peers=False).agent.name
-            return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
-        return (await self._calls(name, service),)
+        offering = [peer.guid for peer in peers if self._offers(peer, service)]
+        found = await asyncio.gather(*(self._calls(guid, service) for guid in offering or [p.guid for p in peers]))
+        served = tuple(diagnosis for diagnosis in found if diagnosis.node) or tuple(filter(_is_denied, found))
+        return served or (await self._no_server(service, [peer.name for peer in peers]),)
+
+    def _offers(self, peer: PeerInfo, service: str) -> bool:
+        """Whether a link carries a service of a peer: the link's own peer, or a relayed one."""
+        session = self._session(peer)
+        remote = self._services.imports.get(session.peer, service) if session is not None else None
+        return session is not None and remote is not None and _instance(session, remote.origin) == peer.instance
+
+    async def _no_server(self, service: str, linked: list[str]) -> Diagnosis:
+        """The diagnosis of a service that no peer has."""
+        state = self._core.state()
+        own = [node for node in state.services.get(service, {}) if not is_own(node)]
+        similar = await asyncio.to_thread(did_you_mean, service, {*state.services})
+        text = f"no linked peer ({', '.join(linked) or 'there is none'}) provides {service}"
+        remedy = "`rosservice list` and `rmpa peer list` show what there is"
+        remedy = f"did you mean {similar}?" if similar else remedy
+        if own:
+            text = f"{own[0]} of this module provides {service}; clients here call it without us"
+            remedy = f"whether another module may call it: `rmpa why {self._name}:{service}` over there"
+        stage = Check("server", OK if own else FAIL, text, remedy)
+        return Diagnosis.of((stage,), kind="service", name=service, peer="", to=self._name)
 
     async def _calls(self, name: str, service: str) -> Diagnosis:
-        snapshot = self._snapshots.build(frozenset())
+        snapshot, there, refusal = self._snapshot(), None, ""
         peer = find_peer(snapshot, name)
-        session = self._carrier(peer) if peer is not None else None
-        if peer is None or session is None:
-            return diagnose_service(peer_stages(snapshot, name), snapshot.agent.name, name, service)
-        service, wire = self._topics.there(peer.name, service)
-        there: ServiceAtServer | None = None
-        refusal = ""
+        session = self._session(peer) if peer is not None else None
+        if peer is None or session is None or not session.linked:
+            return diagnose_service(peer_stages(snapshot, name), self._name, name, service)
+        service, wire = self._names(peer.name, service)
         try:
             there = await self._ask(session, SERVICE, {"service": wire}, ServiceAtServer)
         except RmpaError as error:
             refusal = str(error)
-        here = await self._services.here(session, service, wire)
-        begin = peer_stages(snapshot, name)
-        return diagnose_service(begin, snapshot.agent.name, peer.name, service, here, there, refusal)
+        here, begin = await self._service_here(session, service), peer_stages(self._snapshot(), name)
+        return diagnose_service(begin, self._name, peer.name, service, wire, here, there, refusal)
+
+    async def _service_here(self, session: PeerSession, service: str) -> ServiceHere:
+        """What is known here of a service of a peer; its proxy is probed as a client would."""
+        remote = self._services.imports.get(session.peer, service)
+        if remote is None:
+            return ServiceHere()
+        info, shown = self._snapshots.peers_service(session.peer, remote), self._services.shown(remote)
+        if shown is None or shown.proxy is None:
+            return ServiceHere(info, denied=self._services.imports.why_hidden(remote)[1] == DENIED)
+        uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
+        answer, refusal = await _probe(uri, service) if uri else ("", "")
+        return ServiceHere(
+            info, registered=bool(uri), answer=answer, refusal=refusal, mismatched=bool(shown.mismatch)
+        )
+
+    async def _answer_service(self, session: PeerSession, args: dict[str, Any]) -> ServiceAtServer:
+        """The reply to ``why.service``; the server is probed.
+
+        Args:
+            session: The peer that asks.
+            args: ``service``: its name on the wire.
+        """
+        wire, asker = _name_in(args, "service"), session.link.name
+        seen, gate = self._services.exports.seen, self._bridge.gate
+        services = self._bridge.context.names.of(asker).locals_of(wire)
+        services = tuple(service for service in services if gate.judge(Access.CALL, asker, service).allowed)
+        if not services:
+            return ServiceAtServer(permitted=False)
+        for service in services:
+            server = seen.get(service)
+            if server is not None:
+                decision = self._services.exports.decision(session.peer, service)
+                _, refusal = await _probe(server.uri, service)
+                return ServiceAtServer(
+                    node=server.node,
+                    service=service,
+                    crosses=decision is None or decision.allowed,
+                    rule=decision.rule if decision is not None else "",
+                    refusal=refusal,
+                    permitted=True if gate.on else None,
+                )
+            for node in self._core.state().services.get(service, {}):
+                if (found := self._core.unreachable().get(node)) is not None:
+                    refusal = f"it cannot be reached at {found.api} ({found.problem})"
+                    return ServiceAtServer(node=node, service=service, refusal=refusal)
+        return ServiceAtServer(similar=await self._similar(asker, Access.CALL, wire, seen))
 
     async def _ask(
         self,
@@ -429,6 +489,39 @@ class WhyService:
             raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
 
 
+def _instance(session: PeerSession, origin: Any) -> str:
+    """The instance id of the module of an offer that a link brought."""
+    return str(origin.instance) if origin is not None else session.link.identity.instance.hex()
+
+
+def _name_in(args: dict[str, Any], key: str) -> str:
+    """The argument ``key`` of a peer's request, a ROS name.
+
+    Raises:
+        RemoteProtocolError: It is not a ROS name.
+    """
+    name = args.get(key)
+    if not isinstance(name, str) or len(name) > config_limits.CROSSING_NAME_MAX or not is_global_name(name):
+        raise RemoteProtocolError(f"the question names no {key}")
+    return name
+
+
+async def _probe(uri: str, service: str) -> tuple[str, str]:
+    """A server's description of its service, and why there is none; asked as ``rospy.wait_for_service`` does."""
+    try:
+        found = await ServiceConnection.open(
+            uri, service, OWN_NODE, probe=True, persistent=False, timeout=observe_limits.WHY_PROBE
+        )
+    except RmpaError as error:
+        return "", str(error)
+    found.close()
+    return f"{found.description.type}, md5 {found.description.md5sum}", ""
+
+
+def _has_no_publisher(found: Diagnosis) -> bool:
+    return found.failed is not None and found.failed.name in _NO_PUBLISHER
+
+
 def _is_denied(found: Diagnosis) -> bool:
     """Whether a peer tells nothing of a name, because its permissions do not let this module have it."""
     return found.failed is not None and found.failed.name == PERMISSION_THERE
@@ -439,8 +532,3 @@ def _with_calls(found: Diagnosis) -> Diagnosis:
     *walked, last = found.stages
     text = f"{last.text}, nor call it if it is a service"
     return msgspec.structs.replace(found, stages=(*walked, msgspec.structs.replace(last, text=text)))
-
-
-def _no_link(peer: str) -> Check:
-    remedy = "ask on its own machine; or try again in a moment"
-    return Check("link", FAIL, f"there is no link to {peer} that could be asked", remedy)

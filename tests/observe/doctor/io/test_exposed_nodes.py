@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.observe.doctor.agents import exposed_nodes
+from rmpa.observe.doctor.checks import exposed_nodes
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.rpc import call_api
 

@@ -14,8 +14,8 @@ from rmpa.core.errors import StartError
 from rmpa.discovery.discovery import PacketFilter
 from rmpa.discovery.network import Interface, list_interfaces, receive
 from rmpa.observe import limits
-from rmpa.observe.doctor import checks as multicast
-from rmpa.observe.doctor.checks import hear
+from rmpa.observe.doctor import network as multicast
+from rmpa.observe.doctor.network import hear
 
 PORT = 20000 + os.getpid() % 20000
 LO = next(interface for interface in list_interfaces() if interface.name == "lo")
