@@ -1,6 +1,4 @@
-"""Judges snapshots as statuses of ``/diagnostics``, and publishes them.
-
-Judges snapshots: how the agent, its links and the topics that cross them are.
+"""Judges snapshots as statuses of ``/diagnostics``, and publishes them: the agent, its links, what crosses them.
 
 Levels are those of REP 107. STALE marks what existed before and is gone, such as a lost peer and its topics.
 """
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import remedy
 from rmpa.observe import limits
 from rmpa.observe.peer_info import FAIL, OK, STALE, WARN, Check
-from rmpa.observe.why.diagnosis import BY_RULE, misplaced, subscriber_text
+from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import (
     ARRAY_TYPE,
@@ -31,147 +29,136 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.observe.peer_info import CheckLevel, PeerInfo
-    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, SubscriberTransport, TopicInfo
+    from rmpa.observe.snapshot import RouteInfo, SampleSpread, ServiceInfo, Snapshot, TopicInfo
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.core.external import Core
 
 
-# The evidence of each health check: figures as text, their units in the keys, so that rqt can plot them.
+# --- the evidence of each status: figures as text, their units in the keys, so that rqt can plot them ---------------
+
+Values = dict[str, str | float | None]
+"""Figures by their name; what is empty or ``None`` is left out."""
 
 
-def number(value: float | None, scale: float = 1.0) -> str:
-    """Six significant digits; empty for ``None``."""
-    return "" if value is None else f"{value * scale:.6g}"
+def _texts(*values: Values) -> dict[str, str]:
+    """Figures as text, with six significant digits."""
+    found = {name: value for part in values for name, value in part.items() if value not in ("", None)}
+    return {name: f"{value:.6g}" if isinstance(value, float) else str(value) for name, value in found.items()}
+
+
+def _scaled(value: float | None, scale: float = 1.0) -> float | None:
+    return None if value is None else value * scale
+
+
+def _milliseconds(what: str, spread: SampleSpread | None, *fields: str) -> Values:
+    return {} if spread is None else {f"{what} {field} (ms)": getattr(spread, field) * 1e3 for field in fields}
 
 
 def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
     """The agent's own figures, and its counters by name."""
-    agent = snapshot.agent
-    known = {
+    agent, trust, files = snapshot.agent, snapshot.trust, snapshot.agent.files
+    known: Values = {
         "name": agent.name,
         "GUID": agent.guid,
-        "domain": str(agent.domain),
+        "domain": agent.domain,
         "ROS core": agent.core_uri,
         "core memory": agent.core_memory,
         "version": agent.version,
-        "uptime (s)": number(agent.uptime),
-        "CPU (%)": number(agent.cpu),
-        "memory (MB)": number(agent.rss, 1e-6),
-        "open files": str(agent.files.open) if agent.files else "",
-        "limit of open files": str(agent.files.limit) if agent.files else "",
-        "peers": str(len(snapshot.peers)),
-        "linked": str(linked),
-        "proxies": str(agent.proxies),
-        "proxies' listening sockets": str(agent.proxy_sockets),
+        "uptime (s)": agent.uptime,
+        "CPU (%)": agent.cpu,
+        "memory (MB)": _scaled(agent.rss, 1e-6),
+        "open files": files.open if files else None,
+        "limit of open files": files.limit if files else None,
+        "peers": len(snapshot.peers),
+        "linked": linked,
+        "proxies": agent.proxies,
+        "proxies' listening sockets": agent.proxy_sockets,
         "real time": "; ".join(agent.realtime),
-        "certificate (h left)": number(snapshot.trust.expires - snapshot.taken, 1 / 3600) if snapshot.trust else "",
+        "certificate (h left)": (trust.expires - snapshot.taken) / 3600 if trust else None,
     }
-    return _known(known) | {f"count {name}": str(count) for name, count in snapshot.counters.items()}
+    return _texts(known, {f"count {name}": count for name, count in snapshot.counters.items()})
 
 
 def link_values(info: PeerInfo) -> dict[str, str]:
     """The figures of a peer and its link."""
-    known = {"state": info.state, "GUID": info.guid, "address": ", ".join(info.addresses)}
-    link = info.link
-    if link is not None:
+    known: Values = {"state": info.state, "GUID": info.guid, "address": ", ".join(info.addresses)}
+    if (link := info.link) is not None:
         known |= {
-            "up (s)": number(link.up_ago),
-            "heard (ms ago)": number(link.heard_ago, 1e3),
+            "up (s)": link.up_ago,
+            "heard (ms ago)": _scaled(link.heard_ago, 1e3),
             "pace": "at rest" if link.rests else "in use",
-            "round trip (ms)": number(link.rtt, 1e3),
-            "clock offset (ms)": number(link.clock_offset, 1e3),
-            "clock error (± ms)": number(link.clock_error, 1e3),
-            "bytes in": str(link.bytes_in),
-            "bytes out": str(link.bytes_out),
-            "queued (B)": str(link.queued),
-            "dropped": str(link.dropped),
-            "topics in": str(info.topics_in),
-            "topics out": str(info.topics_out),
+            "round trip (ms)": _scaled(link.rtt, 1e3),
+            "clock offset (ms)": _scaled(link.clock_offset, 1e3),
+            "clock error (± ms)": _scaled(link.clock_error, 1e3),
+            "bytes in": link.bytes_in,
+            "bytes out": link.bytes_out,
+            "queued (B)": link.queued,
+            "dropped": link.dropped,
+            "topics in": info.topics_in,
+            "topics out": info.topics_out,
         }
-    for bound in info.beyond:
-        known[f"{bound.kind} hidden here (limit {bound.limit})"] = str(bound.hidden)
-    return _known(known)
+    return _texts(known, {f"{at.kind} hidden here (limit {at.limit})": at.hidden for at in info.beyond})
 
 
 def service_values(info: ServiceInfo) -> dict[str, str]:
     """The figures of a service's calls across the mesh."""
-    known = {
+    known: Values = {
         "node": info.node,
         "state": info.state,
         "type": info.type,
-        "calls": str(info.calls),
-        "failed": str(info.failed),
-        "under way": str(info.active),
+        "calls": info.calls,
+        "failed": info.failed,
+        "under way": info.active,
         "last problem": info.problem,
     }
-    return _known(known | _milliseconds("latency", info.latency, "p50", "p99", "max"))
+    return _texts(known, _milliseconds("latency", info.latency, "p50", "p99", "max"))
 
 
 def route_values(route: RouteInfo) -> dict[str, str]:
     """The figures of one source of a topic."""
-    period, latency = route.period, route.latency
-    known = {
+    known: Values = {
         "node": route.node,
         "type": route.type,
         "state": route.state,
         "transport": route.transport,
         "relayed by": route.condition if route.condition != BY_RULE else "",
         "lane": route.lane,
-        "rate (Hz)": number(route.rate),
-        "bandwidth (B/s)": number(route.bandwidth),
-        "age (s)": number(route.age),
+        "rate (Hz)": route.rate,
+        "bandwidth (B/s)": route.bandwidth,
+        "age (s)": route.age,
+        **_milliseconds("period", route.period, "mean", "sd", "min", "max", "p99"),
+        "jitter (ms)": _scaled(route.jitter, 1e3) if route.period is not None else None,
+        **_milliseconds("latency", route.latency, "p50", "p99", "max", "last"),
+        "latency error (± ms)": route.latency.error * 1e3 if route.latency is not None else None,
+        "waiting": route.kept if route.direction == "out" else None,
     }
-    if period is not None:
-        known |= _milliseconds("period", period, "mean", "sd", "min", "max", "p99")
-        known["jitter (ms)"] = number(route.jitter, 1e3)
-    if latency is not None:
-        known |= _milliseconds("latency", latency, "p50", "p99", "max", "last")
-        known["latency error (± ms)"] = number(latency.error, 1e3)
-    if route.direction == "out":
-        known |= {"waiting": str(route.kept)}
     if route.oversized:
-        known |= {"too long": str(route.oversized), "too long, last (B)": str(route.oversized_bytes)}
+        known |= {"too long": route.oversized, "too long, last (B)": route.oversized_bytes}
     if route.messages or route.dropped or route.lost:
-        counted = ("messages", "lost", "late", "expired", "dropped")
-        known |= {name: str(getattr(route, name)) for name in counted}
-    for one in route.subscribers:
-        known |= _direct_values(one)
-    known |= {f"contract {key}": str(value) for key, value in route.contract.items()}
-    known |= {f"events {kind}": str(count) for kind, count in route.events.items()}
-    return _known(known)
+        known |= {name: getattr(route, name) for name in ("messages", "lost", "late", "expired", "dropped")}
+    for one in connected_directly(route):
+        what = f"direct {one.node}"
+        known |= {f"{what} to": one.endpoint, f"{what} since (s)": one.since_ago}
+        known[f"{what} interruptions"] = one.interruptions or None
+    contract: Values = {f"contract {key}": str(value) for key, value in route.contract.items()}
+    return _texts(known, contract, {f"events {kind}": count for kind, count in route.events.items()})
 
 
-def _direct_values(one: SubscriberTransport) -> dict[str, str]:
-    """What is known of a subscriber that is connected directly."""
-    if one.transport != "direct":
-        return {}
-    known = {"to": one.endpoint, "since (s)": number(one.since_ago), "interruptions": str(one.interruptions or "")}
-    return {f"direct {one.node} {key}": value for key, value in known.items()}
-
-
-def _milliseconds(what: str, spread: SampleSpread | None, *fields: str) -> dict[str, str]:
-    if spread is None:
-        return {}
-    return {f"{what} {field} (ms)": number(getattr(spread, field), 1e3) for field in fields}
-
-
-def _known(values: dict[str, str]) -> dict[str, str]:
-    return {key: value for key, value in values.items() if value}
-
+# --- the judgement --------------------------------------------------------------------------------------------------
 
 HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
 _LINKED: Final = "linked"
-_UNKNOWN: Final = "loss_unknown"
-_LOST, _RESTORED, _DEADLINE = "liveliness_lost", "liveliness_restored", "deadline_missed"
+_LOST, _RESTORED = "liveliness_lost", "liveliness_restored"
+_EVENTS: Final = ("deadline_missed", "loss_unknown")
 _MISSES: Final = {
     "lost": "lost",
     "late": "late",
     "expired": "beyond their lifespan",
     "dropped": "dropped for a slow receiver",
     "oversized": "left out, too long to cross",
-    _UNKNOWN: "times an unknown number lost",
-    _DEADLINE: "deadlines missed",
+    "loss_unknown": "times an unknown number lost",
+    "deadline_missed": "deadlines missed",
 }
 _LEVELS: Final = {
     OK: DiagnosticLevel.OK,
@@ -190,7 +177,7 @@ class Health:
     """Judges snapshots in turn, and compares each with the one before it to find what is new."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, Counter[str]] = {}
+        self._counts: dict[str, Counter[str]] | None = None
         """The counts of the last snapshot, by the check's name."""
         self._linked: dict[str, float] = {}
         """When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``."""
@@ -207,43 +194,53 @@ class Health:
             snapshot: With all topics and services.
             now: Monotonic seconds.
         """
-        counts: dict[str, Counter[str]] = {}
+        before, counts = self._counts, dict[str, Counter[str]]()
+
+        def new(name: str, **present: int) -> Counter[str]:
+            """The counts since the last snapshot; none if that snapshot did not have this check."""
+            counts[name] = Counter(present)
+            return counts[name] - (before or {}).get(name, counts[name])
+
         peers = _by_name(snapshot.peers)
         yield _agent(snapshot)
         for name, info in peers.items():
             if info.state == _LINKED:
                 self._linked[name] = now
                 self._topics[name] = set()
-            counts[name] = Counter(dropped=info.link.dropped if info.link else 0)
-            yield _peer(name, info, self._new(name, counts[name]), was_linked=name in self._linked)
+            dropped = new(name, dropped=info.link.dropped if info.link else 0)["dropped"]
+            level, text = _judge_peer(info, dropped, was_linked=name in self._linked)
+            yield Check(f"rmpa: {name}", level, text, evidence=link_values(info))
         for name, topic, route in _incoming(snapshot.topics):
-            if route.peer not in peers or peers[route.peer].state != _LINKED:
-                continue  # the route waits for its peer: stale, like everything of that peer
-            counts[name] = _missing(route)
-            self._topics.setdefault(route.peer, set()).add(name)
-            level, text = _judge_route(topic, route, self._new(name, counts[name]))
-            yield Check(name, level, text, evidence=route_values(route))
+            if route.peer in peers and peers[route.peer].state == _LINKED:
+                # Else the route waits for its peer: stale, like everything of that peer.
+                missed = {kind: getattr(route, kind) for kind in _MISSES if kind not in _EVENTS}
+                missed |= {kind: route.events.get(kind, 0) for kind in _EVENTS}
+                self._topics.setdefault(route.peer, set()).add(name)
+                level, text = _judge_route(topic, route, new(name, **missed))
+                yield Check(name, level, text, evidence=route_values(route))
         for name, route in _outgoing(snapshot.topics):
             counts[name] = Counter(lost=route.lost, oversized=route.oversized)
-            # The last snapshot did not have this check, so no messages were missed before.
-            before = self._counts.get(name, Counter()) if self._counts else counts[name]
-            yield _sent(name, route, counts[name] - before)
-        yield from _refused(snapshot)
+            # A snapshot that did not have this check had missed no messages.
+            yield _sent(name, route, counts[name] - (counts if before is None else before).get(name, Counter()))
+        for topic in snapshot.topics:  # of a peer's one that does not fit a subscriber, its own check says it
+            if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
+                yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
         for node in snapshot.unreachable:
-            values = {"unreachable for (s)": number(node.ago)}
-            yield Check(f"rmpa: node {node.node}", WARN, str(node), evidence=values)
+            yield Check(
+                f"rmpa: node {node.node}", WARN, str(node), evidence=_texts({"unreachable for (s)": node.ago})
+            )
         for service in snapshot.services:
             if service.calls:
                 name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
                 name += f"service {service.name}"
-                counts[name] = Counter(calls=service.calls, failed=service.failed)
-                yield _service(name, service, self._new(name, counts[name]))
+                called = new(name, calls=service.calls, failed=service.failed)
+                # New failures are one warning, because a server may fail calls on purpose.
+                text = f"{called['failed']} of {called['calls']} calls failed: {service.problem}"
+                if not called["failed"]:
+                    text = f"{called['calls']} calls" + (f", {service.active} under way" if service.active else "")
+                yield Check(name, WARN if called["failed"] else OK, text, evidence=service_values(service))
         yield from self._stale(peers, now)
         self._counts = counts
-
-    def _new(self, name: str, counts: Counter[str]) -> Counter[str]:
-        """The counts since the last snapshot; empty if that snapshot did not have this check."""
-        return counts - self._counts.get(name, counts)
 
     def _stale(self, peers: Mapping[str, PeerInfo], now: float) -> Iterator[Check]:
         """Peers that are gone, and the topics of those that are not linked."""
@@ -255,9 +252,9 @@ class Health:
                 del self._linked[name]
                 self._topics.pop(name, None)
                 continue
-            text = f"{name} is gone" if info is None else f"no link to {name}"
-            values = {"linked before (s)": number(now - last)}
+            text, values = f"no link to {name}", _texts({"linked before (s)": now - last})
             if info is None:
+                text = f"{name} is gone"
                 yield Check(f"rmpa: {name}", STALE, text, evidence=values)
             for topic in sorted(self._topics.get(name, ())):
                 yield Check(topic, STALE, text, evidence=values)
@@ -274,35 +271,29 @@ def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
     return found
 
 
-class _UniqueNames:
-    """Numbers repeated names: ``x``, ``x #2``, ``x #3``."""
-
-    def __init__(self) -> None:
-        self._taken: Counter[str] = Counter()
-
-    def __call__(self, name: str) -> str:
-        self._taken[name] += 1
-        return name if self._taken[name] == 1 else f"{name} #{self._taken[name]}"
+def _numbered(name: str, taken: Counter[str]) -> str:
+    """A name that was not taken before: ``x``, ``x #2``, ``x #3``."""
+    taken[name] += 1
+    return name if taken[name] == 1 else f"{name} #{taken[name]}"
 
 
 def _incoming(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, RouteInfo]]:
     """The routes from peers, each with the unique name of its check."""
     for topic in topics:
         sources = [route for route in topic.routes if route.direction == "in"]
-        several = Counter(route.peer for route in sources)
-        unique = _UniqueNames()
+        several, taken = Counter(route.peer for route in sources), Counter[str]()
         for route in sources:
             node = f" ({route.node})" if several[route.peer] > 1 else ""
-            yield unique(f"rmpa: {route.peer}: {topic.name}{node}"), topic, route
+            yield _numbered(f"rmpa: {route.peer}: {topic.name}{node}", taken), topic, route
 
 
 def _outgoing(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, RouteInfo]]:
     """The routes to peers that miss, or may miss, messages, each with the unique name of its check."""
-    unique = _UniqueNames()
+    taken = Counter[str]()
     for topic in topics:
         for route in topic.routes:
             if route.direction == "out" and (route.state == "away" or route.lost or route.oversized):
-                yield unique(f"rmpa: to {route.peer}: {topic.name} ({route.node})"), route
+                yield _numbered(f"rmpa: to {route.peer}: {topic.name} ({route.node})", taken), route
 
 
 def _sent(name: str, route: RouteInfo, new: Counter[str]) -> Check:
@@ -315,34 +306,6 @@ def _sent(name: str, route: RouteInfo, new: Counter[str]) -> Check:
     return Check(name, level, "; ".join(texts) or "nothing is missed", evidence=route_values(route))
 
 
-def _refused(snapshot: Snapshot) -> Iterator[Check]:
-    """Local topics that do not fit a subscriber elsewhere; a topic of a peer has a check already."""
-    for topic in snapshot.topics:
-        if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
-            yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
-
-
-def _service(name: str, info: ServiceInfo, new: Counter[str]) -> Check:
-    """A service that was called. New failures are one warning, because a server may fail calls on purpose."""
-    if new["failed"]:
-        level, text = WARN, f"{new['failed']} of {new['calls']} calls failed: {info.problem}"
-    else:
-        level, text = OK, f"{new['calls']} calls" + (f", {info.active} under way" if info.active else "")
-    return Check(name, level, text, evidence=service_values(info))
-
-
-def _missing(route: RouteInfo) -> Counter[str]:
-    return Counter(
-        lost=route.lost,
-        late=route.late,
-        expired=route.expired,
-        dropped=route.dropped,
-        oversized=route.oversized,
-        deadline_missed=route.events.get(_DEADLINE, 0),
-        loss_unknown=route.events.get(_UNKNOWN, 0),
-    )
-
-
 def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
@@ -353,19 +316,13 @@ def _agent(snapshot: Snapshot) -> Check:
     return Check(HERE, level, text, evidence=agent_values(snapshot, linked))
 
 
-def _peer(name: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> Check:
-    level, text = _judge_peer(info, new["dropped"], was_linked=was_linked)
-    return Check(f"rmpa: {name}", level, text, evidence=link_values(info))
-
-
 def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[CheckLevel, str]:
     """The worst present state of a peer; ``dropped`` is the number of messages dropped since the last snapshot."""
     link = info.link
     if info.state == _LINKED and link is not None:
         if dropped:
             return WARN, f"{dropped} messages dropped: the link takes them too slowly"
-        troubles = [*info.conflicts, *(bound.text for bound in info.beyond)]
-        if troubles:
+        if troubles := [*info.conflicts, *(bound.text for bound in info.beyond)]:
             return WARN, "; ".join(troubles)
         return OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
     if info.state == "relayed":
@@ -388,20 +345,15 @@ def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple
     if route.problem:
         return WARN, route.problem
     if troubled := misplaced(route):
-        return WARN, "; ".join(subscriber_text(one) for one in troubled)
+        return WARN, "; ".join(map(subscriber_text, troubled))
     deadline = route.contract.get("deadline")
     if isinstance(deadline, float) and route.age is not None and route.age > deadline:
         return WARN, f"no message for {route.age:.3g} s; deadline {deadline:.3g} s"
     if any(new.values()):
         return WARN, ", ".join(f"{count} {_MISSES[kind]}" for kind, count in new.items() if count)
-    return OK, _flowing(route)
-
-
-def _flowing(route: RouteInfo) -> str:
-    direct = [subscriber_text(one) for one in route.subscribers if one.transport == "direct"]
-    if direct and route.transport == "direct":
-        return "; ".join(direct)
-    return "; ".join([_relayed(route), *direct])
+    direct = [*map(subscriber_text, connected_directly(route))]
+    relayed = [] if direct and route.transport == "direct" else [_relayed(route)]
+    return OK, "; ".join((*relayed, *direct))
 
 
 def _relayed(route: RouteInfo) -> str:
