@@ -24,7 +24,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
-from rmpa.observe.control_server import ControlServer, control_access
+from rmpa.observe.control_server import ControlServer, control_group
 from rmpa.observe.health import Diagnostics
 from rmpa.observe.operations import ControlOperations, GraphRevisions, SiteRequests
 from rmpa.observe.peer_info import INFO
@@ -246,7 +246,7 @@ class Agent:
             settings.name,
             handlers,
             counters=counters,
-            access=control_access(settings.control_group),
+            group=control_group(settings.control_group),
         )
 
     async def start(self) -> None:

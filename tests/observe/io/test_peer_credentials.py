@@ -14,13 +14,7 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.observe.control import ControlReply
-from rmpa.observe.control_server import (
-    ControlAccess,
-    ControlServer,
-    PeerCredentials,
-    control_access,
-    peer_credentials,
-)
+from rmpa.observe.control_server import ControlServer, control_group, peer_credentials
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,26 +53,25 @@ def open_to_all(place: Path) -> None:
 def test_the_kernel_tells_user_process_and_groups() -> None:
     one, other = socket.socketpair(socket.AF_UNIX)
     with one, other:
-        assert peer_credentials(one) == PeerCredentials(
-            os.getpid(), os.geteuid(), frozenset({os.getegid(), *os.getgroups()})
-        )
+        groups = frozenset({os.getegid(), *os.getgroups()})
+        assert peer_credentials(one) == (os.getpid(), os.geteuid(), groups)
 
 
-def test_the_agents_user_root_and_the_group_are_served() -> None:
-    access = ControlAccess(1000, 7)
-    assert access.allows(PeerCredentials(1, 1000, frozenset()))
-    assert access.allows(PeerCredentials(1, 0, frozenset()))
-    assert access.allows(PeerCredentials(1, 1001, frozenset({5, 7})))
-    assert not access.allows(PeerCredentials(1, 1001, frozenset({5})))
-    assert not ControlAccess(1000).allows(PeerCredentials(1, 1001, frozenset({7, 1000})))
+def test_the_agents_user_root_and_the_group_are_served(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    server = ControlServer(place, "base", {}, group=7)
+    assert server.serves(1000, frozenset())
+    assert server.serves(0, frozenset())
+    assert server.serves(1001, frozenset({5, 7}))
+    assert not server.serves(1001, frozenset({5}))
+    assert not ControlServer(place, "base", {}).serves(1001, frozenset({7, 1000}))
 
 
 def test_the_group_is_known_by_name_or_number() -> None:
-    here = grp.getgrgid(0)
-    assert control_access(here.gr_name).group == control_access("0").group == 0
-    assert control_access("") == ControlAccess(os.geteuid())
+    assert control_group(grp.getgrgid(0).gr_name) == control_group("0") == 0
+    assert control_group("") is None
     with pytest.raises(StartError, match=r"no group 'robotz'; make it \(sudo groupadd robotz\), or change group"):
-        control_access("robotz")
+        control_group("robotz")
 
 
 @as_root
@@ -104,7 +97,7 @@ async def test_users_of_the_group_get_in(place: Path) -> None:
     for above in place.parents:
         if str(above) not in ("/", "/tmp"):
             above.chmod(above.stat().st_mode | 0o011)
-    server = ControlServer(place, "base", {"echo": lambda args: args}, access=ControlAccess(0, GROUP))
+    server = ControlServer(place, "base", {"echo": lambda args: args}, group=GROUP)
     await server.start()
     try:
         assert place.stat().st_mode & 0o777 == 0o750
