@@ -23,17 +23,19 @@ async def eventually(condition: Callable[[], object], seconds: float = 20.0) -> 
             await asyncio.sleep(0.005)
 
 
-def fits(expression: str, key: str) -> bool:
-    """Whether a key expression with ``*`` and ``**`` matches a key."""
-    return _fits(expression.split("/"), key.split("/"))
+def fits(one: str, other: str) -> bool:
+    """Whether two key expressions with ``*`` and ``**`` intersect."""
+    return _fit(one.split("/"), other.split("/"))
 
 
-def _fits(parts: list[str], key: list[str]) -> bool:
-    if not parts:
-        return not key
-    if parts[0] == "**":
-        return _fits(parts[1:], key) or (bool(key) and _fits(parts, key[1:]))
-    return bool(key) and parts[0] in ("*", key[0]) and _fits(parts[1:], key[1:])
+def _fit(one: list[str], other: list[str]) -> bool:
+    if not one or not other:
+        return all(chunk == "**" for chunk in (*one, *other))
+    if one[0] == "**":
+        return _fit(one[1:], other) or _fit(one, other[1:])
+    if other[0] == "**":
+        return _fit(other, one)
+    return (one[0] == other[0] or "*" in (one[0], other[0])) and _fit(one[1:], other[1:])
 
 
 @dataclass
@@ -150,6 +152,8 @@ class MemoryZenoh:
 class MemorySession:
     """One session; ``close`` ends it as the end of its process would."""
 
+    endpoints: tuple[str, ...] = ("tcp/192.0.2.1:7447",)
+
     def __init__(self, network: MemoryZenoh, zid: str) -> None:
         self.network, self.zid = network, zid
 
@@ -207,8 +211,9 @@ class MemorySession:
         del all_complete, priority
         loop = asyncio.get_running_loop()
         queries = []
-        for entry in [entry for entry in self.network.queryables if fits(selector, entry.key)]:
-            query = MemoryQuery(entry.key, bytes(payload), attachment, loop.create_future())
+        key, _, parameters = selector.partition("?")
+        for entry in [entry for entry in self.network.queryables if fits(key, entry.key)]:
+            query = MemoryQuery(key, bytes(payload), attachment, loop.create_future(), parameters)
             queries.append(query)
             self.network.soon(self.network.queryables, entry, query)
         if queries:

@@ -1,20 +1,21 @@
-"""Topics and services of a neighbour in the gateway's graph, and taps that listen to the gateway's own.
-
-A service of a neighbour in the gateway's graph.
-"""
+"""Topics and services of a neighbour in the gateway's graph, and taps that listen to the gateway's own."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import logging
-from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import service_place
+from rmpa.bridge.messages import Origin, Source, is_crossing_name, is_crossing_type
+from rmpa.bridge.policy import OUTSIDE_GUID, is_outside, service_place
+from rmpa.bridge.proxies import PeerProxies
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import peer_name_problem
+from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
@@ -23,111 +24,345 @@ from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, printable
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.bridge.messages import Origin
-    from rmpa.bridge.policy import Relay
-    from rmpa.bridge.proxies import PeerProxies
-    from rmpa.gateway.neighbour import ForeignSource, MeshSource
-    from rmpa.ros.core.external import Core
+    from rmpa.agent.agent import Agent
+    from rmpa.gateway.neighbour import MeshSource, SourceKey
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription
 
-
-# What a foreign topic and service share in the gateway's graph: its proxy node, or why it has none.
-
-
 _log = logging.getLogger(__name__)
+_INSTANCE_LABEL: Final = b"rmpa site 1"
+_PREFIX: Final = LENGTH.size
 
 
-class ProxiedSource(ABC):
-    """A foreign source in the gateway's graph.
+def foreign_origin(source: ForeignSource) -> Origin:
+    """The origin with which the relay offers a neighbour's source; its path is empty.
+
+    The instance of a site is the same in all gateways that reach it. The node is ``/<module>/<node>``, or ``/<node>``
+    where there is no module.
+    """
+    digest = hashlib.sha256(_INSTANCE_LABEL + source.site.encode()).digest()
+    node = f"/{source.module}{source.node}" if source.module else source.node
+    return Origin(source.site, OUTSIDE_GUID, digest[: core_limits.INSTANCE_ID_BYTES].hex(), node, ())
+
+
+class ForeignSite:
+    """What one site, or ROS 2, has in the gateway's graph; of sources of one node and name the first is shown.
+
+    Args:
+        agent: The gateway's agent.
+        source: A source of it.
+        number: Its number in the relay: negative, for no peer has such a one.
+    """
+
+    def __init__(self, agent: Agent, source: ForeignSource, number: int) -> None:
+        origin = foreign_origin(source)
+        bad = peer_name_problem(source.site)
+        prefix = "" if bad else agent.bridge.sessions.reserved_name(origin)[: -len(origin.node)]
+        self.agent: Final = agent
+        self.core: Final = agent.core
+        self.relay: Final = agent.bridge.relay
+        self.number: Final = number
+        self.proxies: Final = PeerProxies(prefix, agent.bridge.proxy_nodes)
+        self.shown: dict[SourceKey, list[ProxiedSource]] = {}
+        """By kind, name here, and proxy; the first one of several is in the graph."""
+        self._instance = origin.instance
+
+    def key(self, source: ForeignSource) -> SourceKey:
+        """Kind, name here, and proxy of a source."""
+        return source.kind, source.name, self.proxies.name(foreign_origin(source).node)
+
+    def show(self, one: ProxiedSource) -> None:
+        """Put a source into the graph, or have it wait until its name is free."""
+        if problem := _name_problem(one.source):
+            one.refused = problem
+            return
+        if not self.shown:
+            self._reach(reached=True)
+        same = self.shown.setdefault(self.key(one.source), [])
+        same.append(one)
+        if len(same) == 1:
+            one.begin()
+
+    def hide(self, one: ProxiedSource) -> None:
+        """Forget a source that is closed; the next of its name takes its place."""
+        key = self.key(one.source)
+        same = self.shown.get(key, [])
+        if one not in same:
+            return
+        first = same[0] is one
+        same.remove(one)
+        if same and first:
+            same[0].begin()
+        elif not same:
+            del self.shown[key]
+            if not self.shown:
+                self._reach(reached=False)
+
+    def module_with(self, service: str) -> str:
+        """The module of this mesh that has a service of this name; empty if there is none."""
+        imports = self.agent.services.imports
+        found = imports.shown(service)
+        if found is None or (found.origin is not None and is_outside(found.origin)):
+            return ""
+        return imports.peer_name(found.peer)
+
+    def _reach(self, *, reached: bool) -> None:
+        """Hide, or show, what other gateways of this site bring from there: this gateway has its own way."""
+        self.agent.bridge.topics.reached_here(self._instance, reached=reached)
+        self.agent.services.reached_here(self._instance, reached=reached)
+
+
+def _name_problem(source: ForeignSource) -> str:
+    """Why a foreign source cannot be in a graph of ROS 1, or empty."""
+    if problem := peer_name_problem(source.site):
+        return f"site {source.site[:64]!r}: {problem}"
+    for name in (foreign_origin(source).node, source.name):
+        if not is_crossing_name(name):
+            return f"{name[:64]!r} is not a global name of ROS, or too long"
+    if source.kind is SourceKind.TOPIC and not is_crossing_type(source.type):
+        return f"{source.type[:64]!r} is not a message type of ROS 1"
+    return ""
+
+
+class ProxiedSource:
+    """A foreign source in the gateway's graph: what topics and services share.
 
     Args:
         source: The source.
-        origin: The origin to offer it with.
-        number: The number of its site in the relay.
-        core: The gateway's core.
-        relay: Offers it to the modules.
-        proxies: The proxies of its site.
-        on_closed: Called once it is closed.
+        site: Its site, whose proxies it stands at.
     """
 
-    def __init__(
-        self,
-        source: ForeignSource,
-        origin: Origin,
-        number: int,
-        *,
-        core: Core,
-        relay: Relay,
-        proxies: PeerProxies,
-        on_closed: Callable[[], None],
-    ) -> None:
+    def __init__(self, source: ForeignSource, site: ForeignSite) -> None:
         self.source = source
-        self._origin = origin
-        self._number = number
-        self._core = core
-        self._relay = relay
-        self._proxies = proxies
-        self._on_closed = on_closed
+        self.refused = "another source of this node has its name here"
+        """Why it is not in the graph; empty if it is."""
+        self._site = site
+        self._origin = foreign_origin(source)
         self._key = f"{source.kind.name} {source.name}"
+        self._place = service_place(source.name, "") if source.kind is SourceKind.SERVICE else (source.name, "")
+        self._offered = Source(self._place[0], site.proxies.name(self._origin.node))
         self._node: SlaveNode | None = None
         self._begun = False
-        self._refused = "another source of this node has its name here"
         self._mismatch = ""
         self._closed = False
 
     def begin(self) -> None:
         """Put it into the graph, in a later turn of the loop."""
         self._begun = True
-        self._refused = ""
-        self._proxies.hold(self._origin.node, self._key, self._ready, self._left)
-
-    def refuse(self, text: str) -> None:
-        """Say why it cannot be in the graph."""
-        self._refused = text
+        self.refused = ""
+        self._site.proxies.hold(self._origin.node, self._key, self._ready, self._left)
 
     @property
     def problem(self) -> str:
         """Why it is not in the graph, or not understood by its subscribers or clients; empty for nothing."""
-        return self._refused or self._proxies.problems.get(self._origin.node, "") or self._mismatch
+        return self.refused or self._site.proxies.problems.get(self._origin.node, "") or self._mismatch
+
+    def reconcile(self) -> None:
+        """Register it if the core has lost it, or if its name has become free."""
+        state, node = self._site.core.state(), self._node
+        of_topic = self.source.kind is SourceKind.TOPIC
+        names, uri = (
+            (state.publishers, node and node.uri) if of_topic else (state.services, node and node.service_uri)
+        )
+        if node is not None and names.get(self.source.name, {}).get(node.name) != uri:
+            self._register()
 
     def close(self) -> None:
         """Take it out of the graph in a later turn of the loop; what its users wait for ends now."""
-        if self._closed:
-            return
-        self._closed = True
-        self._withdraw()
-        if self._begun:
-            self._proxies.release(self._origin.node, self._key)
-        self._on_closed()
+        if not self._closed:
+            self._closed = True
+            self._withdraw()
+            if self._begun:
+                self._site.proxies.release(self._origin.node, self._key)
+            self._site.hide(self)
 
-    def _registered(self, node: SlaveNode, code: int, status: str) -> None:
-        """Take in the core's answer to a registration."""
-        self._refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
-        if self._refused:
-            _log.error("! %s of %s: %s", self.source.name, node.name, self._refused)
-
-    @abstractmethod
-    def _withdraw(self) -> None:
-        """End what subscribers or clients have of it."""
-
-    @abstractmethod
     def _ready(self, node: SlaveNode) -> None:
         """Its proxy node is in the graph: show the source there."""
+        self._node = node
+        self._site.relay.shown(self._site.number, self._offered, (self._place[0], node.name), self._origin)
+        self._attach(node)
+        self._register()
 
-    @abstractmethod
     def _left(self, node: SlaveNode) -> None:
         """Take the source out of the graph: its proxy node leaves."""
+        self._node = None
+        self._detach(node)
+        self._site.relay.gone(self._site.number, self._offered)
+
+    def _call(self, method: str, node: SlaveNode, *args: str) -> None:
+        """Register it with the core; what the core says against it is its problem."""
+        code, status, _ = self._site.core.call(method, node.name, self.source.name, *args)
+        self.refused = "" if code == 1 else f"the gateway's core does not take it: {status}"
+        if self.refused:
+            _log.error("! %s of %s: %s", self.source.name, node.name, self.refused)
+
+    def _withdraw(self) -> None:
+        """End what subscribers or clients have of it."""
+        raise NotImplementedError
+
+    def _attach(self, node: SlaveNode) -> None:
+        raise NotImplementedError
+
+    def _register(self) -> None:
+        raise NotImplementedError
+
+    def _detach(self, node: SlaveNode) -> None:
+        raise NotImplementedError
 
 
-# Subscriptions of the gateway to the topics of its own graph.
+class ProxiedTopic(ProxiedSource, PublicationEvents):
+    """A foreign topic in the gateway's graph; until ``describe`` its subscribers wait.
+
+    Args:
+        source: The topic.
+        site: Its site.
+        on_demand: ``(wanted)``: a first subscriber has come, or the last one has left.
+    """
+
+    def __init__(self, source: ForeignSource, site: ForeignSite, on_demand: Callable[[bool], None]) -> None:
+        super().__init__(source, site)
+        self._on_demand = on_demand
+        self._wanted = False
+        self._publication = Publication(source.name, self._offered.node, events=self)
+
+    def describe(self, description: TopicDescription) -> None:
+        """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
+        if self._publication.describe(description) and not self._closed:
+            for delay in bridge_limits.CALL_BACK_DELAYS:
+                asyncio.get_running_loop().call_later(delay, self._register)
+
+    def publish(self, body: Buffer) -> int:
+        """Send one message without its length; return the messages dropped for slow subscribers."""
+        size = len(body)
+        if size <= core_limits.CUT_THROUGH_BYTES:
+            return self._publication.publish_framed(LENGTH.pack(size) + body)
+        before = self._publication.dropped
+        self._publication.begin(LENGTH.size + size)
+        self._publication.extend(LENGTH.pack(size))
+        self._publication.extend(body)
+        return self._publication.dropped - before
+
+    def forget_latched(self) -> None:
+        """Drop the latched message: its publisher is gone."""
+        self._publication.forget_latched()
+
+    def first_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._demand(wanted=True)
+
+    def last_subscriber(self) -> None:
+        """Of ``PublicationEvents``."""
+        self._demand(wanted=False)
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        """Of ``PublicationEvents``."""
+        self._mismatch = f"{printable(fields.get('callerid', ''))}: {text}"
+
+    def _demand(self, *, wanted: bool) -> None:
+        if wanted != self._wanted and not self._closed:
+            self._wanted = wanted
+            self._on_demand(wanted)
+
+    def _withdraw(self) -> None:
+        self._publication.withdraw()
+
+    def _attach(self, node: SlaveNode) -> None:
+        node.add_publication(self._publication)
+
+    def _register(self) -> None:
+        if self._node is not None:
+            self._call("registerPublisher", self._node, self.source.type, self._node.uri)
+
+    def _detach(self, node: SlaveNode) -> None:
+        self._site.core.call("unregisterPublisher", node.name, self.source.name, node.uri)
+        node.remove_publication(self.source.name)
 
 
-_PREFIX = LENGTH.size
+class ProxiedService(ProxiedSource):
+    """A foreign service in the gateway's graph; calls under way get an error once it is closed.
+
+    A graph has one server of each service: while another node has its name, it waits, and ``problem`` says so.
+
+    Args:
+        source: The service.
+        site: Its site.
+        serve: Awaited with each request for its response.
+        describe: Awaited for the service's type.
+    """
+
+    def __init__(
+        self,
+        source: ForeignSource,
+        site: ForeignSite,
+        serve: Callable[[bytes], Awaitable[bytes]],
+        describe: Callable[[], Awaitable[ServiceDescription]],
+    ) -> None:
+        super().__init__(source, site)
+        self._serve = serve
+        self._calls: set[asyncio.Task[None]] = set()
+        timeout = site.agent.bridge.context.services.timeout(source.name)
+        self._endpoint = ServiceEndpoint(
+            source.name,
+            self._offered.node,
+            self._called,
+            describe,
+            timeout=timeout,
+            on_mismatch=self._mismatched,
+        )
+
+    def make_room(self) -> None:
+        """Leave the name to a module's service, until that one has gone."""
+        if self._node is not None and self._site.module_with(self.source.name):
+            self._unregister(self._node)
+            self._register()
+
+    def _called(self, call: ServiceCall) -> None:
+        task = asyncio.get_running_loop().create_task(self._answer(call), name=f"call {self.source.name}")
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+        call.on_gone = lambda: task.cancel() and None
+
+    async def _answer(self, call: ServiceCall) -> None:
+        try:
+            call.reply(True, await self._serve(bytes(call.request)))
+        except RmpaError as error:
+            call.fail(str(error))
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! service %s of %s failed", self.source.name, self.source.site)
+            call.fail(f"service [{self.source.name}]: the gateway failed at this call; its log says why")
+
+    def _mismatched(self, _fields: Mapping[str, str], text: str) -> None:
+        self._mismatch = text
+
+    def _withdraw(self) -> None:
+        self._endpoint.withdraw(f"service [{self.source.name}] of {self.source.site} has gone")
+        for task in self._calls:
+            task.cancel()
+
+    def _attach(self, node: SlaveNode) -> None:
+        node.add_service(self._endpoint)
+
+    def _register(self) -> None:
+        node, name = self._node, self.source.name
+        if node is None:
+            return
+        servers = self._site.core.state().services.get(name, {})
+        if other := next((one for one in servers if one != node.name), "") or self._site.module_with(name):
+            self.refused = f"{other} has a service of this name here"
+        else:
+            self._call("registerService", node, node.service_uri, node.uri)
+
+    def _unregister(self, node: SlaveNode) -> None:
+        self._site.core.call("unregisterService", node.name, self.source.name, node.service_uri)
+
+    def _detach(self, node: SlaveNode) -> None:
+        self._unregister(node)
+        node.remove_service(self.source.name)
 
 
+@dataclass(eq=False, slots=True)
 class TopicTap:
     """A subscription to one topic of one node; it reconnects until it is closed or the source is gone.
 
@@ -142,30 +377,18 @@ class TopicTap:
         on_closed: Called once it is closed.
     """
 
-    def __init__(
-        self,
-        source: MeshSource,
-        caller_id: str,
-        number: Callable[[], int],
-        find: Callable[[str, str, str], Publication | None],
-        *,
-        on_message: Callable[[memoryview], None],
-        on_described: Callable[[TopicDescription], None],
-        on_lost: Callable[[str], None],
-        on_closed: Callable[[TopicTap], None],
-    ) -> None:
-        self.source = source
-        self._caller_id = caller_id
-        self._number = number
-        self._find = find
-        self._on_message = on_message
-        self._on_described = on_described
-        self._on_lost = on_lost
-        self._on_closed = on_closed
-        self.connection: TopicConnection | None = None
-        """The connection to the publisher; ``None`` while its address is not known."""
-        self._description: TopicDescription | None = None
-        self._closed = False
+    source: MeshSource
+    caller_id: str
+    number: Callable[[], int]
+    find: Callable[[str, str, str], Publication | None]
+    on_message: Callable[[memoryview], None]
+    on_described: Callable[[TopicDescription], None]
+    on_lost: Callable[[str], None]
+    on_closed: Callable[[TopicTap], None]
+    connection: TopicConnection | None = None
+    """The connection to the publisher; ``None`` while its address is not known."""
+    _description: TopicDescription | None = field(default=None, init=False)
+    _closed: bool = field(default=False, init=False)
 
     @property
     def description(self) -> TopicDescription | None:
@@ -186,263 +409,39 @@ class TopicTap:
             connection.close()
             self.connection = None
             if connection.uri != uri:
-                self._on_lost("its node is at another address now" if uri else "its node has gone")
+                self.on_lost("its node is at another address now" if uri else "its node has gone")
         if uri and not self._closed:
             self._connect(uri)
 
+    def close(self) -> None:
+        """Disconnect; no callback is called afterwards."""
+        if not self._closed:
+            self._closed = True
+            if self.connection is not None:
+                self.connection.close()
+            self.on_closed(self)
+
     def _connect(self, uri: str) -> None:
-        on_message, here, proxy = self._on_message, self.source.here, self.source.proxy
+        on_message, source = self.on_message, self.source
 
         def find() -> Callable[[InProcessConnection], None] | None:
-            publication = self._find(proxy, uri, here)
+            publication = self.find(source.proxy, uri, source.here)
             return publication.attach if publication is not None else None
 
         kind = PublisherConnection if find() is None else InProcessConnection
         self.connection = kind(
-            here,
+            source.here,
             uri,
-            self._caller_id,
+            self.caller_id,
             on_message=lambda framed: on_message(framed[_PREFIX:]),
             on_header=self._described,
-            on_refused=self._refused,
-            on_lost=self._on_lost,
-            number=self._number(),
+            on_refused=lambda text: self.on_lost(f"its publisher refuses: {text}"),
+            on_lost=self.on_lost,
+            number=self.number(),
             find=find,
         )
         self.connection.start()
 
-    def _refused(self, text: str) -> None:
-        self._on_lost(f"its publisher refuses: {text}")
-
     def _described(self, fields: Header) -> None:
         self._description = TopicDescription.from_header(fields)
-        self._on_described(self._description)
-
-    def close(self) -> None:
-        """Disconnect; no callback is called afterwards."""
-        if self._closed:
-            return
-        self._closed = True
-        if self.connection is not None:
-            self.connection.close()
-        self._on_closed(self)
-
-
-class ProxiedService(ProxiedSource):
-    """A foreign service in the gateway's graph; calls under way get an error once it is closed.
-
-    A graph has one server of each service: while another node has its name, it waits, and ``problem`` says so.
-
-    Args:
-        source: The service.
-        origin: The origin to offer it with.
-        number: The number of its site in the relay.
-        core: The gateway's core.
-        relay: Offers it to the modules.
-        proxies: The proxies of its site.
-        serve: Awaited with each request for its response.
-        describe: Awaited for the service's type.
-        timeout: Seconds for a call.
-        taken: Returns which module has a service of this name; empty if there is none.
-        on_closed: Called once it is closed.
-    """
-
-    def __init__(
-        self,
-        source: ForeignSource,
-        origin: Origin,
-        number: int,
-        *,
-        core: Core,
-        relay: Relay,
-        proxies: PeerProxies,
-        serve: Callable[[bytes], Awaitable[bytes]],
-        describe: Callable[[], Awaitable[ServiceDescription]],
-        timeout: float,
-        taken: Callable[[], str],
-        on_closed: Callable[[], None],
-    ) -> None:
-        super().__init__(source, origin, number, core=core, relay=relay, proxies=proxies, on_closed=on_closed)
-        self._serve = serve
-        self._taken = taken
-        self._offered = Source(service_place(source.name, "")[0], proxies.name(origin.node))
-        self._calls: set[asyncio.Task[None]] = set()
-        self.endpoint = ServiceEndpoint(
-            source.name,
-            self._offered.node,
-            self._called,
-            describe,
-            timeout=timeout,
-            on_mismatch=self._mismatched,
-        )
-        """Takes the clients."""
-
-    def reconcile(self, services: Mapping[str, Mapping[str, str]]) -> None:
-        """Register it if the core has lost it, or if its name has become free."""
-        node = self._node
-        if node is not None and services.get(self.source.name, {}).get(node.name) != node.service_uri:
-            self._register()
-
-    def make_room(self) -> None:
-        """Leave the name to a module's service, until that one has gone."""
-        if self._node is not None and self._taken():
-            self._unregister(self._node)
-            self._register()
-
-    def _withdraw(self) -> None:
-        self.endpoint.withdraw(f"service [{self.source.name}] of {self.source.site} has gone")
-        for task in self._calls:
-            task.cancel()
-
-    def _called(self, call: ServiceCall) -> None:
-        task = asyncio.get_running_loop().create_task(self._answer(call), name=f"call {self.source.name}")
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
-        call.on_gone = lambda: _cancel(task)
-
-    async def _answer(self, call: ServiceCall) -> None:
-        try:
-            call.reply(True, await self._serve(bytes(call.request)))
-        except RmpaError as error:
-            call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! service %s of %s failed", self.source.name, self.source.site)
-            call.fail(f"service [{self.source.name}]: the gateway failed at this call; its log says why")
-
-    def _mismatched(self, _fields: Mapping[str, str], text: str) -> None:
-        self._mismatch = text
-
-    def _ready(self, node: SlaveNode) -> None:
-        self._node = node
-        self._relay.shown(self._number, self._offered, service_place(self.source.name, node.name), self._origin)
-        node.add_service(self.endpoint)
-        self._register()
-
-    def _register(self) -> None:
-        node = self._node
-        if node is None:
-            return
-        other = next((one for one in self._core.state().services.get(self.source.name, {}) if one != node.name), "")
-        if other := other or self._taken():
-            self._refused = f"{other} has a service of this name here"
-            return
-        code, status, _ = self._core.call("registerService", node.name, self.source.name, node.service_uri, node.uri)
-        self._registered(node, code, status)
-
-    def _unregister(self, node: SlaveNode) -> None:
-        self._core.call("unregisterService", node.name, self.source.name, node.service_uri)
-
-    def _left(self, node: SlaveNode) -> None:
-        self._node = None
-        self._unregister(node)
-        node.remove_service(self.source.name)
-        self._relay.gone(self._number, self._offered)
-
-
-def _cancel(task: asyncio.Task[None]) -> None:
-    task.cancel()
-
-
-# A topic of a neighbour in the gateway's graph: its proxy, its publication, its offer to the mesh.
-
-
-class ProxiedTopic(ProxiedSource, PublicationEvents):
-    """A foreign topic in the gateway's graph; until ``describe`` its subscribers wait.
-
-    Args:
-        source: The topic.
-        origin: The origin to offer it with.
-        number: The number of its site in the relay.
-        core: The gateway's core.
-        relay: Offers it to the modules.
-        proxies: The proxies of its site.
-        on_demand: ``(wanted)``: a first subscriber has come, or the last one has left.
-        on_closed: Called once it is closed.
-    """
-
-    def __init__(
-        self,
-        source: ForeignSource,
-        origin: Origin,
-        number: int,
-        *,
-        core: Core,
-        relay: Relay,
-        proxies: PeerProxies,
-        on_demand: Callable[[bool], None],
-        on_closed: Callable[[], None],
-    ) -> None:
-        super().__init__(source, origin, number, core=core, relay=relay, proxies=proxies, on_closed=on_closed)
-        self._on_demand = on_demand
-        self._offered = Source(source.name, proxies.name(origin.node))
-        self._wanted = False
-        self.publication = Publication(source.name, self._offered.node, events=self)
-        """Its messages for subscribers, here and of the mesh."""
-
-    def describe(self, description: TopicDescription) -> None:
-        """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
-        if self.publication.describe(description) and not self._closed:
-            for delay in bridge_limits.CALL_BACK_DELAYS:
-                asyncio.get_running_loop().call_later(delay, self._register)
-
-    def publish(self, body: Buffer) -> int:
-        """Send one message without its length; return the messages dropped for slow subscribers."""
-        size = len(body)
-        if size <= core_limits.CUT_THROUGH_BYTES:
-            return self.publication.publish_framed(LENGTH.pack(size) + body)
-        before = self.publication.dropped
-        self.publication.begin(LENGTH.size + size)
-        self.publication.extend(LENGTH.pack(size))
-        self.publication.extend(body)
-        return self.publication.dropped - before
-
-    def forget_latched(self) -> None:
-        """Drop the latched message: its publisher is gone."""
-        self.publication.forget_latched()
-
-    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> None:
-        """Register it again if the core has lost it."""
-        node = self._node
-        if node is not None and publishers.get(self.source.name, {}).get(node.name) != node.uri:
-            self._register()
-
-    def _withdraw(self) -> None:
-        self.publication.withdraw()
-
-    def _demand(self, *, wanted: bool) -> None:
-        if wanted != self._wanted and not self._closed:
-            self._wanted = wanted
-            self._on_demand(wanted)
-
-    def first_subscriber(self) -> None:
-        """Of ``PublicationEvents``."""
-        self._demand(wanted=True)
-
-    def last_subscriber(self) -> None:
-        """Of ``PublicationEvents``."""
-        self._demand(wanted=False)
-
-    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """Of ``PublicationEvents``."""
-        self._mismatch = f"{printable(fields.get('callerid', ''))}: {text}"
-
-    def _ready(self, node: SlaveNode) -> None:
-        self._node = node
-        self._relay.shown(self._number, self._offered, (self.source.name, node.name), self._origin)
-        node.add_publication(self.publication)
-        self._register()
-
-    def _register(self) -> None:
-        node = self._node
-        if node is None:
-            return
-        code, status, _ = self._core.call(
-            "registerPublisher", node.name, self.source.name, self.source.type, node.uri
-        )
-        self._registered(node, code, status)
-
-    def _left(self, node: SlaveNode) -> None:
-        self._node = None
-        self._core.call("unregisterPublisher", node.name, self.source.name, node.uri)
-        node.remove_publication(self.source.name)
-        self._relay.gone(self._number, self._offered)
+        self.on_described(self._description)

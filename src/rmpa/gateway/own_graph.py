@@ -1,88 +1,170 @@
-"""The gateway's own graph for its neighbours: what is offered, with its origin.
+"""The gateway's own graph for its neighbours: the sources of the modules at this site, and what neighbours bring in.
 
-The origin with which the relay offers what a neighbour of the gateway has. Pure.
+All is called in the event loop, callbacks too. ::
+
+    modules ⇢ mesh ⇢ proxies in the core ⇢ MeshSources, TopicTap, ServicePool ⇢ neighbour
+    modules ⇠ mesh ⇠ relay ⇠ proxies in the core ⇠ ProxiedTopic, ProxiedService ⇠ neighbour
 """
 
 from __future__ import annotations
 
 import asyncio
-import hashlib
-from dataclasses import dataclass, field
-from types import MappingProxyType
+import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.bridge.messages import Origin, is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
-from rmpa.bridge.proxies import PeerProxies
+from rmpa.bridge.messages import is_crossing_name, is_crossing_type
+from rmpa.bridge.policy import is_outside, service_place
 from rmpa.bridge.services.bodies import LocalService, ServicePool
 from rmpa.bridge.sessions import Part
-from rmpa.core import limits as core_limits
+from rmpa.bridge.topics.local import LocalSources
+from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.core.identity import OWN_NODE, peer_name_problem
-from rmpa.gateway.foreign import ProxiedService, ProxiedTopic, TopicTap
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, MeshSources, SourceKind
+from rmpa.core.identity import OWN_NODE, is_own
+from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic, TopicTap
+from rmpa.gateway.neighbour import MeshSource, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Iterator
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import SourceKey
+    from rmpa.gateway.neighbour import ForeignSource, SourceKey
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
-_INSTANCE_LABEL: Final = b"rmpa site 1"
-
-
-def site_instance(site: str) -> str:
-    """The instance of a site, 32 hexadecimal digits: the same in all gateways that reach it."""
-    digest = hashlib.sha256(_INSTANCE_LABEL + site.encode()).digest()
-    return digest[: core_limits.INSTANCE_ID_BYTES].hex()
-
-
-def foreign_node(source: ForeignSource) -> str:
-    """The node in the origin's graph: ``/<module>/<node>``, or ``/<node>`` where there is no module."""
-    return f"/{source.module}{source.node}" if source.module else source.node
-
-
-def foreign_origin(source: ForeignSource) -> Origin:
-    """The origin of a neighbour's source; its path is empty."""
-    return Origin(source.site, OUTSIDE_GUID, site_instance(source.site), foreign_node(source), ())
-
-
-# The gateway's own graph, for its neighbours. All is called in the event loop, callbacks too.
-#
-# ::
-#
-#     modules ⇢ mesh ⇢ proxies in the core ⇢ MeshSources, TopicTap, ServicePool ⇢ neighbour
-#     modules ⇠ mesh ⇠ relay ⇠ proxies in the core ⇠ ProxiedTopic, ProxiedService ⇠ neighbour
-
-
+_log = logging.getLogger(__name__)
 TAP_NODE: Final = f"{OWN_NODE}/gateway"
 """The node that subscribes to what neighbours want."""
 _ANY: Final = "*"
+_KINDS: Final = {RegistrationKind.PUBLISHER: SourceKind.TOPIC, RegistrationKind.SERVICE: SourceKind.SERVICE}
 
 
-@dataclass(slots=True)
-class _Site:
-    """What one site, or another neighbour, has in the gateway's graph.
+class MeshSources:
+    """Follows the gateway's graph, and reports which sources of the mesh there are.
+
+    A source counts if the gateway's own policy lets it cross. What a neighbour has brought here, through this gateway
+    or another one of this site, does not count.
 
     Args:
-        number: Its number in the relay: negative, for no peer has such a one.
-        instance: Its instance in the origins.
-        proxies: Its proxies.
-        shown: Its topics and services, by kind, name here, and proxy; the first one of several is in the graph.
+        agent: The gateway's agent.
+        name: Its name among its peers.
     """
 
-    number: int
-    instance: str
-    proxies: PeerProxies
-    shown: dict[SourceKey, list[ProxiedTopic | ProxiedService]] = field(default_factory=dict)
+    def __init__(self, agent: Agent, name: str) -> None:
+        self._agent = agent
+        self._name = name
+        self._relay = agent.bridge.relay
+        self._local = LocalSources(agent.core, agent.bridge.relay)
+        self.known: dict[SourceKey, MeshSource] = {}
+        """The sources that were reported."""
+        self.watchers: list[Callable[[MeshSource, bool], None]] = []
+        self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
+        self._changed: dict[tuple[SourceKind, str], None] = {}
+        self._soon: asyncio.Handle | None = None
+        self._begun = False
+
+    def begin(self) -> None:
+        """Begin to report; the agent's place in the network is known."""
+        self._begun = True
+        self.look_at_all()
+
+    def close(self) -> None:
+        """Report nothing more."""
+        self._begun = False
+        self.watchers.clear()
+        if self._soon is not None:
+            self._soon.cancel()
+            self._soon = None
+
+    def changed(self, change: GraphChange) -> None:
+        """Have a name examined that was registered or unregistered."""
+        self._local.changed(change)
+        if change.kind in _KINDS:
+            self._look((_KINDS[change.kind], change.name))
+
+    def look_at_all(self) -> None:
+        """Have every name examined."""
+        state = self._agent.core.state()
+        topics = [(SourceKind.TOPIC, topic) for topic in state.publishers]
+        services = [(SourceKind.SERVICE, service) for service in state.services]
+        for name in (*topics, *services, *self._by_name):
+            self._look(name)
+
+    def _look(self, name: tuple[SourceKind, str]) -> None:
+        self._changed[name] = None
+        if self._begun and self._soon is None:
+            self._soon = asyncio.get_running_loop().call_soon(self._examine)
+
+    def _examine(self) -> None:
+        self._soon = None
+        changed, self._changed = self._changed, {}
+        for kind, name in yielding_to_data(list(changed), every=16):
+            sources = (self._topic if kind is SourceKind.TOPIC else self._service)(name)
+            found = {(kind, name, source.proxy): source for source in sources}
+            before = self._by_name.pop((kind, name), {})
+            if found:
+                self._by_name[kind, name] = found
+            for key, source in before.items():
+                if found.get(key) != source:
+                    del self.known[key]
+                    self._tell(source, there=False)
+            for key, source in found.items():
+                if before.get(key) != source:
+                    self.known[key] = source
+                    self._tell(source, there=True)
+
+    def _tell(self, source: MeshSource, *, there: bool) -> None:
+        for on_change in tuple(self.watchers):
+            with logged_failure(_log, "a neighbour failed at %s; the others are told", source):
+                on_change(source, there)
+
+    def _topic(self, topic: str) -> Iterator[MeshSource]:
+        for node, local in self._local.of(topic).items():
+            if self._may_cross(topic, local.type, node):
+                yield self._own(SourceKind.TOPIC, node, topic, local.type)
+        for proxy, local in self._local.relayed(topic).items():
+            shown, origin = self._relay.source((topic, proxy)), local.origin
+            if origin is None or shown is None or is_outside(origin):
+                continue
+            if self._may_cross(topic, local.type, origin.node):
+                yield MeshSource(
+                    SourceKind.TOPIC,
+                    origin.name,
+                    origin.instance,
+                    origin.node,
+                    shown[1].topic,
+                    local.type,
+                    topic,
+                    proxy,
+                )
+
+    def _service(self, service: str) -> Iterator[MeshSource]:
+        for node in self._agent.core.state().services.get(service, {}) if is_crossing_name(service) else ():
+            judge = self._agent.bridge.context.services.judge
+            if not is_own(node):
+                if judge(service, node).allowed:
+                    yield self._own(SourceKind.SERVICE, node, service, _ANY)
+                continue
+            place = service_place(service, node)
+            origin, shown = self._relay.origin(place), self._relay.source(place)
+            if origin is None or shown is None or is_outside(origin) or not judge(service, origin.node).allowed:
+                continue
+            remote = self._agent.services.imports.get(shown[0], service)
+            wire = remote.wire if remote is not None else service
+            yield MeshSource(SourceKind.SERVICE, origin.name, origin.instance, origin.node, wire, _ANY, service, node)
+
+    def _own(self, kind: SourceKind, node: str, name: str, type_name: str) -> MeshSource:
+        """A source of the gateway's own module."""
+        return MeshSource(kind, self._name, self._relay.instance, node, name, type_name, name, node)
+
+    def _may_cross(self, topic: str, type_name: str, node: str) -> bool:
+        known = is_crossing_name(topic) and is_crossing_name(node) and is_crossing_type(type_name)
+        return known and self._agent.bridge.context.policy.judge(topic, type_name, node).allowed
 
 
 class AgentGraph(Part):
@@ -94,18 +176,20 @@ class AgentGraph(Part):
     """
 
     def __init__(self, agent: Agent, settings: Settings) -> None:
-        self._agent = agent
-        self._name = settings.name
-        self._core = agent.core
-        self._bridge = agent.bridge
-        self._sources = MeshSources(agent, settings)
-        self._sources.watch(self._source_changed)
-        agent.services.make_room = self._make_room
+        self.agent: Final = agent
+        self.name: Final = settings.name
+        """The gateway's name among its peers."""
         self.reloaded: Callable[[Settings], None] = lambda _: None
         """Called with other rules, after the graph has taken them."""
+        self._core = agent.core
+        self._sources = MeshSources(agent, settings.name)
+        self._sources.watchers.append(self._source_changed)
+        self.sources: Final = self._sources.known
+        """The local sources by kind, name here and node here. What came from a neighbour is not among them."""
+        agent.services.make_room = self._make_room
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}
-        self._sites: dict[str, _Site] = {}
+        self._sites: dict[str, ForeignSite] = {}
         self._node = SlaveNode(
             TAP_NODE,
             agent.core.node_host,
@@ -117,24 +201,11 @@ class AgentGraph(Part):
 
     # --- for neighbours ---------------------------------------------------------------------------------------
 
-    @property
-    def agent(self) -> Agent:
-        """The gateway's agent."""
-        return self._agent
-
-    @property
-    def name(self) -> str:
-        """The gateway's name among its peers."""
-        return self._name
-
-    @property
-    def sources(self) -> Mapping[SourceKey, MeshSource]:
-        """The local sources by kind, name here and node here. What came from a neighbour is not among them."""
-        return MappingProxyType(self._sources.known)
-
     def watch(self, on_change: Callable[[MeshSource, bool], None]) -> None:
         """Call ``on_change(source, there)`` for each source that is there now, and at each change."""
-        self._sources.watch(on_change)
+        self._sources.watchers.append(on_change)
+        for source in list(self.sources.values()):
+            on_change(source, True)
 
     def tap(
         self,
@@ -159,11 +230,11 @@ class AgentGraph(Part):
             source,
             listener or TAP_NODE,
             self._node.next_number,
-            self._bridge.proxy_nodes.publication,
-            on_message=on_message,
-            on_described=on_described,
-            on_lost=on_lost,
-            on_closed=self._tap_closed,
+            self.agent.bridge.proxy_nodes.publication,
+            on_message,
+            on_described,
+            on_lost,
+            self._tap_closed,
         )
         taps = self._taps.setdefault(source.here, set())
         taps.add(tap)
@@ -181,7 +252,7 @@ class AgentGraph(Part):
             source: The topic.
             listener: A source of the node that listens to it.
         """
-        _, (_, _, name) = self._place(listener)
+        name = self._site(listener).key(listener)[2]
         return self.tap(source, lambda _: None, lambda _: None, lambda _: None, listener=name)
 
     async def describe(self, source: MeshSource) -> ServiceDescription:
@@ -220,18 +291,9 @@ class AgentGraph(Part):
             source: The topic.
             on_demand: ``(wanted)``: a first node or module has subscribed, or the last one has left.
         """
-        site, key = self._place(source)
-        shown = ProxiedTopic(
-            source,
-            foreign_origin(source),
-            site.number,
-            core=self._core,
-            relay=self._bridge.relay,
-            proxies=site.proxies,
-            on_demand=on_demand,
-            on_closed=lambda: self._hidden(site, key, shown),
-        )
-        self._show(site, key, shown)
+        site = self._site(source)
+        shown = ProxiedTopic(source, site, on_demand)
+        site.show(shown)
         return shown
 
     def show_service(
@@ -247,21 +309,9 @@ class AgentGraph(Part):
             serve: Awaited with each request for its response; an ``RmpaError`` is the client's error.
             describe: Awaited once a client or a module asks for its type; an ``RmpaError`` is the client's error.
         """
-        site, key = self._place(source)
-        shown = ProxiedService(
-            source,
-            foreign_origin(source),
-            site.number,
-            core=self._core,
-            relay=self._bridge.relay,
-            proxies=site.proxies,
-            serve=serve,
-            describe=describe,
-            timeout=self._bridge.context.services.timeout(source.name),
-            taken=lambda: self._module_with(source.name),
-            on_closed=lambda: self._hidden(site, key, shown),
-        )
-        self._show(site, key, shown)
+        site = self._site(source)
+        shown = ProxiedService(source, site, serve, describe)
+        site.show(shown)
         return shown
 
     # --- the bridge's part ------------------------------------------------------------------------------------
@@ -274,14 +324,13 @@ class AgentGraph(Part):
 
     def unwatch(self) -> None:
         """Forget all that ``watch`` was given: the neighbours are closed."""
-        self._sources.unwatch(self._source_changed)
+        self._sources.watchers[1:] = []
 
     async def end(self) -> None:
         """Take everything back, before the agent closes; the neighbours are closed."""
         self._sources.close()
-        for taps in list(self._taps.values()):
-            for tap in list(taps):
-                tap.close()
+        for tap in [tap for taps in self._taps.values() for tap in taps]:
+            tap.close()
         for site in self._sites.values():
             for shown in [one for same in site.shown.values() for one in reversed(same)]:
                 shown.close()
@@ -296,7 +345,7 @@ class AgentGraph(Part):
     def reload(self) -> None:
         """Take other rules."""
         self._sources.look_at_all()
-        self.reloaded(self._bridge.context.settings)
+        self.reloaded(self.agent.bridge.context.settings)
 
     def graph_changed(self, change: GraphChange) -> None:
         """Follow publishers and services that come, go or move."""
@@ -304,20 +353,18 @@ class AgentGraph(Part):
         if change.kind is RegistrationKind.PUBLISHER and change.name in self._taps:
             self._follow(change.name)
         elif change.kind is RegistrationKind.SERVICE and not change.added:
-            self._retry_service(change.name)
+            for shown in self._services_of(change.name):
+                shown.reconcile()
 
     def reconcile(self) -> None:
         """Mend what the core has lost, and try again what failed."""
-        state = self._core.state()
         for site in self._sites.values():
             site.proxies.reconcile()
             for shown in yielding_to_data([same[0] for same in site.shown.values()], every=16):
-                if isinstance(shown, ProxiedTopic):
-                    shown.reconcile(state.publishers)
-                else:
-                    shown.reconcile(state.services)
+                shown.reconcile()
+        subscribers = self._core.state().subscribers
         for topic in yielding_to_data(list(self._taps), every=16):
-            if TAP_NODE not in state.subscribers.get(topic, {}):
+            if TAP_NODE not in subscribers.get(topic, {}):
                 self._register_subscriber(topic)
             self._follow(topic)
         before = asyncio.get_running_loop().time() - bridge_limits.SERVICE_IDLE
@@ -329,46 +376,10 @@ class AgentGraph(Part):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _place(self, source: ForeignSource) -> tuple[_Site, SourceKey]:
-        """The site of a foreign source, and the key of the source there."""
-        origin = foreign_origin(source)
-        site = self._sites.get(source.site)
-        if site is None:
-            bad = peer_name_problem(source.site)
-            prefix = "" if bad else self._bridge.sessions.reserved_name(origin)[: -len(origin.node)]
-            site = self._sites[source.site] = _Site(
-                -1 - len(self._sites), site_instance(source.site), PeerProxies(prefix, self._bridge.proxy_nodes)
-            )
-        return site, (source.kind, source.name, site.proxies.name(origin.node))
-
-    def _show(self, site: _Site, key: SourceKey, shown: ProxiedTopic | ProxiedService) -> None:
-        if problem := _name_problem(shown.source):
-            shown.refuse(problem)
-            return
-        if not site.shown:
-            self._reach(site, reached=True)
-        same = site.shown.setdefault(key, [])
-        same.append(shown)
-        if len(same) == 1:
-            shown.begin()
-
-    def _hidden(self, site: _Site, key: SourceKey, shown: ProxiedTopic | ProxiedService) -> None:
-        same = site.shown.get(key, [])
-        if shown not in same:
-            return
-        first = same[0] is shown
-        same.remove(shown)
-        if same and first:
-            same[0].begin()
-        elif not same:
-            del site.shown[key]
-            if not site.shown:
-                self._reach(site, reached=False)
-
-    def _reach(self, site: _Site, *, reached: bool) -> None:
-        """Hide, or show, what other gateways of this site bring from there: this gateway has its own way."""
-        self._bridge.topics.reached_here(site.instance, reached=reached)
-        self._agent.services.reached_here(site.instance, reached=reached)
+    def _site(self, source: ForeignSource) -> ForeignSite:
+        if source.site not in self._sites:
+            self._sites[source.site] = ForeignSite(self.agent, source, -1 - len(self._sites))
+        return self._sites[source.site]
 
     def _register_subscriber(self, topic: str) -> None:
         self._core.call("registerSubscriber", TAP_NODE, topic, _ANY, self._node.uri)
@@ -386,24 +397,12 @@ class AgentGraph(Part):
             tap.follow(publishers.get(tap.source.proxy, ""))
 
     def _connections(self) -> list[TopicConnection]:
-        taps = [tap for taps in self._taps.values() for tap in taps]
-        return [tap.connection for tap in taps if tap.connection is not None]
-
-    def _module_with(self, service: str) -> str:
-        """The module of this mesh that has a service of this name; empty if there is none."""
-        found = self._agent.services.imports.shown(service)
-        if found is None or (found.origin is not None and is_outside(found.origin)):
-            return ""
-        return self._agent.services.imports.peer_name(found.peer)
+        connections = (tap.connection for taps in self._taps.values() for tap in taps)
+        return [connection for connection in connections if connection is not None]
 
     def _make_room(self, name: str) -> None:
         for shown in self._services_of(name):
             shown.make_room()
-
-    def _retry_service(self, name: str) -> None:
-        services = self._core.state().services
-        for shown in self._services_of(name):
-            shown.reconcile(services)
 
     def _services_of(self, name: str) -> list[ProxiedService]:
         """The foreign services of a name, of each site the one that is in the graph."""
@@ -433,15 +432,3 @@ class AgentGraph(Part):
             pool = ServicePool(source.here, server, lambda: self._core.suspect(source.proxy))
             self._pools[source.here] = pool
         return pool
-
-
-def _name_problem(source: ForeignSource) -> str:
-    """Why a foreign source cannot be in a graph of ROS 1, or empty."""
-    if problem := peer_name_problem(source.site):
-        return f"site {source.site[:64]!r}: {problem}"
-    for name in (foreign_node(source), source.name):
-        if not is_crossing_name(name):
-            return f"{name[:64]!r} is not a global name of ROS, or too long"
-    if source.kind is SourceKind.TOPIC and not is_crossing_type(source.type):
-        return f"{source.type[:64]!r} is not a message type of ROS 1"
-    return ""

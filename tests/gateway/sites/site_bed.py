@@ -7,25 +7,45 @@ import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.policy import OPEN_GATE
+from rmpa.config.peer_rules import ServiceRule
+from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Contracts
+from rmpa.core.counters import Counters
 from rmpa.gateway.neighbour import MeshSource, SourceKind
-from rmpa.gateway.sites.catalogue import CrossingRules
-from rmpa.gateway.sites.imported_topic import SiteTopics
+from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.site import SiteNeighbour
+from rmpa.gateway.sites.topics import SiteContext
 from rmpa.ros.wire.tcpros import TopicDescription
-from rmpa.runtime.loop import SystemClock
 from tests.gateway.memory_graph import MemoryGraph, MemoryTap, MemoryTopic
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+    from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import ContractRule
     from rmpa.gateway.zenoh.session import OpenSession
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+
+
+def site_context(
+    name: str,
+    graph: object,
+    session: object,
+    rules: CrossingRules | None = None,
+    contracts: tuple[ContractRule, ...] = (),
+    timeout: float = 30.0,
+) -> SiteContext:
+    """What the parts of a site share; calls take ``timeout`` seconds at most."""
+    services = ServiceSettings(rules=(ServiceRule(("/**",), timeout),))
+    bridge = BridgeContext.of(Settings(services=services))
+    made: tuple[Any, Any] = graph, session
+    return SiteContext(name, *made, rules or CrossingRules(), bridge, Contracts(contracts), Counters())
 
 
 def described(latching: bool = False, md5sum: str = MD5, type_name: str = "odd_msgs/Odd") -> TopicDescription:
@@ -105,7 +125,6 @@ class Site:
     neighbour: SiteNeighbour
     graph: SiteGraph
     session: OpenSession
-    topic_part: SiteTopics
 
     def topic(self, name: str, node: str = "/talker") -> MemoryTopic:
         """A topic that is shown here."""
@@ -116,11 +135,9 @@ class Site:
 
     def topics(self, way: str) -> list[dict[str, object]]:
         """The report of the topics that go ``out`` or come ``in``."""
-        parts = self.neighbour.report()["parts"]
-        assert isinstance(parts, dict)
-        found = parts["topics"][way]
+        found = self.neighbour.topics.report()[way]
         assert isinstance(found, list)
-        return found
+        return [each for each in found if each["wanted"] or each["messages"] or each["problem"]]
 
     async def subscribed(self, name: str, node: str = "/talker") -> MemoryTopic:
         """Subscribe to a topic of the other site, and wait until its messages come."""
@@ -146,15 +163,14 @@ class SiteBed:
         graph: SiteGraph | None = None,
         rules: tuple[CrossingRule, ...] = (),
         contracts: tuple[ContractRule, ...] = (),
+        gate: PermissionGate = OPEN_GATE,
     ) -> Site:
         """Open one more gateway, and start it."""
         session = await self.zenoh.session()
         graph = graph if graph is not None else SiteGraph()
         own = SiteGateway(name, rank, f"{len(self.opened) + 1:032x}")
-        crossing = CrossingRules(rules)
-        shown: Any = graph
-        topics = SiteTopics(name, shown, session, crossing, Contracts(contracts), SystemClock())
-        site = Site(SiteNeighbour(shown, session, own, crossing, [topics]), graph, session, topics)
+        context = site_context(name, graph, session, CrossingRules(rules, gate=gate), contracts)
+        site = Site(SiteNeighbour(context, own), graph, session)
         self.opened.append(site)
         site.neighbour.start()
         return site

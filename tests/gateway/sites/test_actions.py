@@ -5,51 +5,47 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.plans import SiteExport, SiteImport
 from rmpa.gateway.sites.services import SiteActions
 
-RUN = "0" * 32
+GOAL, CANCEL = "arm_msgs/MoveActionGoal", "actionlib_msgs/GoalID"
 
 
-def client(topic: str, type_name: str) -> SiteExport:
-    source = MeshSource(SourceKind.TOPIC, "base", RUN, "/client", topic, type_name, topic, "/rmpa/base/client")
-    return SiteExport(source, SiteSource(SiteModule("yard", "base", RUN), source.kind, type_name, "/client", topic))
+def client(topic: str, type_name: str) -> MeshSource:
+    return MeshSource(SourceKind.TOPIC, "base", "0" * 32, "/client", topic, type_name, topic, "/rmpa/base/client")
 
 
-def server(topic: str, type_name: str = "actionlib_msgs/GoalStatusArray") -> SiteImport:
-    source = ForeignSource(SourceKind.TOPIC, "warehouse", "arm", "/server", topic, type_name)
-    announced = SiteSource(SiteModule("warehouse", "arm", RUN), source.kind, type_name, "/server", topic)
-    return SiteImport(source, announced)
+def server(topic: str, type_name: str = "actionlib_msgs/GoalStatusArray") -> ForeignSource:
+    return ForeignSource(SourceKind.TOPIC, "warehouse", "arm", "/server", topic, type_name)
 
 
-class _Listening:
-    def __init__(self, table: set[tuple[str, str]], pair: tuple[str, str]) -> None:
-        self.table, self.pair = table, pair
-        table.add(pair)
+class Heard(set[tuple[str, str]]):
+    """The pairs of a graph's topics and the servers under whose names they are listened to."""
 
-    description = None
+    def attend(self, source: MeshSource, listener: ForeignSource) -> Heard:
+        self.add((source.here, listener.name))
+        tap = Heard()
+        tap.close = lambda: self.remove((source.here, listener.name))  # type: ignore[method-assign]
+        return tap
 
     def close(self) -> None:
-        self.table.remove(self.pair)
+        raise NotImplementedError
 
 
-async def test_goals_and_cancellations_are_listened_to_under_the_servers_name() -> None:
-    heard: set[tuple[str, str]] = set()
-    part = SiteActions(cast("Any", lambda source, foreign: _Listening(heard, (source.here, foreign.name))))
-    goal, cancel = client("/move/goal", "arm_msgs/MoveActionGoal"), client("/move/cancel", "actionlib_msgs/GoalID")
-    part.export(goal)
-    part.export(client("/move/other", "std_msgs/String"))
-    part.show(server("/turn/status"))
-    part.show(server("/move/feedback", "arm_msgs/MoveActionFeedback"))
+def test_goals_and_cancellations_are_listened_to_under_the_servers_name() -> None:
+    heard = Heard()
+    actions = SiteActions(cast("Any", heard))
+    actions.client(client("/move/goal", GOAL), there=True)
+    actions.client(client("/move/goal", GOAL), there=True)  # for another site too
+    actions.client(client("/move/other", "std_msgs/String"), there=True)
+    actions.server(server("/turn/status"), there=True)
+    actions.server(server("/move/feedback", "arm_msgs/MoveActionFeedback"), there=True)
     assert heard == set()
-    part.show(server("/move/status"))
-    part.export(cancel)
+    actions.server(server("/move/status"), there=True)
+    actions.client(client("/move/cancel", CANCEL), there=True)
     assert heard == {("/move/goal", "/move/status"), ("/move/cancel", "/move/status")}
-    part.withdraw(goal)
+    actions.client(client("/move/goal", GOAL), there=False)
+    assert len(heard) == 2
+    actions.client(client("/move/goal", GOAL), there=False)
     assert heard == {("/move/cancel", "/move/status")}
-    part.hide(server("/move/status"))
-    assert heard == set()
-    part.show(server("/move/status"))
-    await part.close()
+    actions.server(server("/move/status"), there=False)
     assert heard == set()

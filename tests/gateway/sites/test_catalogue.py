@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, CatalogueEvent, SiteCatalogue
+from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 
 FOUND, RENEWED, GONE = CatalogueChange.FOUND, CatalogueChange.RENEWED, CatalogueChange.GONE
@@ -21,20 +21,29 @@ STOP = SiteSource(BASE, SourceKind.SERVICE, "std_srvs/Trigger", "/driver", "/sto
 EVERYTHING = (FIRST, SECOND, ARM, BASE, SCAN, STOP)
 
 
-def told(catalogue: SiteCatalogue) -> list[tuple[CatalogueChange, object]]:
-    return [(event.change, event.item) for event in catalogue.take_events()]
+class Followed(SiteCatalogue):
+    """A catalogue of the site ``home``, and what it has told."""
+
+    def __init__(self, own: str = "home") -> None:
+        self.told: list[tuple[CatalogueChange, SiteModule | SiteSource]] = []
+        super().__init__(own, lambda change, item: self.told.append((change, item)))
 
 
-def with_everything() -> SiteCatalogue:
-    catalogue = SiteCatalogue("home")
+def told(catalogue: Followed) -> list[tuple[CatalogueChange, SiteModule | SiteSource]]:
+    events, catalogue.told[:] = list(catalogue.told), []
+    return events
+
+
+def with_everything() -> Followed:
+    catalogue = Followed()
     for item in EVERYTHING:
         catalogue.token(item.token(), 0.0, alive=True)
-    catalogue.take_events()
+    told(catalogue)
     return catalogue
 
 
 def test_a_source_is_there_with_its_module() -> None:
-    catalogue = SiteCatalogue("home")
+    catalogue = Followed()
     catalogue.token(SCAN.token(), 0.0, alive=True)
     assert told(catalogue) == []
     catalogue.token(ARM.token(), 0.0, alive=True)
@@ -106,20 +115,20 @@ def test_a_source_whose_token_stays_is_shown_again_with_its_module() -> None:
     catalogue = with_everything()
     catalogue.token(ARM.token(), 10.0, alive=False)
     catalogue.handle_timer(11.0)
-    catalogue.take_events()
+    told(catalogue)
     catalogue.token(ARM.token(), 12.0, alive=True)
     assert told(catalogue) == [(FOUND, ARM), (FOUND, SCAN)]
 
 
 def test_tokens_of_this_site_are_not_another_sites() -> None:
-    catalogue = SiteCatalogue("cloud")
+    catalogue = Followed("cloud")
     for item in EVERYTHING:
         catalogue.token(item.token(), 0.0, alive=True)
     assert catalogue.sites == ()
 
 
 def test_tokens_that_are_none_are_counted() -> None:
-    catalogue = SiteCatalogue("home")
+    catalogue = Followed()
     for key in ("", "rmpa/1/cloud", ARM.token() + "x", f"rmpa/2{ARM.token()[6:]}", SCAN.token() + "/later"):
         catalogue.token(key, 0.0, alive=True)
     assert catalogue.sites == ()
@@ -131,7 +140,7 @@ def test_sites_modules_and_sources_have_bounds_that_are_told(monkeypatch: pytest
     monkeypatch.setattr(limits, "SITES_MAX", 2)
     monkeypatch.setattr(limits, "SITE_MODULES_MAX", 2)
     monkeypatch.setattr(limits, "SITE_SOURCES_MAX", 3)
-    catalogue = SiteCatalogue("home")
+    catalogue = Followed()
     modules = [SiteModule("cloud", f"m{number}", "0" * 32) for number in range(4)]
     for module in modules:
         catalogue.token(module.token(), 0.0, alive=True)
@@ -156,18 +165,17 @@ ITEMS = st.sampled_from(
 
 @given(st.lists(st.tuples(ITEMS, st.booleans(), st.floats(0, 1))))
 def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSource, bool, float]]) -> None:
-    catalogue = SiteCatalogue("home")
+    catalogue = Followed()
     alive: set[object] = set()
     shown: set[object] = set()
     now = 0.0
 
-    def follow(event: CatalogueEvent) -> None:
-        item = event.item
-        if event.change is FOUND:
+    def follow(change: CatalogueChange, item: SiteModule | SiteSource) -> None:
+        if change is FOUND:
             assert item not in shown
             assert isinstance(item, SiteModule) or item.module in shown
             shown.add(item)
-        elif event.change is RENEWED:
+        elif change is RENEWED:
             assert item in shown
         else:
             assert not any(isinstance(each, SiteSource) and each.module == item for each in shown)
@@ -180,11 +188,11 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
             catalogue.handle_timer(now)
         catalogue.token(item.token(), now, alive=there)
         (alive.add if there else alive.discard)(item)
-        for event in catalogue.take_events():
-            follow(event)
+        for event in told(catalogue):
+            follow(*event)
     catalogue.handle_timer(now + 10)
-    for event in catalogue.take_events():
-        follow(event)
+    for event in told(catalogue):
+        follow(*event)
     wanted = {
         item
         for item in alive
@@ -192,3 +200,35 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
     }
     assert shown == wanted == set(catalogue.all())
     assert catalogue.next_timer() is None
+
+
+def test_history() -> None:
+    now = 0.0
+    history = SiteHistory(lambda: now)
+    history.seen(["yard", "hall"])
+    now = 5.0
+    history.seen(["hall"])
+    now = 7.0
+    history.seen(["hall"])
+    assert history.away == ("yard",)
+    assert (history.since_ago("yard"), history.since_ago("hall"), history.since_ago("moon")) == (2.0, 7.0, None)
+
+
+def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
+    now = 0.0
+    history = SiteHistory(lambda: now)
+    arm = SiteModule("yard", "arm", "0" * 32)
+    scan, old, last = (SiteSource(arm, SourceKind.TOPIC, "a/B", "/n", name) for name in ("/scan", "/old", "/last"))
+    for source in (scan, old, last):
+        history.source(source, there=True)
+    history.seen(["yard"])
+    assert history.had("/scan") == (), "it is there"
+    history.source(old, there=False)
+    now = 9.0
+    history.source(last, there=False)  # withdrawn by a gateway that ends
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last", "/old")] == [(("yard", "arm"),), (("yard", "arm"),), ()]
+    history.source(last, there=True)
+    history.seen(["yard"])
+    history.seen([])
+    assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]

@@ -15,15 +15,15 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.sites.catalogue import CrossingRules, SiteCatalogue
-from rmpa.gateway.sites.exported_topic import TopicHeader
+from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.sites.catalogue import SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import (
     AttachmentReader,
-    SiteAttachment,
+    MessageSource,
     SiteGateway,
-    SiteHistory,
     SiteModule,
     SiteSource,
+    TopicHeader,
     parse_token,
 )
 from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
@@ -45,7 +45,7 @@ def source(
 
 def test_all_sites_together_announce_a_bounded_number_of_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    catalogue = SiteCatalogue("home")
+    catalogue = SiteCatalogue("home", lambda *_: None)
     for site in ("a", "b", "c"):
         catalogue.token(SiteModule(site, "arm", RUN).token(), 0.0, alive=True)
         for number in range(60):
@@ -61,7 +61,7 @@ def test_all_sites_together_announce_a_bounded_number_of_sources(monkeypatch: py
 
 
 def test_thousands_of_publishers_of_one_name_are_judged_in_linear_time() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = SiteImports(CrossingRules(), lambda *_: None)
     begin = time.process_time()
     for number in range(MANY):
         imports.found(source(number, "/x", "a/B"))
@@ -75,7 +75,7 @@ def test_thousands_of_publishers_of_one_name_are_judged_in_linear_time() -> None
 @pytest.mark.parametrize("kind", list(SourceKind))
 def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: SourceKind) -> None:
     """One program that shows and hides a source must not keep the gateway busy with all others of its name."""
-    imports = SiteImports(CrossingRules())
+    imports = SiteImports(CrossingRules(), lambda *_: None)
     holder = source(0, "/x", "a/First", kind)
     imports.found(holder)
     for number in range(1, MANY):
@@ -114,7 +114,7 @@ def test_what_sites_had_that_are_away_is_bounded(monkeypatch: pytest.MonkeyPatch
 def test_attachments_of_invented_sources_fill_no_memory() -> None:
     reader = AttachmentReader()
     for number in range(5000):
-        reader.read(SiteAttachment(1, 1, "0" * 32, f"/n{number}", ("eve",)).serialize())
+        reader.read(MessageSource("0" * 32, f"/n{number}", ("eve",)).writer()(1, 1))
     assert len(reader._known) <= 256
 
 

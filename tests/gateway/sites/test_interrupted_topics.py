@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
-from rmpa.core.contract import Contracts
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, SourceKind, ZenohQos
-from rmpa.gateway.sites.catalogue import CrossingRules
-from rmpa.gateway.sites.imported_topic import SiteTopics
-from rmpa.gateway.sites.keys import SiteAttachment, SiteModule, SiteSource
+from rmpa.gateway.sites.keys import MessageSource, SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
-from rmpa.runtime.loop import SystemClock
+from rmpa.gateway.sites.topics import SiteTopics
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryZenoh, eventually
-from tests.gateway.sites.site_bed import MD5
+from tests.gateway.sites.site_bed import MD5, site_context
 
 if TYPE_CHECKING:
     import pytest
@@ -35,8 +32,7 @@ class Hall:
     def __init__(self) -> None:
         network = MemoryZenoh()
         self.graph = MemoryGraph()
-        graph, session = cast("Any", self.graph), cast("Any", network.session())
-        self.topics = SiteTopics("hall", graph, session, CrossingRules(()), Contracts(()), SystemClock())
+        self.topics = SiteTopics(site_context("hall", self.graph, network.session()))
         yard = network.session()
         self.wanted = asyncio.Event()
         self.yard = yard.publisher(ENTRY.announced.key(), QOS, self._matching)
@@ -45,8 +41,9 @@ class Hall:
         (self.wanted.set if there else self.wanted.clear)()
 
     def send(self, *numbers: int) -> None:
+        write = MessageSource(MD5, "/talker", ("yard",), run=7).writer()
         for number in numbers:
-            self.yard.put(b"x", SiteAttachment(number, 0, MD5, "/talker", ("yard",), run=7).serialize())
+            self.yard.put(b"x", write(number, 0))
 
     def subscribe(self) -> None:
         self.graph.topics["/scan", "/talker"].on_demand(True)
@@ -105,4 +102,3 @@ async def test_the_counts_of_many_interrupted_topics_are_bounded(monkeypatch: py
     hall.subscribe()
     hall.topics.hide(ENTRY)
     assert hall.topics._interrupted == {}
-    await hall.end()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.params import rules as transfer
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites.params import (
     ParamAnswer,
     ParamQuestion,
-    SiteAsker,
-    SiteParamExports,
-    SiteParamImports,
+    SiteParams,
     from_json,
     param_key,
     parse_param_key,
@@ -26,10 +26,11 @@ from rmpa.gateway.sites.params import (
 )
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
-from tests.gateway.sites.loopback_session import LoopbackSession
+from tests.gateway.memory_zenoh import MemoryZenoh
+from tests.gateway.sites.site_bed import site_context
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
 
 
 class ArmParams:
@@ -60,21 +61,37 @@ class ArmParams:
         return self.values[key]
 
 
+class KeptHome(CrossingRules):
+    """Rules that keep some parameters at home."""
+
+    denied: frozenset[str] = frozenset()
+
+    def refusal(
+        self,
+        site: str,
+        module: str,
+        name: str,
+        access: Access = Access.SUBSCRIBE,
+        askers: Iterable[str] = (),
+        told: str | None = None,
+    ) -> str:
+        assert access is Access.PARAM
+        return f"a rule keeps {told} of {module} from {site}" if name in self.denied else ""
+
+
 class ParamSites:
     """Two sites, of which the second asks."""
 
     def __init__(self) -> None:
-        self.session, self.arm = LoopbackSession(), ArmParams()
-        self.denied: set[str] = set()
-        self.exports = SiteParamExports("warehouse", cast("Any", self.session), self.arm.ask, self._why_not)
-        self.imports = SiteParamImports("office", cast("Any", self.session), lambda: 1)
+        network = MemoryZenoh()
+        self.session, self.arm, self.rules = network.session(), ArmParams(), KeptHome()
+        own = network.session()
+        self.exports = SiteParams(site_context("warehouse", None, own, self.rules), self.arm.ask)
+        self.imports = SiteParams(site_context("office", None, own), self.arm.ask)
         self.exports.lead(leads=True)
 
-    def _why_not(self, asker: SiteAsker, module: str, name: str, told: str) -> str:
-        return f"a rule keeps {told} of {module} from {asker.site}" if name in self.denied else ""
-
-    async def ask(self, what: str, **args: str) -> Any:
-        return await self.imports.ask("desk", "warehouse", "arm", what, args)
+    async def ask(self, what: str, asker: str = "desk", **args: str) -> Any:
+        return await self.imports.ask(asker, "warehouse", "arm", {"what": what, **args})
 
     async def get(self, key: str) -> Any:
         return parse_response((await self.ask(transfer.GET, key=key))["text"].encode())
@@ -104,7 +121,7 @@ async def test_parameters_of_another_site_are_read_and_written_also_large_ones(s
     assert sites.arm.values["/big"] == large
     names = await sites.names()
     assert names == ["/speed", "/gains/p", "/gains/i", "/big"]
-    assert await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"}) == {}
+    assert await sites.ask(transfer.DELETE, key="/speed") == {}
     assert "/speed" not in sites.arm.values
 
 
@@ -118,12 +135,12 @@ async def test_what_the_module_refuses_arrives_with_its_text(sites: ParamSites) 
 
 
 async def test_a_rule_of_the_gateway_keeps_parameters_home_also_within_a_namespace(sites: ParamSites) -> None:
-    sites.denied = {"/speed", "/gains/p"}
+    sites.rules.denied = frozenset(("/speed", "/gains/p"))
     for key in ("/speed", "/gains"):
         with pytest.raises(PeerRefused, match="a rule keeps"):
             await sites.get(key)
         with pytest.raises(PeerRefused, match="a rule keeps"):
-            await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": key})
+            await sites.ask(transfer.DELETE, key=key)
     with pytest.raises(PeerRefused, match="a rule keeps"):
         await sites.set("/gains", {"p": 5})
     assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
@@ -220,14 +237,13 @@ async def test_a_module_here_gets_what_it_may_have_by_this_gateways_permissions_
         with pytest.raises(PeerRefused, match=rf"desk may not have {key.rstrip('/')}$"):
             await sites.get(key)
         with pytest.raises(PeerRefused, match="desk may not have"):
-            await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": key})
+            await sites.ask(transfer.DELETE, key=key)
         with pytest.raises(PeerRefused, match="desk may not have"):
             await sites.set(key, 5)
     assert sites.arm.values["/gains"] == {"p": 1, "i": 2}
     names = await sites.names()
     assert names == ["/speed", "/gains/p", "/big"]
-    answer = await sites.imports.ask("", "warehouse", "arm", transfer.GET, {"key": "/gains"})
-    assert "p" in cast("Any", answer)["text"], "this machine's user"
+    assert "p" in (await sites.ask(transfer.GET, "", key="/gains"))["text"], "this machine's user"
 
 
 async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSites) -> None:
@@ -242,7 +258,7 @@ async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSit
     await sites.get("/speed")
     await sites.set("/speed", 2)
     await sites.names()
-    await sites.imports.ask("desk", "warehouse", "arm", transfer.DELETE, {"key": "/speed"})
+    await sites.ask(transfer.DELETE, key="/speed")
     assert {(site, tuple(askers)) for _, site, askers in asked} == {("office", ("desk",))}
     await sites.session.get("rmpa/1/warehouse/arm/p/gains")
     assert asked[-1] == (transfer.GET, "", [])
@@ -251,12 +267,11 @@ async def test_questions_carry_the_modules_that_ask_to_the_owner(sites: ParamSit
 async def test_the_own_sites_modules_are_asked_by_themselves(sites: ParamSites) -> None:
     for asker in ("desk", ""):
         with pytest.raises(PeerRefused, match="of this very site: ask it itself, by --peer base"):
-            await sites.imports.ask(asker, "office", "base", transfer.GET, {"key": "/"})
-    assert sites.session.asked == []
+            await sites.imports.ask(asker, "office", "base", {"what": transfer.GET, "key": "/"})
 
 
 async def test_a_site_is_not_told_whether_a_parameter_is_there_that_a_rule_keeps_from_it(sites: ParamSites) -> None:
-    sites.denied = {"/speed", "/none"}
+    sites.rules.denied = frozenset(("/speed", "/none"))
     texts = []
     for name in ("speed", "none"):
         (reply,) = await sites.session.get(f"rmpa/1/warehouse/arm/p/{name}")

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.catalogue import CrossingRules
+from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites.keys import SiteModule, SiteSource, parse_token
-from rmpa.gateway.sites.plans import ImportChange, SiteExport, SiteExports, SiteImports
+from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
 
 if TYPE_CHECKING:
     import pytest
@@ -32,24 +32,40 @@ def announced(name: str, module: str = "arm", type_name: str = "std_msgs/String"
     return SiteSource(SiteModule("cloud", module, RUN), kind, type_name, "/node", name)
 
 
+class Exports(SiteExports):
+    """The exports of the site ``home``, and the changes that it has told."""
+
+    def __init__(self, *rules: CrossingRule, site: str = "home") -> None:
+        self.told: list[tuple[SiteModule | SiteExport, bool]] = []
+        super().__init__(site, CrossingRules(rules), lambda item, there: self.told.append((item, there)))
+
+
+class Imports(SiteImports):
+    """Imports, and the changes that they have told."""
+
+    def __init__(self, *rules: CrossingRule) -> None:
+        self.told: list[tuple[SiteImport | None, SiteImport | None]] = []
+        super().__init__(CrossingRules(rules), lambda old, new: self.told.append((old, new)))
+
+
 def tokens(exports: SiteExports) -> set[str]:
     return {each.token() for each in exports.modules} | {each.announced.token() for each in exports.entries}
 
 
 def test_a_module_is_announced_before_its_first_source_and_withdrawn_after_its_last() -> None:
-    exports = SiteExports("home", CrossingRules())
+    exports = Exports()
     one, two = mesh_source("/one"), mesh_source("/two")
     for source in (one, two):
         exports.changed(source, there=True)
     for source in (one, two):
         exports.changed(source, there=False)
-    told = [(isinstance(change.item, SiteExport), change.there) for change in exports.take_changes()]
+    told = [(isinstance(item, SiteExport), there) for item, there in exports.told]
     assert told == [(False, True), (True, True), (True, True), (True, False), (True, False), (False, False)]
     assert tokens(exports) == set()
 
 
 def test_what_stays_home_is_told_with_its_rule() -> None:
-    exports = SiteExports("home", CrossingRules((CrossingRule(names=("/secret",), crossing=Crossing.IN),)))
+    exports = Exports(CrossingRule(names=("/secret",), crossing=Crossing.IN))
     exports.changed(mesh_source("/secret"), there=True)
     exports.changed(mesh_source("/scan"), there=True)
     assert [entry.source.name for entry in exports.entries] == ["/scan"]
@@ -59,7 +75,7 @@ def test_what_stays_home_is_told_with_its_rule() -> None:
 
 
 def test_names_that_no_key_can_hold_are_told() -> None:
-    exports = SiteExports("home", CrossingRules())
+    exports = Exports()
     exports.changed(replace(mesh_source("/one"), node="/" + "n" * 255), there=True)
     exports.changed(mesh_source("/" + "t" * limits.KEY_MAX), there=True)
     exports.changed(mesh_source("/odd", type_name="odd"), there=True)
@@ -68,7 +84,7 @@ def test_names_that_no_key_can_hold_are_told() -> None:
 
 
 def test_a_service_crosses_before_its_type_is_known() -> None:
-    exports = SiteExports("home", CrossingRules())
+    exports = Exports()
     exports.changed(mesh_source("/stop", type_name="*", kind=S), there=True)
     [entry] = exports.entries
     assert parse_token(entry.announced.token()) == entry.announced
@@ -76,7 +92,7 @@ def test_a_service_crosses_before_its_type_is_known() -> None:
 
 def test_what_exceeds_the_bound_is_told_and_offered_when_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITE_SOURCES_MAX", 1)
-    exports = SiteExports("home", CrossingRules())
+    exports = Exports()
     for name in ("/one", "/two"):
         exports.changed(mesh_source(name), there=True)
     [(source, why)] = exports.refusals()
@@ -93,7 +109,7 @@ def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -
         CrossingRule(sites=("hall",)),
         CrossingRule(sites=("*",), crossing=Crossing.NONE),
     )
-    exports = SiteExports("home", CrossingRules(rules))
+    exports = Exports(*rules)
     exports.changed(mesh_source("/scan"), there=True)
     assert exports.entries == []
     assert "of which none was here yet" in next(why for _, why in exports.refusals())
@@ -105,17 +121,14 @@ def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -
         ("/stop", "hall", None),
         ("/stop", "yard1", 2.0),
     ]
-    assert [each.name for each in exports.sources] == ["/scan", "/stop"]
+    assert [source.name for source, _ in exports.offered()] == ["/scan", "/stop"]
     assert list(exports.refusals()) == []
-    exports.take_changes()
+    exports.told.clear()
     exports.sites_seen(["street"])
-    assert exports.take_changes() == [], "a site that is away for a while keeps what is addressed to it"
+    assert exports.told == [], "a site that is away for a while keeps what is addressed to it"
     exports.sites_seen(["yard2"])
-    assert [change.item.announced.to for change in exports.take_changes() if isinstance(change.item, SiteExport)] == [
-        "yard2",
-        "yard2",
-    ]
-    for source in exports.sources:
+    assert [item.announced.to for item, _ in exports.told if isinstance(item, SiteExport)] == ["yard2", "yard2"]
+    for source, _ in list(exports.offered()):
         exports.changed(source, there=False)
     assert tokens(exports) == set()
 
@@ -123,7 +136,7 @@ def test_what_rules_let_out_to_some_sites_is_announced_to_each_of_them_alone() -
 def test_sites_that_were_away_for_long_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_REMEMBERED_MAX", 2)
     rules = (CrossingRule(sites=("yard*",)), CrossingRule(crossing=Crossing.NONE))
-    exports = SiteExports("home", CrossingRules(rules))
+    exports = Exports(*rules)
     exports.changed(mesh_source("/scan"), there=True)
     for site in ("yard1", "yard2", "yard3"):
         exports.sites_seen([site])
@@ -131,7 +144,7 @@ def test_sites_that_were_away_for_long_are_forgotten(monkeypatch: pytest.MonkeyP
 
 
 def test_another_run_of_a_module_replaces_its_tokens() -> None:
-    exports = SiteExports("home", CrossingRules())
+    exports = Exports()
     exports.changed(mesh_source("/one"), there=True)
     before = tokens(exports)
     exports.changed(replace(mesh_source("/one"), instance="f" * 32), there=True)
@@ -140,15 +153,15 @@ def test_another_run_of_a_module_replaces_its_tokens() -> None:
 
 
 def test_a_source_is_shown_under_the_name_of_the_rule() -> None:
-    imports = SiteImports(CrossingRules((CrossingRule(name="/{site}{name}"),)))
+    imports = Imports(CrossingRule(name="/{site}{name}"))
     imports.found(announced("/scan"))
-    [change] = imports.take_changes()
-    assert change.new is not None
-    assert change.new.source == ForeignSource(T, "cloud", "arm", "/node", "/cloud/scan", "std_msgs/String")
+    [(_, new)] = imports.told
+    assert new is not None
+    assert new.source == ForeignSource(T, "cloud", "arm", "/node", "/cloud/scan", "std_msgs/String")
 
 
 def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     first, second = announced("/scan"), announced("/scan", "base", "std_msgs/Bool")
     imports.found(first)
     imports.found(second)
@@ -163,14 +176,14 @@ def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> 
 
 
 def test_two_publishers_of_one_type_share_a_name() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     imports.found(announced("/scan"))
     imports.found(announced("/scan", "base"))
     assert len(imports.entries) == 2
 
 
 def test_a_source_of_this_site_goes_before_those_of_others() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     imports.found(announced("/scan"))
     own = mesh_source("/scan", type_name="std_msgs/Bool")
     imports.own_changed(own, there=True)
@@ -181,7 +194,7 @@ def test_a_source_of_this_site_goes_before_those_of_others() -> None:
 
 
 def test_one_service_has_one_server() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     imports.found(announced("/stop", kind=S, type_name="std_srvs/Trigger"))
     imports.found(announced("/stop", "base", kind=S, type_name="std_srvs/Trigger"))
     assert len(imports.entries) == 1
@@ -189,30 +202,27 @@ def test_one_service_has_one_server() -> None:
 
 
 def test_a_new_run_of_a_module_continues_its_sources() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     old = announced("/scan")
     new = replace(old, module=replace(old.module, instance="f" * 32))
     imports.found(old)
-    imports.take_changes()
     imports.found(new)
     imports.gone(old)
-    [change] = imports.take_changes()
-    assert change.old is not None
-    assert change.new is not None
-    assert change.old.source == change.new.source
-    assert change.new.announced == new
+    [_, (before, after)] = imports.told
+    assert before is not None
+    assert after is not None
+    assert before.source == after.source
+    assert after.announced == new
     imports.gone(new)
-    [change] = imports.take_changes()
-    assert change.new is None
+    assert imports.told[2:] == [(after, None)]
 
 
 def test_what_was_interrupted_is_renewed() -> None:
-    imports = SiteImports(CrossingRules())
+    imports = Imports()
     imports.found(announced("/scan"))
     [shown] = imports.entries
-    imports.take_changes()
     imports.renewed(announced("/scan"))
-    assert imports.take_changes() == [ImportChange(shown, shown)]
+    assert imports.told[1:] == [(shown, shown)]
 
 
 NAMES = st.sampled_from(["/a", "/b"])
@@ -224,7 +234,7 @@ TYPES = st.sampled_from(["std_msgs/String", "std_msgs/Bool"])
 def test_what_one_site_offers_is_shown_at_the_other_without_mixed_types(
     changes: list[tuple[str, str, str, SourceKind, bool, bool]],
 ) -> None:
-    exports, imports = SiteExports("cloud", CrossingRules()), SiteImports(CrossingRules())
+    exports, imports = Exports(site="cloud"), Imports()
     shown: dict[ForeignSource, SiteSource] = {}
     there: set[str] = set()
     own: dict[tuple[SourceKind, str], set[str]] = {}
@@ -239,23 +249,25 @@ def test_what_one_site_offers_is_shown_at_the_other_without_mixed_types(
                 types.discard(f"{module} {type_name}")
         else:
             exports.changed(source, there=come)
-        for change in exports.take_changes():
-            if isinstance(change.item, SiteExport):
-                token = change.item.announced.token()
+        for item, offered in exports.told:
+            if isinstance(item, SiteExport):
+                token = item.announced.token()
                 read = parse_token(token)
                 assert isinstance(read, SiteSource)
-                if change.there:
+                if offered:
                     there.add(token)
                     imports.found(read)
                 else:
                     there.discard(token)
                     imports.gone(read)
-        for each in imports.take_changes():
-            if each.old is not None:
-                assert shown.pop(each.old.source) == each.old.announced
-            if each.new is not None:
-                assert each.new.source not in shown
-                shown[each.new.source] = each.new.announced
+        exports.told.clear()
+        for before, after in imports.told:
+            if before is not None:
+                assert shown.pop(before.source) == before.announced
+            if after is not None:
+                assert after.source not in shown
+                shown[after.source] = after.announced
+        imports.told.clear()
     assert list(shown.values()) == [entry.announced for entry in imports.entries] or set(shown.values()) == {
         entry.announced for entry in imports.entries
     }

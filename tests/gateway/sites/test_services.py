@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteExport, SiteImport
-from rmpa.gateway.sites.services import (
-    SiteServiceExports,
-    SiteServiceImports,
-    asked_type,
-    read_description,
-    write_description,
-)
+from rmpa.gateway.sites.services import SiteServices, asked_type, read_description, write_description
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.gateway.sites.loopback_session import LoopbackSession
+from tests.gateway.memory_zenoh import MemoryZenoh
+from tests.gateway.sites.site_bed import site_context
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -72,16 +69,13 @@ class ServiceGraph:
 class Sites:
     """The parts of two sites on one session."""
 
-    def __init__(self, timeout: float = 30.0, why_not: str = "") -> None:
-        self.session = LoopbackSession()
+    def __init__(self, timeout: float = 30.0, rules: CrossingRules | None = None) -> None:
+        network = MemoryZenoh()
+        self.session = network.session()
         self.there, self.here = ServiceGraph(), ServiceGraph()
-        session, there, here = (cast("Any", each) for each in (self.session, self.there, self.here))
-
-        def refusal(asker: str, _source: object) -> str:
-            return f"{asker}: {why_not}" if why_not else ""
-
-        self.exporter = SiteServiceExports("warehouse", session, there, lambda _: timeout, refusal)
-        self.importer = SiteServiceImports("office", session, here, lambda _: timeout, lambda: 1)
+        session = network.session()
+        self.exporter = SiteServices(site_context("warehouse", self.there, session, rules, timeout=timeout))
+        self.importer = SiteServices(site_context("office", self.here, session, timeout=timeout))
         self.exporter.export(EXPORT)
         self.importer.show(IMPORT)
 
@@ -94,8 +88,8 @@ class Sites:
         return found
 
     async def close(self) -> None:
-        await self.importer.close()
-        await self.exporter.close()
+        for part in (self.importer, self.exporter):
+            await part.close()
 
 
 async def test_a_call_brings_the_response_and_a_query_the_type() -> None:
@@ -107,8 +101,7 @@ async def test_a_call_brings_the_response_and_a_query_the_type() -> None:
     sites.there.server = server
     assert await sites.describe() == MOVE
     assert await sites.call(b"abc") == b"cba"
-    (out,) = cast("Any", sites.exporter.report()["out"])
-    assert (out["calls"], out["failed"], out["type"]) == (1, 0, MOVE.type)
+    assert sites.importer.imported(IMPORT) == {"calls": 1, "failed": 0, "problem": ""}
     await sites.close()
 
 
@@ -198,7 +191,7 @@ async def test_a_new_run_of_the_module_ends_the_calls_of_the_old_one_and_is_call
     call = asyncio.create_task(sites.call())
     await begun.wait()
     newer = SiteSource(SiteModule("warehouse", "arm", "1" * 32), SourceKind.SERVICE, "*", "/driver", "/move")
-    sites.importer.renew(IMPORT, SiteImport(FOREIGN, newer))
+    sites.importer.renew(SiteImport(FOREIGN, newer))
     with pytest.raises(PeerRefused, match="has left"):
         await call
     sites.there.server = answers
@@ -219,6 +212,7 @@ async def test_a_gateway_that_ends_answers_the_calls_under_way() -> None:
     sites.there.server = server
     call = asyncio.create_task(sites.call())
     await begun.wait()
+    sites.exporter.withdraw(EXPORT)
     await sites.exporter.close()
     with pytest.raises(PeerRefused, match="the gateway of site warehouse ends"):
         await call
@@ -253,8 +247,9 @@ async def test_a_service_gets_a_bounded_number_of_calls_at_once(monkeypatch: pyt
 
 
 async def test_a_rule_that_denies_is_the_callers_error() -> None:
-    sites = Sites(why_not="gateway.rule 1 lets it not go out")
-    with pytest.raises(PeerRefused, match=r"office: gateway\.rule 1 lets it not go out"):
+    rule = CrossingRule(sites=("office",), crossing=Crossing.NONE)
+    sites = Sites(rules=CrossingRules((rule,)))
+    with pytest.raises(PeerRefused, match=r"gateway\.rule 1 .* lets it not go out to office"):
         await sites.call()
     await sites.close()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,18 +14,12 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SitePermissions, SourceKind
+from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers
-from rmpa.gateway.sites.catalogue import CrossingRules
-from rmpa.gateway.sites.keys import SiteGateway, SiteHistory, SiteModule, SiteSource
-from rmpa.gateway.sites.why import (
-    SiteWhy,
-    SourceHere,
-    WhyQuestion,
-    here_stages,
-    parse_ways,
-    sent_stages,
-)
+from rmpa.gateway.sites.keys import SiteModule, SiteSource
+from rmpa.gateway.sites.params import SiteParams
+from rmpa.gateway.sites.plans import SiteImport
+from rmpa.gateway.sites.why import SiteWhy, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis
@@ -42,6 +35,10 @@ if TYPE_CHECKING:
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 
 TEXT = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+SCAN = SiteImport(
+    ForeignSource(SourceKind.TOPIC, "yard", "arm", "/n", "/t", "a/B"),
+    SiteSource(SiteModule("yard", "arm", "0" * 32), SourceKind.TOPIC, "a/B", "/n", "/t"),
+)
 
 
 @dataclass
@@ -49,7 +46,6 @@ class Asked:
     """One site, and what answers for it."""
 
     site: Site
-    history: SiteHistory
     answers: SiteAnswers
     params: list[tuple[str, str, str]]
 
@@ -74,31 +70,21 @@ async def asked(
     def may(asker: str, access: Access, name: str) -> bool:
         return not asker or gate.judge(access, asker, name).allowed
 
-    site = await bed.site(name, rules=rules)
-    history = SiteHistory(time.monotonic)
-    site.neighbour.on_sites = history.seen
-    site.neighbour.on_site_source = lambda source, there: history.source(source, there=there)
-    crossing = CrossingRules(rules, permissions=SitePermissions(gate))
-    why = SiteWhy(name, f"{name}_gateway", site.session, site.neighbour, history, crossing, may)
+    site = await bed.site(name, rules=rules, gate=gate)
     params: list[tuple[str, str, str]] = []
 
-    async def ask_param(_asker: str, at: str, module: str, what: str, args: dict[str, Any]) -> object:
-        params.append((at, module, what))
-        return args
+    class Params(SiteParams):
+        async def ask(self, asker: str, at: str, module: str, args: dict[str, Any]) -> object:
+            del asker
+            params.append((at, module, args["what"]))
+            return args
 
+    unused: Any = None
     answers = SiteAnswers(
-        f"{name}_gateway",
-        SiteGateway(name, 100, "0" * 32),
-        site.neighbour,
-        history,
-        lambda: ("tcp/x:1",),
-        ask_param,
-        why,
-        may if gate.on else None,
+        site.neighbour, f"{name}_gateway", Params(site.neighbour.context, unused), may if gate.on else None
     )
-    site.neighbour.add(answers)
     await until(lambda: site.neighbour.leads)
-    return Asked(site, history, answers, params)
+    return Asked(site, answers, params)
 
 
 def levels(diagnosis: Diagnosis) -> dict[str, str]:
@@ -161,7 +147,8 @@ async def test_a_module_and_a_site_are_told_only_of_what_they_may_have() -> None
     to_hall = PermissionRule(("hall",), names={"subscribe": ("/open", "/hidden")})
     async with site_bed() as bed:
         yard = await asked(bed, "yard", permissions=(to_hall,))
-        hall = await asked(bed, "hall", permissions=(to_desk,))
+        to_yard = PermissionRule(("yard",), names={"publish": ("/**",)})
+        hall = await asked(bed, "hall", permissions=(to_desk, to_yard))
         for name in ("/open", "/hidden", "/secret"):
             yard.site.graph.add(name, TEXT)
             hall.site.graph.add(f"/home{name}", TEXT, module="press")
@@ -197,7 +184,7 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
         (module,) = report.sites[1].modules
         assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
         await yard.site.neighbour.close()
-        await until(lambda: hall.history.away == ("yard",))
+        await until(lambda: hall.site.neighbour.history.away == ("yard",))
         report = await hall.report()
         assert report.sites[1].state == "unreachable"
         assert report.sites[1].since_ago is not None
@@ -241,8 +228,7 @@ def test_losses_are_told_with_the_hop_where_they_happen() -> None:
     assert "7 were dropped by its queue" in sent.text
     assert "3 were left out by rate or size of the rule" in sent.text
     report = {"wanted": True, "messages": 80, "rate": 9.5, "lost": 10, "dropped": 0, "mismatched": 2}
-    here = SourceHere(SourceKind.TOPIC, "yard", "arm", "/n", "/t", "/t", report=report)
-    arrived = here_stages("hall", here)[-1]
+    arrived = here_stages(SCAN, report)[-1]
     assert (arrived.name, arrived.level) == ("arrived", WARN)
     assert arrived.text == (
         "80 messages have come, 9.5 Hz; 10 were lost between the gateways; 2 have another md5 sum than their header"
@@ -251,7 +237,7 @@ def test_losses_are_told_with_the_hop_where_they_happen() -> None:
 
 def test_another_definition_is_the_stage_md5() -> None:
     report = {"wanted": True, "problem": "its messages have the md5 sum aa, its header bb"}
-    stages = here_stages("hall", SourceHere(SourceKind.TOPIC, "yard", "arm", "/n", "/t", "/t", report=report))
+    stages = here_stages(SCAN, report)
     assert (stages[-1].name, stages[-1].level) == ("md5", FAIL)
 
 
@@ -260,7 +246,7 @@ async def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
         yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
         yard.site.graph.add("/chatter", TEXT)
         await until(lambda: hall.site.shows("/chatter"))
-        await yard.answers.close()
+        await yard.answers._why.close()
         (way,) = await hall.why("/chatter")
         assert levels(way)["source there"] == "unknown"
         assert levels(way)["demand here"] == "fail"
@@ -284,38 +270,6 @@ async def test_a_router_that_keeps_a_subscription_back_is_named(monkeypatch: pyt
         (told,) = await hall.why("/chatter")
         assert told.failed is not None
         assert told.failed.name == "router"
-
-
-def test_history() -> None:
-    now = 0.0
-    history = SiteHistory(lambda: now)
-    history.seen(["yard", "hall"])
-    now = 5.0
-    history.seen(["hall"])
-    now = 7.0
-    history.seen(["hall"])
-    assert history.away == ("yard",)
-    assert (history.since_ago("yard"), history.since_ago("hall"), history.since_ago("moon")) == (2.0, 7.0, None)
-
-
-def test_what_a_site_had_is_remembered_while_it_is_away() -> None:
-    now = 0.0
-    history = SiteHistory(lambda: now)
-    arm = SiteModule("yard", "arm", "0" * 32)
-    scan, old, last = (SiteSource(arm, SourceKind.TOPIC, "a/B", "/n", name) for name in ("/scan", "/old", "/last"))
-    for source in (scan, old, last):
-        history.source(source, there=True)
-    history.seen(["yard"])
-    assert history.had("/scan") == (), "it is there"
-    history.source(old, there=False)
-    now = 9.0
-    history.source(last, there=False)  # withdrawn by a gateway that ends
-    history.seen([])
-    assert [history.had(name) for name in ("/scan", "/last", "/old")] == [(("yard", "arm"),), (("yard", "arm"),), ()]
-    history.source(last, there=True)
-    history.seen(["yard"])
-    history.seen([])
-    assert [history.had(name) for name in ("/scan", "/last")] == [(), (("yard", "arm"),)]
 
 
 async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it() -> None:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind, ZenohQos
+from rmpa.gateway.neighbour import ForeignSource, SourceKind, ZenohQos
 from rmpa.gateway.ros2 import action_messages as messages
 from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, action_name
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
-from rmpa.gateway.ros2.graph import valid_name
+from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
 from rmpa.gateway.ros2.shown_action import JoinedAction, ShownAction, find_headers, find_parts
 
@@ -401,10 +401,6 @@ class Ros2Actions:
         self._offered.clear()
         self._shown.clear()
 
-    def report(self) -> dict[str, object]:
-        """Nothing: what is wrong with one is among the problems."""
-        return {}
-
     # --- inside -----------------------------------------------------------------------------------------------------
 
     def _server_changed(self, name: str, part: str, source: MeshSource, *, there: bool) -> None:
@@ -429,7 +425,7 @@ class Ros2Actions:
             return
         result = whole[0]["result"]
         ros1 = action_name(result.type, "ActionResult")
-        if self._context.crossing.outgoing(result.module, result.name).allowed and ros1:
+        if self._context.rules.outgoing_to(SITE, result.module, result.name).allowed and ros1:
             self._offered[name] = OfferedAction(self._context, name, ros1, whole[0])
             self._offered[name].start()
 
@@ -450,12 +446,13 @@ class Ros2Actions:
             return
         if (before := self._leaving.pop(name, None)) is not None:
             before.finish()
-        decision = self._context.crossing.incoming(SourceKind.SERVICE, name, "*", endpoint.node.name)
+        source = ForeignSource(SourceKind.SERVICE, SITE, "", endpoint.node.name, name, "*")
+        decision = self._context.rules.incoming(source)
         if decision.allowed:
             self._shown[name] = shown = ShownAction(self._context, endpoint, name, decision.name)
             shown.start()
-            for source in self._clients.get(decision.name, ()):
-                shown.client(source, there=True)
+            for client in self._clients.get(decision.name, ()):
+                shown.client(client, there=True)
 
     def _show_other(self, name: str) -> None:
         """The server is gone: the next of this name takes its place."""

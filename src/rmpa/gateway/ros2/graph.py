@@ -1,68 +1,31 @@
-"""ROS 2's graph: which sources cross, under which names, by which types, and why one does not.
-
-Which sources cross between the mesh and ROS 2, and under which names, by ``[[gateway.rule]]``.
-"""
+"""ROS 2's graph: what its tokens tell, what the gateway declares there, and types that its nodes are asked for."""
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import re
 import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.config.rules import ROS2
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.conversion import NoConversion
 from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, parse_token
 from rmpa.gateway.ros2.pairs import described_types
 from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
-from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
-from rmpa.observe.peer_info import FAIL, OK, WARN, Check
-from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
 
-    from rmpa.config.rules import CrossingRule
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
-SITE: Final = "ros2"
+SITE: Final = ROS2
 """The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too."""
-PLUMBING: Final = frozenset(("/rosout", "/parameter_events"))
-"""Topics that each node of ROS 2 has; they do not cross unless a rule names them as they are."""
-
-
-class Ros2Crossing:
-    """Judges sources by the rules; the first that fits holds, and without one everything crosses.
-
-    Args:
-        rules: The tables ``[[gateway.rule]]``, in order.
-    """
-
-    def __init__(self, rules: Sequence[CrossingRule] = ()) -> None:
-        self._rules = tuple(rules)
-        self._crossing = CrossingRules(rules)
-
-    def outgoing(self, module: str, name: str) -> CrossingDecision:
-        """Decide whether a source of a module crosses to ROS 2, by its name in its module."""
-        return self._crossing.outgoing_to(SITE, module, name)
-
-    def incoming(self, kind: SourceKind, name: str, type_name: str, node: str) -> CrossingDecision:
-        """Decide whether a topic or service of ROS 2 is shown here, and under which name."""
-        if name in PLUMBING and not any(name in rule.names for rule in self._rules):
-            return CrossingDecision(
-                False, f"{name} is of each ROS 2 node; a gateway.rule that names it lets it cross"
-            )
-        return self._crossing.incoming(kind, SITE, SITE, name, type_name, node)
-
-    def name_here(self, name: str) -> str | None:
-        """The name here of a service of ROS 2; ``None`` if it does not cross."""
-        decision = self.incoming(SourceKind.SERVICE, name, "*", "")
-        return decision.name if decision.allowed else None
 
 
 # Two endpoints of one name that do not hear each other, as their keys differ: ROS 2 itself says nothing.
@@ -125,9 +88,9 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
-        self._rivals: dict[str, Ros2Node] = {}
-        self._rivals_named: dict[str, dict[str, str]] = {}
+        self._rivals: dict[str, dict[str, str]] = {}
         """By the name of a node the tokens and sessions of other gateways that show it."""
+        self._rival_tokens = 0
         self.ignored: Counter[str] = Counter()
         """Tokens that were ignored, by reason."""
 
@@ -150,24 +113,24 @@ class Ros2Graph:
         Returns:
             The node's name; empty if the token is no such one.
         """
-        if not alive:
-            gone = self._rivals.pop(key, None)
-            if gone is None:
-                return ""
-            del self._rivals_named[gone.name][key]
-            if not self._rivals_named[gone.name]:
-                del self._rivals_named[gone.name]
-            return gone.name
         try:
             node = parse_token(key)
         except RemoteProtocolError:
             return ""
         if not isinstance(node, Ros2Node) or node.zid == self._own_zid or node.domain != self._domain:
             return ""
-        if not node.name.startswith(OWN_NAMESPACE) or len(self._rivals) >= limits.ROS2_NODES_MAX:
+        shown = self._rivals.get(node.name, {})
+        if not node.name.startswith(OWN_NAMESPACE) or alive == (key in shown):
             return ""
-        self._rivals[key] = node
-        self._rivals_named.setdefault(node.name, {})[key] = node.zid
+        if alive and self._rival_tokens >= limits.ROS2_NODES_MAX:
+            return ""
+        self._rival_tokens += 1 if alive else -1
+        if alive:
+            self._rivals.setdefault(node.name, {})[key] = node.zid
+        else:
+            del shown[key]
+            if not shown:
+                del self._rivals[node.name]
         return node.name
 
     def led_by(self, node: str) -> str:
@@ -176,7 +139,7 @@ class Ros2Graph:
         Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
         node the one with the least session id goes on.
         """
-        shown = self._rivals_named.get(node, {}).values()
+        shown = self._rivals.get(node, {}).values()
         return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:
@@ -186,7 +149,12 @@ class Ros2Graph:
             The node or endpoint that is new or gone; ``None`` if nothing has changed.
         """
         if not alive:
-            return self._remove(key)
+            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None)
+            if isinstance(gone, Ros2Endpoint):
+                del self._by_name[gone.name][key]
+                if not self._by_name[gone.name]:
+                    del self._by_name[gone.name]
+            return gone
         if key in self._nodes or key in self._endpoints:
             return None
         try:
@@ -219,20 +187,7 @@ class Ros2Graph:
             return "too many nodes" if len(self._nodes) >= limits.ROS2_NODES_MAX else ""
         if not _valid(entity.name) or _TYPE.fullmatch(entity.type) is None:
             return "impossible name"
-        if len(self._endpoints) >= limits.ROS2_ENDPOINTS_MAX:
-            return "too many endpoints"
-        return ""
-
-    def _remove(self, key: str) -> Ros2Node | Ros2Endpoint | None:
-        if (node := self._nodes.pop(key, None)) is not None:
-            return node
-        if (endpoint := self._endpoints.pop(key, None)) is None:
-            return None
-        others = self._by_name[endpoint.name]
-        del others[key]
-        if not others:
-            del self._by_name[endpoint.name]
-        return endpoint
+        return "too many endpoints" if len(self._endpoints) >= limits.ROS2_ENDPOINTS_MAX else ""
 
 
 def _order(zid: str) -> int:
@@ -251,100 +206,6 @@ def _valid(name: str) -> bool:
     return len(name) <= limits.ROS2_NAME_MAX and _NAME.fullmatch(name) is not None
 
 
-# ``rmpa why`` between modules and ROS 2: the stages of a topic's way, from what the neighbour reports. Without I/O.
-#
-# ::
-#
-#     out: rule ─ type ─ heard (hashes) ─ demand ─ sent          in: rule ─ type ─ shown ─ demand ─ arrived
-
-
-_RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
-_LOST: Final = {
-    "lost": "were lost on the way, by their numbers",
-    "dropped": "were dropped by a full queue",
-    "limited": "were left out for the rule's rate or size",
-    "unconverted": "could not be converted",
-    "unheard": "came before a node subscribed",
-}
-
-
-def topic_ways(report: Mapping[str, Any], name: str, gateway: str, *, here_only: bool = False) -> list[Diagnosis]:
-    """The ways of a topic from ROS 2 to the modules, and from the modules to ROS 2.
-
-    Args:
-        report: What the neighbour reports.
-        name: The topic, by its name here; with ``here_only`` also by its name in ROS 2.
-        gateway: The gateway's name.
-        here_only: Whether only what comes from ROS 2 is meant.
-    """
-    problems: Mapping[str, str] = report["problems"]
-    ways: list[Diagnosis] = []
-    for row in report["topics"]:
-        coming = row["direction"] == "in"
-        if name != row["here"] and not (here_only and coming and name == row["topic"]):
-            continue
-        if coming:
-            stages = until_failure(_in_stages(row))
-            ways.append(Diagnosis.of(stages, name=row["here"], peer=SITE, to=gateway, node=row["node"]))
-        elif not here_only:
-            stages = until_failure(_out_stages(row, problems))
-            ways.append(Diagnosis.of(stages, name=name, peer=row["module"], to=SITE, node=row["node"]))
-    for what, why in report["topics_refused"].items():
-        topic, _, node = what.partition(" of ")
-        if topic == name:
-            from_ros2 = not node.startswith("/rmpa/")
-            if from_ros2 or not here_only:
-                ends = {"peer": SITE, "to": gateway} if from_ros2 else {"peer": gateway, "to": SITE}
-                ways.append(Diagnosis.of((Check("rule", FAIL, why, _RULES),), name=name, node=node, **ends))
-    return ways
-
-
-def _out_stages(row: Mapping[str, Any], problems: Mapping[str, str]) -> Iterator[Check]:
-    yield Check("rule", OK, row["rule"])
-    if row["problem"]:
-        yield Check("type", FAIL, row["problem"])
-    if not row["ros2_type"]:
-        yield Check("type", WARN, f"ROS 2 has no {row['type']}; its publisher is being asked for the definition")
-        return
-    kept = ", transient local" if row["latched"] else ""
-    yield Check("type", OK, f"it is {row['ros2_type']} in ROS 2{kept}")
-    deaf = [f"{what.partition(' of ')[2]}: {text}" for what, text in problems.items() if _is_end(what, row["here"])]
-    if deaf:
-        yield Check("heard", FAIL if not row["wanted"] else WARN, "; ".join(deaf))
-    if not row["wanted"]:
-        yield Check("demand", WARN, "no node of ROS 2 subscribes: nothing is sent")
-        return
-    yield Check("demand", OK, "a node of ROS 2 subscribes")
-    waiting = f", {row['waiting']} wait" if row["waiting"] else ""
-    yield _flow("sent", f"{row['sent']} messages were sent{waiting}", row, row["sent"])
-
-
-def _in_stages(row: Mapping[str, Any]) -> Iterator[Check]:
-    yield Check("rule", OK, row["rule"])
-    if row["problem"]:
-        yield Check("type", FAIL, row["problem"])
-    kept = ", transient local" if row["latched"] else ""
-    yield Check("type", OK, f"{row['ros2_type']} of ROS 2 is {row['type']} here{kept}")
-    was = f" (ROS 2's {row['topic']})" if row["topic"] != row["here"] else ""
-    yield Check("shown", OK, f"it is {row['here']} here{was}, at /rmpa/{SITE}{row['node']}")
-    if not row["wanted"]:
-        yield Check("demand", WARN, "no node of a module subscribes: it crosses once one does")
-        return
-    yield Check("demand", OK, "a node of a module subscribes")
-    yield _flow("arrived", f"{row['received']} messages have come", row, row["received"])
-
-
-def _flow(stage: str, text: str, row: Mapping[str, Any], messages: int) -> Check:
-    lost = [f"{row[key]} {words}" for key, words in _LOST.items() if row.get(key)]
-    return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)))
-
-
-def _is_end(what: str, name: str) -> bool:
-    """Whether a problem is one of a ROS 2 node with a topic of this name."""
-    topic, _, node = what.partition(" of ")
-    return topic == name and node.startswith("/") and not node.startswith("/rmpa/")
-
-
 # The nodes and endpoints that the gateway declares in ROS 2's graph, for the nodes of its modules.
 #
 # A module's node is ``/rmpa/<module>/<node>`` there, as its proxy is here. What the gateway itself subscribes to or
@@ -360,13 +221,12 @@ class OwnEndpoint:
     Args:
         nodes: The node's owner.
         endpoint: The endpoint.
-        gid_bytes: The length of its GID.
+        gid: What its messages, requests or replies have in their attachment.
     """
 
-    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid_bytes: int) -> None:
+    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid: bytes) -> None:
         self.endpoint = endpoint
-        self.gid = gid_of(endpoint.token(), gid_bytes)
-        """What its messages, requests or replies have in their attachment."""
+        self.gid = gid
         self._nodes = nodes
         self._token: Declaration | None = nodes.session.token(endpoint.token())
 
@@ -396,9 +256,9 @@ class OwnRos2Nodes:
         """The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own."""
         self._domain = domain
         self._gid_bytes = gid_bytes
-        self._next = 0
+        self._numbers = itertools.count()
         self._nodes: dict[str, tuple[Ros2Node, Declaration]] = {}
-        self._uses: dict[str, int] = {}
+        self._uses: Counter[str] = Counter()
 
     def declare(
         self, node: str, kind: EntityKind, name: str, type_name: str, type_hash: str, qos: Ros2Qos
@@ -414,14 +274,14 @@ class OwnRos2Nodes:
             qos: Its QoS.
         """
         if node not in self._nodes:
-            made = Ros2Node(self._domain, self.session.zid, self._number(), node)
+            made = Ros2Node(self._domain, self.session.zid, next(self._numbers), node)
             self._nodes[node] = (made, self.session.token(made.token()))
+        self._uses[node] += 1
         owner = self._nodes[node][0]
-        self._uses[node] = self._uses.get(node, 0) + 1
-        endpoint = Ros2Endpoint(owner, self._number(), kind, name, type_name, type_hash, qos)
-        declared = OwnEndpoint(self, endpoint, self._gid_bytes)
-        self.gids.add(declared.gid)
-        return declared
+        endpoint = Ros2Endpoint(owner, next(self._numbers), kind, name, type_name, type_hash, qos)
+        gid = gid_of(endpoint.token(), self._gid_bytes)
+        self.gids.add(gid)
+        return OwnEndpoint(self, endpoint, gid)
 
     def release(self, node: Ros2Node) -> None:
         """One endpoint of a node was taken back; the node's token goes with the last."""
@@ -429,10 +289,6 @@ class OwnRos2Nodes:
         if not self._uses[node.name]:
             del self._uses[node.name]
             self._nodes.pop(node.name)[1].close()
-
-    def _number(self) -> int:
-        self._next += 1
-        return self._next - 1
 
 
 def gid_of(token: str, size: int = 16) -> bytes:

@@ -1,38 +1,45 @@
-"""Topics of modules in ROS 2's graph.
-
-One topic of one publisher of the mesh, as that of a node of ROS 2.
-"""
+"""Topics between modules and ROS 2: exports in ROS 2's graph, and ROS 2's topics in the gateway's graph."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
+import struct
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
-from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, ros2_qos, zenoh_qos
-from rmpa.gateway.ros2.graph import mismatch, valid_name
+from rmpa.gateway.ros2.format import (
+    GID_BYTES,
+    EntityKind,
+    Ros2Attachment,
+    Ros2Durability,
+    Ros2Qos,
+    ros2_qos,
+    zenoh_qos,
+)
+from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
 from rmpa.gateway.ros2.pairs import Ros2Pairs
-from rmpa.gateway.ros2.topic_import import Ros2TopicImport
-from rmpa.gateway.sites.exported_topic import TopicLimits
+from rmpa.gateway.ros2.types import Ros2Sequences
+from rmpa.gateway.topics import Export
 from rmpa.ros.types.find import find_message_type, type_of_header
+from rmpa.ros.wire.tcpros import TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
-    from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.foreign import ProxiedTopic
+    from rmpa.gateway.neighbour import MeshSource, ZenohQos, ZenohSample
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
-    from rmpa.gateway.sites.catalogue import CrossingDecision
-    from rmpa.gateway.zenoh.threads import QueuedPublisher
+    from rmpa.gateway.rules import CrossingDecision
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import TopicDescription
+    from rmpa.ros.wire.tcpros import Buffer
 
 _STATIC_TF: Final = "/tf_static"
 """Its publishers latch, in ROS 1 and ROS 2 (tf2_ros)."""
@@ -47,260 +54,358 @@ _STREAMS: Final = frozenset(
     )
 )
 """Types of streams: their publishers are not asked whether they latch, since a driver may start by being asked."""
+_TOPIC_ENDS: Final = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+_SEQ: Final = struct.Struct("<I")
 
 
-class Ros2TopicExport:
-    """Declares the topic in ROS 2's graph, and sends its messages while a ROS 2 node subscribes.
+class Ros2Dialect:
+    """The dialect of an ``Export`` to ROS 2: messages are converted, and a token has the type's hash.
 
     A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
-    the key. Whether a topic is latched only its publisher's header tells too, so each is asked once, a while after it
-    appeared; those of images, scans and clouds are not, for a driver may start by that. A latched one becomes
-    transient local, and stays subscribed to once it was wanted, so that what is kept for late subscribers is the last
-    message.
+    the key. A latched topic becomes transient local, and stays connected once it was wanted, so that what is kept for
+    late subscribers is the last message.
 
     Args:
-        context: What the parts share.
-        pairs: The pairs of types.
+        part: Tells it the types, and compares it with what ROS 2 has.
         source: The topic.
         decision: The rule that lets it cross.
-        looks: Bounds how many publishers are asked at once whether they latch.
-        on_declared: Called with this once it has another type or hash in ROS 2's graph.
     """
 
-    def __init__(
-        self,
-        context: Ros2Context,
-        pairs: Ros2Pairs,
-        source: MeshSource,
-        decision: CrossingDecision,
-        looks: asyncio.Semaphore,
-        on_declared: Callable[[Ros2TopicExport], None],
-    ) -> None:
-        self._on_declared = on_declared
-        self._context = context
-        self._pairs = pairs
+    def __init__(self, part: Ros2Topics, source: MeshSource, decision: CrossingDecision) -> None:
         self.source: Final = source
-        self._why = decision.why
-        self._limit = TopicLimits(decision.rate, decision.size)
+        self.why: Final = decision.why
+        self.endpoint: OwnEndpoint | None = None
+        """The publisher in ROS 2's graph; ``None`` while its type is not known."""
+        self.unconverted = 0
+        self._part = part
+        self._conversion: Conversion | None = None
         self._latching = source.name == _STATIC_TF or (
             source.name.endswith("/descriptor") and source.type == "std_msgs/String"  # of a Smart Resource
         )
-        self._looks = looks
-        self._was_described = asyncio.Event()
-        self._tap: TopicTap | None = None
-        self._opening = False
-        self._publisher: QueuedPublisher | None = None
-        self._endpoint: OwnEndpoint | None = None
-        self._conversion: Conversion | None = None
-        self._wanted = self._was_wanted = False
-        self._closed = False
-        self._sequence = 0
-        self._sent_before = 0
-        self._dropped_before = 0
-        self._failed = 0
-        self.problem = ""
-        """Why its messages do not reach ROS 2; empty for nothing."""
 
     @property
-    def endpoint(self) -> OwnEndpoint | None:
-        """The publisher in ROS 2's graph; ``None`` while its type is not known."""
-        return self._endpoint
+    def latched(self) -> bool:
+        """Whether it is transient local in ROS 2."""
+        return self.endpoint is not None and self.endpoint.endpoint.qos.latched
 
-    def start(self) -> None:
-        """Declare it, or ask its publisher for its type first."""
+    def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
+        """Of ``ExportDialect``: once latched it stays so, and no message yields for its size."""
+        del large
+        context, source = self._part.context, self.source
         try:
-            found = self._pairs.ros2_type(self.source.type)
-        except NoConversion as error:
-            self._fail(str(error))
-            return
+            found = self._part.pairs.ros2_type(source.type) if about is None else self._learn(about)
+        except RmpaError:
+            self._conversion = None
+            self.close()
+            raise
         if found is None:
-            self._open_tap()
-        else:
-            self._declare(*found)
-            if self._endpoint is not None and not self._endpoint.endpoint.qos.latched:
-                self._context.spawn(self._look())
+            return None
+        self._latching = self._latching or latched
+        qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching)
+        old = self.endpoint
+        if old is None or (old.endpoint.type, old.endpoint.type_hash, old.endpoint.qos) != (*found, qos):
+            self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, *found, qos)
+            if old is not None:
+                old.close()
+            self._part.declared(self)
+        assert self.endpoint is not None  # noqa: S101 - it is declared here, or was before
+        return self.endpoint.endpoint.key(), zenoh_qos(context.contracts.of(source.name, source.type), qos)
 
-    def retry(self) -> None:
-        """Types were learnt: try again if its own was missing."""
-        if self._endpoint is None and self._tap is None and not self._closed:
-            self.start()
+    def payload(self, body: memoryview) -> bytes | None:
+        """Of ``ExportDialect``."""
+        if self._conversion is None:
+            return None
+        try:
+            return self._conversion.to_ros2(body)
+        except ConversionError as error:
+            self.unconverted += 1
+            if self.unconverted == 1:
+                self.told(str(error))
+            return None
+
+    def attachment(self, sequence: int, stamp: int) -> bytes:
+        """Of ``ExportDialect``."""
+        return Ros2Attachment(sequence, stamp, self.endpoint.gid if self.endpoint is not None else b"").serialize()
+
+    def linger(self, *, keeps: bool) -> float | None:
+        """Of ``ExportDialect``."""
+        return None if keeps else 0.0
+
+    def told(self, problem: str) -> None:
+        """Of ``ExportDialect``."""
+        self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
 
     def close(self) -> None:
-        """Take it out of ROS 2's graph."""
-        self._closed = True
-        self._close_tap()
-        self._withdraw()
-        self._context.say(self._subject, "")
+        """Of ``ExportDialect``."""
+        if self.endpoint is not None:
+            self.endpoint.close()
+            self.endpoint = None
 
-    def report(self) -> dict[str, object]:
-        """Its state, as JSON values."""
-        publisher = self._publisher
-        endpoint = None if self._endpoint is None else self._endpoint.endpoint
-        return {
-            "direction": "out",
-            "topic": self.source.name,
-            "here": self.source.here,
-            "module": self.source.module,
-            "node": self.source.node,
-            "type": self.source.type,
-            "ros2_type": "" if endpoint is None else endpoint.type,
-            "latched": endpoint is not None and endpoint.qos.latched,
-            "wanted": self._wanted,
-            "rule": self._why,
-            "sent": self._sent_before + (0 if publisher is None else publisher.sent),
-            "dropped": self._dropped_before + (0 if publisher is None else publisher.dropped),
-            "limited": self._limit.dropped,
-            "waiting": 0 if publisher is None else publisher.waiting,
-            "unconverted": self._failed,
-            "problem": self.problem,
-        }
+    def _learn(self, about: TopicDescription) -> tuple[str, str]:
+        fields = {"type": about.type, "md5sum": about.md5sum, "message_definition": about.definition}
+        kind = type_of_header(fields)
+        found = self._part.pairs.learn(kind)
+        self._conversion = self._part.pairs.outgoing(kind)
+        return found
 
-    # --- in ROS 2's graph ----------------------------------------------------------------------------------------
 
-    def _declare(self, type_name: str, type_hash: str) -> None:
-        """Declare it, or declare it anew with another type or QoS; messages that wait are sent before."""
-        context, source = self._context, self.source
-        contract = context.contracts.of(source.name, source.type)
-        qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching)
-        old_endpoint, old_publisher = self._endpoint, self._publisher
-        self._endpoint = context.nodes.declare(
-            source.proxy, EntityKind.PUBLISHER, source.here, type_name, type_hash, qos
+class _Publisher:
+    """What one node of ROS 2 publishes of a topic; it may have several publishers of it."""
+
+    def __init__(self, node: str, topic: Ros2Import) -> None:
+        self.node: Final = node
+        self.endpoints: list[Ros2Endpoint] = []
+        self.wanted = False
+        self.kept: bytes | None = None
+        """The last message of a transient local one that is not wanted."""
+        self.received = self.dropped = 0
+        source = ForeignSource(SourceKind.TOPIC, SITE, "", node, topic.decision.name, topic.ros1_type)
+        self.topic: ProxiedTopic = topic.part.context.graph.show_topic(
+            source, lambda wanted: topic.demand(self, wanted)
         )
-        publisher: list[QueuedPublisher] = []
-
-        def matching(there: bool) -> None:
-            if not publisher or publisher[0] is self._publisher:
-                self._matching(there=there)
-
-        self._publisher = context.session.publisher(self._endpoint.endpoint.key(), zenoh_qos(contract, qos), matching)
-        publisher.append(self._publisher)
-        self._sequence = 0
-        self._drop(old_endpoint, old_publisher)
-        self._on_declared(self)
-
-    def _withdraw(self) -> None:
-        endpoint, publisher = self._endpoint, self._publisher
-        self._endpoint, self._publisher = None, None
-        self._drop(endpoint, publisher)
-
-    def _drop(self, endpoint: OwnEndpoint | None, publisher: QueuedPublisher | None) -> None:
-        if endpoint is not None:
-            endpoint.close()
-        if publisher is not None:
-            self._sent_before += publisher.sent + publisher.waiting
-            self._dropped_before += publisher.dropped
-            publisher.close()
-
-    def _matching(self, *, there: bool) -> None:
-        """Zenoh's matching tells of demand, not the tokens of subscriptions: what is sent before it is lost."""
-        if self._closed or self._endpoint is None:
-            return
-        self._wanted = there
-        if there:
-            self._was_wanted = True
-            self._open_tap()
-        elif not self._keeps:
-            self._close_tap()
-
-    # --- in the mesh ---------------------------------------------------------------------------------------------
 
     @property
-    def _keeps(self) -> bool:
-        """Whether its messages are kept for late subscribers, once one has come."""
-        return self._was_wanted and self._endpoint is not None and self._endpoint.endpoint.qos.latched
+    def latched(self) -> bool:
+        return any(each.qos.latched for each in self.endpoints)
 
-    def _open_tap(self) -> None:
-        if self._tap is None and not self._opening:
-            self._opening = True
-            self._tap = self._context.graph.tap(self.source, self._message, self._described, self._lost)
-            self._opening = False
 
-    async def _look(self) -> None:
-        """Ask the publisher once for its header, unless a subscriber has it asked before."""
-        if self.source.type in _STREAMS:
+class Ros2Import:
+    """Shows the publishers of one key, and subscribes to it while a node or module wants one of them.
+
+    All publishers of one topic, type and hash share a key. What comes is given to the node whose publisher's GID is
+    in the attachment; a GID that fits no token (plain Zenoh programs choose their own) is given to a publisher
+    without messages of its own. A header's ``seq``, which ROS 2 lacks, is the message's number at its publisher.
+
+    Args:
+        part: Is told once it is idle.
+        first: A publisher of the topic.
+        ros1_type: ``package/Name`` of ROS 1.
+        decision: The rule that lets it cross, and its name here.
+    """
+
+    # More than twelve fields: publishers, demand, and messages that are too early change each other.
+
+    def __init__(self, part: Ros2Topics, first: Ros2Endpoint, ros1_type: str, decision: CrossingDecision) -> None:
+        self.part: Final = part
+        self.first: Final = first
+        self.ros1_type: Final = ros1_type
+        self.decision: Final = decision
+        self.conversion: Conversion | None = None
+        self.problem = ""
+        """Why its messages do not come; empty for nothing."""
+        self.publishers: dict[str, _Publisher] = {}
+        """By node."""
+        self._by_gid: dict[bytes, _Publisher] = {}
+        self._adopted: dict[bytes, _Publisher] = {}
+        self._has_seq = False
+        self._subscribed: tuple[Declaration, OwnEndpoint] | None = None
+        self._history = False
+        self._sequences = Ros2Sequences()
+        self._early: deque[tuple[bytes, int, bytes]] = deque()
+        self._early_bytes = self._unheard = self._unconverted = 0
+        self._lingering: asyncio.TimerHandle | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether it has no publishers, and none came or went a moment ago: its publisher does not restart."""
+        return not self.publishers and self._lingering is None
+
+    def add(self, endpoint: Ros2Endpoint) -> None:
+        """A publisher appeared."""
+        node = endpoint.node.name
+        if node not in self.publishers:
+            self.publishers[node] = _Publisher(node, self)
+        publisher = self.publishers[node]
+        publisher.endpoints.append(endpoint)
+        self._by_gid[gid_of(endpoint.token())] = publisher
+        self._describe(publisher)
+        self._linger()
+        if publisher.latched and not self._history:
+            self._unsubscribe()  # again, with the history
+        self._follow_demand()
+
+    def remove(self, endpoint: Ros2Endpoint) -> None:
+        """A publisher is gone."""
+        publisher = self._by_gid.pop(gid_of(endpoint.token()), None)
+        if publisher is None:
             return
-        await asyncio.sleep(limits.LATCH_LOOK_AFTER)
-        async with self._looks:
-            if self._closed or self._was_described.is_set():
+        self._linger()
+        publisher.endpoints.remove(endpoint)
+        self._adopted = {gid: each for gid, each in self._adopted.items() if each is not publisher}
+        if not publisher.endpoints:
+            self.publishers.pop(publisher.node).topic.close()
+        self._follow_demand()
+
+    def converted(self, conversion: Conversion | None, problem: str = "") -> None:
+        """The conversion of its type was found, or why there is none."""
+        self.conversion, self.problem = conversion, problem
+        self._has_seq = conversion is not None and _begins_with_header(conversion.ros1)
+        self._say(problem)
+        for publisher in self.publishers.values():
+            self._describe(publisher)
+        self._follow_demand()
+
+    def close(self) -> None:
+        """Take it out of the gateway's graph."""
+        if self._lingering is not None:
+            self._lingering.cancel()
+        for publisher in self.publishers.values():
+            publisher.topic.close()
+        self._unsubscribe()
+        self.publishers.clear()
+        self._say("")
+
+    def report(self) -> Iterator[dict[str, object]]:
+        """Its state, as JSON values: one row for each node."""
+        for each in self.publishers.values():
+            yield {
+                "direction": "in",
+                "topic": self.first.name,
+                "here": self.decision.name,
+                "type": self.ros1_type,
+                "ros2_type": self.first.type,
+                "rule": self.decision.why,
+                "lost": self._sequences.lost,
+                "unheard": self._unheard,
+                "unconverted": self._unconverted,
+                "node": each.node,
+                "latched": each.latched,
+                "wanted": each.wanted,
+                "received": each.received,
+                "dropped": each.dropped,
+                "problem": self.problem or each.topic.problem,
+            }
+
+    # --- demand --------------------------------------------------------------------------------------------------
+
+    def demand(self, publisher: _Publisher, wanted: bool) -> None:
+        """A node or module wants a publisher, or none does any more."""
+        publisher.wanted = wanted
+        kept, publisher.kept = publisher.kept, None
+        if not wanted:
+            publisher.topic.forget_latched()
+        self._follow_demand()
+        if not wanted:
+            return
+        if kept is not None:  # this key was subscribed to already: its history came then
+            self._deliver(publisher, kept, 0)
+        early, self._early, self._early_bytes = self._early, deque(), 0
+        for gid, sequence, payload in early:
+            if self._publisher_of(gid) is publisher:
+                self._deliver(publisher, payload, sequence)
+            else:
+                self._hold(gid, sequence, payload)
+
+    def _describe(self, publisher: _Publisher) -> None:
+        if self.conversion is not None:
+            kind = self.conversion.ros1
+            described = TopicDescription(kind.name, kind.md5sum, kind.definition, latching=publisher.latched)
+            publisher.topic.describe(described)
+
+    def _linger(self) -> None:
+        """Stay subscribed for a moment, and hold what comes: nodes subscribe to a new source some time after it."""
+        if self._subscribed is None:
+            return
+        if self._lingering is not None:
+            self._lingering.cancel()
+        self._lingering = asyncio.get_running_loop().call_later(limits.ROS2_LINGER, self._end_lingering)
+
+    def _end_lingering(self) -> None:
+        self._lingering = None
+        self._early.clear()
+        self._early_bytes = 0
+        self._follow_demand()
+        self.part.drop_idle(self)
+
+    def _hold(self, gid: bytes, sequence: int, payload: bytes) -> None:
+        self._early.append((gid, sequence, payload))
+        self._early_bytes += len(payload)
+        while len(self._early) > limits.ROS2_EARLY_MESSAGES or self._early_bytes > limits.ROS2_EARLY_BYTES:
+            self._early_bytes -= len(self._early.popleft()[2])
+            self._unheard += 1
+
+    def _follow_demand(self) -> None:
+        wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
+        if not wanted and self._lingering is None:
+            self._unsubscribe()
+        elif wanted and self._subscribed is None:
+            context, first = self.part.context, self.first
+            self._history = any(each.latched for each in self.publishers.values())
+            qos = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL if self._history else Ros2Durability.VOLATILE)
+            kind = EntityKind.SUBSCRIPTION
+            self._subscribed = (
+                context.session.subscribe(first.key(), self._sample, history=self._history),
+                context.nodes.declare(context.nodes.own_name, kind, first.name, first.type, first.type_hash, qos),
+            )
+
+    def _unsubscribe(self) -> None:
+        for each in self._subscribed or ():
+            each.close()
+        self._subscribed = None
+        self._sequences.forget()
+        self._adopted.clear()
+        for publisher in self.publishers.values():
+            publisher.kept = None
+
+    # --- messages ------------------------------------------------------------------------------------------------
+
+    def _sample(self, sample: ZenohSample) -> None:
+        gid, sequence = b"", 0
+        if sample.attachment:
+            try:
+                attachment = Ros2Attachment.parse(sample.attachment)
+            except RemoteProtocolError as error:
+                self._fail(str(error))
                 return
-            self._open_tap()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(limits.LATCH_LOOK_TIMEOUT):
-                    await self._was_described.wait()
-        if not self._closed:
-            self._close_unwanted()
+            gid, sequence = attachment.gid, attachment.sequence
+            own = gid in self.part.context.nodes.gids
+            if own or not self._sequences.accept(attachment, history=self._history):
+                return
+        publisher = self._publisher_of(gid)
+        if publisher is not None and publisher.wanted:
+            self._deliver(publisher, sample.payload, sequence)
+        elif publisher is not None and publisher.latched:
+            publisher.kept = sample.payload
+        elif self._lingering is not None:
+            self._hold(gid, sequence, sample.payload)
 
-    def _close_tap(self) -> None:
-        tap, self._tap = self._tap, None
-        if tap is not None:
-            tap.close()
+    def _publisher_of(self, gid: bytes) -> _Publisher | None:
+        return self._by_gid.get(gid[:GID_BYTES]) or self._adopted.get(gid) or self._adopt(gid)
 
-    def _close_unwanted(self) -> None:
-        """Disconnect if nothing is wanted, or nothing can be done with it. Not within the tap's own callback."""
-        if self._endpoint is None or not (self._wanted or self._keeps):
-            self._close_tap()
+    def _adopt(self, gid: bytes) -> _Publisher | None:
+        """The publisher of a GID that is of no token: one that has none yet, else the first."""
+        taken, every = list(self._adopted.values()), list(self.publishers.values())
+        found = next((each for each in every if each not in taken), every[0] if every else None)
+        if found is not None and len(self._adopted) < len(self._by_gid):
+            self._adopted[gid] = found
+        return found
 
-    def _lost(self, reason: str) -> None:
-        self._conversion = None
-        self.problem = f"the publisher in the mesh: {reason}"
-
-    def _described(self, description: TopicDescription) -> None:
-        self._was_described.set()
-        fields = {
-            "type": description.type,
-            "md5sum": description.md5sum,
-            "message_definition": description.definition,
-        }
+    def _deliver(self, publisher: _Publisher, payload: bytes, sequence: int) -> None:
+        if self.conversion is None:
+            return
         try:
-            kind = type_of_header(fields)
-            found = self._pairs.learn(kind)
-            self._conversion = self._pairs.outgoing(kind)
-        except (NoConversion, RmpaError) as error:
-            self._conversion = None
+            body: Buffer = self.conversion.to_ros1(payload)
+        except ConversionError as error:
             self._fail(str(error))
             return
-        self.problem = ""
-        self._context.say(self._subject, "")
-        known = self._endpoint
-        changed = known is None or (known.endpoint.type, known.endpoint.type_hash) != found
-        if changed or (description.latching and not self._latching):
-            self._latching = self._latching or description.latching
-            self._declare(*found)
-        asyncio.get_running_loop().call_soon(self._close_unwanted)  # it may have been asked for its type only
-
-    def _message(self, body: memoryview) -> None:
-        publisher, conversion, endpoint = self._publisher, self._conversion, self._endpoint
-        if publisher is None or conversion is None or endpoint is None:
-            return
-        if not self._limit.admit(time.monotonic(), len(body)):
-            self._limit.dropped += 1
-            return
-        try:
-            payload = conversion.to_ros2(body)
-        except ConversionError as error:
-            self._failed += 1
-            if self._failed == 1:
-                self._context.say(self._subject, str(error))
-            return
-        self._sequence += 1
-        publisher.put(payload, Ros2Attachment(self._sequence, time.time_ns(), endpoint.gid).serialize())
-
-    @property
-    def _subject(self) -> str:
-        return f"{self.source.here} of {self.source.proxy}"
+        publisher.received += 1
+        if self._has_seq:
+            body = bytearray(body)
+            _SEQ.pack_into(body, 0, (sequence or publisher.received) & 0xFFFFFFFF)
+        publisher.dropped += publisher.topic.publish(body)
 
     def _fail(self, text: str) -> None:
-        """No ROS 2 node can get it: it is not in ROS 2's graph either, but told."""
-        self.problem = text
-        self._context.say(self._subject, text)
-        self._withdraw()
-        asyncio.get_running_loop().call_soon(self._close_unwanted)
+        self._unconverted += 1
+        if self._unconverted == 1:
+            self._say(text)
+
+    def _say(self, text: str) -> None:
+        self.part.context.say(f"{self.first.name} of ROS 2 ({self.first.type})", text)
 
 
-# The topics of modules in ROS 2's graph, and ROS 2's topics in the gateway's graph.
-
-
-_TOPIC_ENDS: Final = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+def _begins_with_header(kind: MessageType) -> bool:
+    """Whether a message's first bytes are the ``seq`` of its header, which ROS 2 does not have."""
+    return bool(kind.fields) and kind.fields[0].type == "std_msgs/Header" and not kind.fields[0].array
 
 
 class Ros2Topics:
@@ -312,84 +417,106 @@ class Ros2Topics:
     """
 
     def __init__(self, context: Ros2Context, find: Callable[[str], MessageType] = find_message_type) -> None:
-        self._context = context
-        self._pairs = Ros2Pairs(context.types, context.mapping, find)
-        self._exports: dict[tuple[str, str], Ros2TopicExport] = {}
-        self._exports_named: dict[str, dict[tuple[str, str], Ros2TopicExport]] = {}
-        self._imports: dict[str, Ros2TopicImport] = {}
-        self._refused: dict[str, str] = {}
+        self.context: Final = context
+        self.pairs: Final = Ros2Pairs(context.types, context.mapping, find)
+        self.refused: dict[str, str] = {}
+        """Why topics do not cross, by ``<topic> of <node>``."""
+        self._exports: dict[str, dict[str, tuple[Export, Ros2Dialect]]] = {}
+        """By name here, then by proxy."""
+        self._imports: dict[str, Ros2Import] = {}
+        """By key."""
         self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
-        for exported in self._exports.values():
-            exported.close()
+        for export, _ in self._every_export():
+            export.close()
         for imported in self._imports.values():
             imported.close()
-        self._exports.clear()
-        self._exports_named.clear()
-        self._imports.clear()
 
-    def report(self) -> dict[str, object]:
-        """The topics that cross, one row for each source, and those that do not cross, with the reason."""
-        rows = [each.report() for each in self._exports.values()]
+    def rows(self) -> Iterator[dict[str, object]]:
+        """The topics that cross, one row for each source."""
+        for export, dialect in self._every_export():
+            source = export.source
+            yield {
+                "direction": "out",
+                "here": source.here,
+                "module": source.module,
+                "node": source.node,
+                "type": source.type,
+                "ros2_type": "" if dialect.endpoint is None else dialect.endpoint.endpoint.type,
+                "latched": dialect.latched,
+                "wanted": export.wanted,
+                "rule": dialect.why,
+                "sent": export.messages,
+                "dropped": export.dropped,
+                "limited": export.limited,
+                "waiting": export.waiting,
+                "unconverted": dialect.unconverted,
+                "problem": export.problem,
+            }
         for imported in self._imports.values():
-            rows += imported.report()
-        return {"topics": rows, "topics_refused": dict(self._refused)}
+            yield from imported.report()
+
+    def _every_export(self) -> list[tuple[Export, Ros2Dialect]]:
+        return [each for exports in self._exports.values() for each in exports.values()]
+
+    def _refuse(self, what: str, why: str) -> None:
+        if len(self.refused) >= limits.ROS2_PROBLEMS_MAX:
+            del self.refused[next(iter(self.refused))]
+        self.refused[what] = why
 
     # --- from the mesh to ROS 2 ----------------------------------------------------------------------------------
 
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Put a topic of a module into ROS 2's graph, or take it out."""
-        context = self._context
         if source.kind is not SourceKind.TOPIC:
             return False
-        key = source.here, source.proxy
-        if (old := self._exports.pop(key, None)) is not None:
-            self._exports_named[source.here].pop(key, None)
-            if not self._exports_named[source.here]:
-                del self._exports_named[source.here]
-            old.close()
-        refused = f"{source.here} of {source.proxy}"
-        self._refused.pop(refused, None)
-        if not there:
-            return True
-        decision = context.crossing.outgoing(source.module, source.name)
-        if not valid_name(source.here) or not valid_name(source.proxy):
-            self._refuse(refused, "ROS 2 allows no such name: a part of it begins with a digit, or it is too long")
-        elif not decision.allowed:
-            self._refuse(refused, decision.why)
-        else:
-            export = self._exports[key] = Ros2TopicExport(
-                context, self._pairs, source, decision, self._looks, self._declared
-            )
-            self._exports_named.setdefault(source.here, {})[key] = export
+        exports = self._exports.setdefault(source.here, {})
+        if (old := exports.pop(source.proxy, None)) is not None:
+            old[0].close()
+        what = f"{source.here} of {source.proxy}"
+        self.refused.pop(what, None)
+        decision = self.context.rules.outgoing_to(SITE, source.module, source.name)
+        if there and not (valid_name(source.here) and valid_name(source.proxy)):
+            self._refuse(what, "ROS 2 allows no such name: a part of it begins with a digit, or it is too long")
+        elif there and not decision.allowed:
+            self._refuse(what, decision.why)
+        elif there:
+            dialect = Ros2Dialect(self, source, decision)
+            export = Export(source, self.context.graph, self.context.session, dialect, decision.rate, decision.size)
+            exports[source.proxy] = export, dialect
             export.start()
+            if export.announced and not dialect.latched and source.type not in _STREAMS:
+                self.context.spawn(self._look(export))
+        if not exports:
+            del self._exports[source.here]
         return True
 
-    def _declared(self, export: Ros2TopicExport) -> None:
+    async def _look(self, export: Export) -> None:
+        """Ask the publisher once for its header, which tells whether it latches, unless it was asked before."""
+        await asyncio.sleep(limits.LATCH_LOOK_AFTER)
+        async with self._looks:
+            if export.about is None:
+                with contextlib.suppress(RmpaError):
+                    await export.header(limits.LATCH_LOOK_TIMEOUT)
+
+    def declared(self, dialect: Ros2Dialect) -> None:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""
-        for other in list(self._context.ros2.at(export.source.here, *_TOPIC_ENDS)):
-            self._compare(export, other)
-        self._retry_imports()
+        for other in list(self.context.ros2.at(dialect.source.here, *_TOPIC_ENDS)):
+            self._compare(dialect, other)
+        for imported in self._imports.values():  # a type was learnt: topics whose fields were not known may have it
+            if imported.conversion is None:
+                with contextlib.suppress(NoConversion):
+                    found = self.pairs.incoming(imported.first.type, imported.first.type_hash)
+                    if found is not None:
+                        imported.converted(found)
 
-    def _retry_imports(self) -> None:
-        """A type was learnt: topics of ROS 2 whose fields were not known may have it."""
-        for imported in self._imports.values():
-            if imported.converts:
-                continue
-            try:
-                found = self._pairs.incoming(imported.type, imported.type_hash)
-            except NoConversion:
-                continue
-            if found is not None:
-                imported.converted(found, "")
-
-    def _compare(self, export: Ros2TopicExport, other: Ros2Endpoint) -> None:
-        if export.endpoint is not None:
-            text = mismatch(export.endpoint.endpoint, other, self._context.types.distribution)
+    def _compare(self, dialect: Ros2Dialect, other: Ros2Endpoint) -> None:
+        if dialect.endpoint is not None:
+            text = mismatch(dialect.endpoint.endpoint, other, self.context.types.distribution)
             if text:
-                self._context.say(f"{other.name} of {other.node.name}", text)
+                self.context.say(f"{other.name} of {other.node.name}", text)
 
     # --- from ROS 2 to the mesh ----------------------------------------------------------------------------------
 
@@ -397,79 +524,62 @@ class Ros2Topics:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""
         if endpoint.kind not in _TOPIC_ENDS:
             return False
-        if not there:
-            self._context.say(f"{endpoint.name} of {endpoint.node.name}", "")
-        for export in self._exports_named.get(endpoint.name, {}).values() if there else ():
-            self._compare(export, endpoint)
-        if endpoint.kind is EntityKind.PUBLISHER and not _hidden(endpoint.name):
-            (self._publisher_there if there else self._publisher_gone)(endpoint)
+        what = f"{endpoint.name} of {endpoint.node.name}"
+        if there:
+            for _, dialect in self._exports.get(endpoint.name, {}).values():
+                self._compare(dialect, endpoint)
+        else:
+            self.context.say(what, "")
+        if endpoint.kind is not EntityKind.PUBLISHER or "/_" in endpoint.name:
+            return True  # ROS 2's tools hide what has such a name, as the topics of actions
+        imported = self._imports.get(endpoint.key())
+        if there:
+            self._add(endpoint, imported, what)
+        else:
+            self.refused.pop(what, None)
+            if imported is not None:
+                imported.remove(endpoint)
+                self.drop_idle(imported)
         return True
 
-    def _publisher_there(self, endpoint: Ros2Endpoint) -> None:
-        context, pairs = self._context, self._pairs
-        key = endpoint.key()
-        imported = self._imports.get(key)
-        if imported is None:
-            ros1_type = pairs.ros1_name(endpoint.type)
-            decision = context.crossing.incoming(SourceKind.TOPIC, endpoint.name, ros1_type, endpoint.node.name)
-            if not decision.allowed:
-                self._refuse(f"{endpoint.name} of {endpoint.node.name}", decision.why)
-                return
-            imported = self._imports[key] = Ros2TopicImport(
-                context, endpoint, ros1_type, decision, lambda: self._drop_unused(key)
-            )
-            imported.add(endpoint)
-            self._find_conversion(imported, endpoint)
-        else:
-            imported.add(endpoint)
-            if imported.problem:  # this node may be able to describe the type
-                self._find_conversion(imported, endpoint)
-
-    def _publisher_gone(self, endpoint: Ros2Endpoint) -> None:
-        self._refused.pop(f"{endpoint.name} of {endpoint.node.name}", None)
-        key = endpoint.key()
-        if (imported := self._imports.get(key)) is not None:
-            imported.remove(endpoint)
-            self._drop_unused(key)
-
-    def _drop_unused(self, key: str) -> None:
+    def drop_idle(self, imported: Ros2Import) -> None:
         """A topic without publishers goes; one that was wanted stays for a while, as its publisher may restart."""
-        imported = self._imports.get(key)
-        if imported is not None and not imported.publishers and not imported.lingers:
-            del self._imports[key]
+        if imported.idle and self._imports.pop(imported.first.key(), None) is not None:
             imported.close()
 
-    def _find_conversion(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
-        context, pairs = self._context, self._pairs
+    def _add(self, endpoint: Ros2Endpoint, imported: Ros2Import | None, what: str) -> None:
+        if imported is None:
+            kind = self.pairs.ros1_name(endpoint.type)
+            source = ForeignSource(SourceKind.TOPIC, SITE, "", endpoint.node.name, endpoint.name, kind)
+            decision = self.context.rules.incoming(source)
+            if not decision.allowed:
+                self._refuse(what, decision.why)
+                return
+            imported = self._imports[endpoint.key()] = Ros2Import(self, endpoint, kind, decision)
+            imported.add(endpoint)
+        else:
+            imported.add(endpoint)
+            if not imported.problem:
+                return  # else this node may be able to describe the type
         try:
-            conversion = pairs.incoming(endpoint.type, endpoint.type_hash)
+            conversion = self.pairs.incoming(endpoint.type, endpoint.type_hash)
         except NoConversion as error:
             imported.converted(None, str(error))
             return
         if conversion is not None:
-            imported.converted(conversion, "")
+            imported.converted(conversion)
         else:
-            context.spawn(self._ask_type(imported, endpoint))
+            self.context.spawn(self._ask_type(imported, endpoint))
 
-    async def _ask_type(self, imported: Ros2TopicImport, endpoint: Ros2Endpoint) -> None:
+    async def _ask_type(self, imported: Ros2Import, endpoint: Ros2Endpoint) -> None:
         """Ask the publisher's node for the fields of its type."""
-        context, pairs = self._context, self._pairs
+        name, type_hash = endpoint.type, endpoint.type_hash
         try:
-            pairs.described(endpoint.type, endpoint.type_hash, await context.asker.learn(of=endpoint))
-            imported.converted(pairs.incoming(endpoint.type, endpoint.type_hash), "")
+            self.pairs.described(name, type_hash, await self.context.asker.learn(of=endpoint))
+            imported.converted(self.pairs.incoming(name, type_hash))
         except (NoConversion, RemoteProtocolError) as error:
-            if not imported.converts:
+            if imported.conversion is None:
                 imported.converted(None, str(error))
             return
-        for export in self._exports.values():
-            export.retry()
-
-    def _refuse(self, what: str, why: str) -> None:
-        if len(self._refused) >= limits.ROS2_PROBLEMS_MAX:
-            del self._refused[next(iter(self._refused))]
-        self._refused[what] = why
-
-
-def _hidden(name: str) -> bool:
-    """Whether ROS 2's tools hide a topic: a part of its name begins with ``_``, as those of actions."""
-    return "/_" in name
+        for export, _ in self._every_export():
+            export.start()

@@ -1,11 +1,9 @@
-"""What other sites have, which gateway of a site leads, and the rules of what crosses.
+"""What other sites have, which gateway of a site leads, and since when a site is away. Without I/O.
 
-What other sites have, from their liveliness tokens.
-
-Sans-I/O. Tokens come and go one by one, in any order. A source is there while its own token and that of its module
-are. What a gateway withdraws goes at once (after ``limits.SITE_SETTLE``); what is lost together with the leading
-gateway of its site, or with the way to it, stays for ``limits.SITE_GRACE``, so that neither a short break of a link
-nor a change of the leading gateway takes everything down and up::
+Tokens come and go one by one, in any order. A source is there while its own token and that of its module are. What a
+gateway withdraws goes at once (after ``limits.SITE_SETTLE``); what is lost together with the leading gateway of its
+site, or with the way to it, stays for ``limits.SITE_GRACE``, so that neither a short break of a link nor a change of
+the leading gateway takes everything down and up::
 
     ABSENT ──token──► THERE ──token gone──► SETTLING ──0.05 s──► ABSENT
                         ▲                      │ leading gateway gone too
@@ -18,23 +16,16 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.peer_rules import Access
-from rmpa.config.rules import ROS2, Crossing
 from rmpa.core.counters import Counters, TimerQueue
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import is_global_name, matches
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
 
-    from rmpa.bridge.policy import PolicyDecision
-    from rmpa.config.rules import CrossingRule
-    from rmpa.gateway.neighbour import SitePermissions
-
-    Judge = Callable[[SourceKind, str, str, str], PolicyDecision]
+_ENDING: Final = 2.0
+"""Seconds within which a gateway that ends withdraws what it announced: that too is what its site had."""
 
 
 class CatalogueChange(Enum):
@@ -44,14 +35,6 @@ class CatalogueChange(Enum):
     RENEWED = "renewed"
     """Its token had gone and came back in time: another gateway may have it now."""
     GONE = "gone"
-
-
-@dataclass(frozen=True, slots=True)
-class CatalogueEvent:
-    """A change of what other sites have. A module is found before its sources, and goes after them."""
-
-    change: CatalogueChange
-    item: SiteModule | SiteSource
 
 
 @dataclass(slots=True)
@@ -72,17 +55,24 @@ class SiteCatalogue:
 
     Args:
         own: This site's name, whose tokens are ignored.
+        changed: Called with each change of a module or a source. A module is found before its sources, and goes after
+            them.
         counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
 
-    def __init__(self, own: str, counters: Counters | None = None) -> None:
+    def __init__(
+        self,
+        own: str,
+        changed: Callable[[CatalogueChange, SiteModule | SiteSource], None],
+        counters: Counters | None = None,
+    ) -> None:
         self._own = own
+        self._tell = changed
         self._sites: dict[str, _Site] = {}
         self._sources = 0
         """Of all sites together."""
         self._ending: TimerQueue[str] = TimerQueue()
         self._by_token: dict[str, SiteModule | SiteSource] = {}
-        self._events: list[CatalogueEvent] = []
         self.counters = counters if counters is not None else Counters()
 
     # --- what is there ------------------------------------------------------------------------------------------
@@ -120,32 +110,32 @@ class SiteCatalogue:
                 yield module
                 yield from self.sources(module)
 
-    def take_events(self) -> list[CatalogueEvent]:
-        """The changes since the last call, in order."""
-        events, self._events = self._events, []
-        return events
-
     # --- tokens -------------------------------------------------------------------------------------------------
 
-    def token(self, key: str, now: float, *, alive: bool) -> None:
+    def token(self, key: str, now: float, *, alive: bool) -> SiteModule | SiteSource | SiteGateway | None:
         """A liveliness token came or went. What is none is counted and ignored.
 
         Args:
             key: The token.
             now: Monotonic seconds.
             alive: Whether it is there.
+
+        Returns:
+            What it stands for, also at this site.
         """
         try:
             item = parse_token(key)
         except RemoteProtocolError:
             self.counters.add("site.token.malformed")
-            return
+            return None
         if item is None:
             self.counters.add("site.token.later_version")
-            return
-        name = item.module.site if isinstance(item, SiteSource) else item.site
-        if name == self._own:
-            return
+        elif item.site != self._own:
+            self._changed(item, key, now, alive=alive)
+        return item
+
+    def _changed(self, item: SiteModule | SiteSource | SiteGateway, key: str, now: float, *, alive: bool) -> None:
+        name = item.site
         site = self._sites.get(name)
         if site is None:
             if not alive:
@@ -170,13 +160,14 @@ class SiteCatalogue:
         """End what is due."""
         while (key := self._ending.pop(now)) is not None:
             item = self._by_token.pop(key)
-            name = item.module.site if isinstance(item, SiteSource) else item.site
-            site = self._sites[name]
+            site = self._sites[item.site]
             if isinstance(item, SiteModule):
                 self._end_module(site, item)
             else:
-                self._end_source(site, item)
-            self._forget_if_empty(name)
+                site.modules[item.module].discard(item)
+                self._count(site, -1)
+                self._tell(CatalogueChange.GONE, item)
+            self._forget_if_empty(item.site)
 
     def _gateway(self, site: _Site, gateway: SiteGateway, now: float, *, alive: bool) -> None:
         if alive:
@@ -189,7 +180,7 @@ class SiteCatalogue:
             return
         site.interrupted_until = now + limits.SITE_GRACE
         for key, item in self._by_token.items():
-            if (item.module.site if isinstance(item, SiteSource) else item.site) == gateway.site:
+            if item.site == gateway.site:
                 self._ending.set(key, site.interrupted_until)
 
     def _came(self, site: _Site, item: SiteModule | SiteSource, key: str) -> None:
@@ -246,11 +237,6 @@ class SiteCatalogue:
             self._tell(CatalogueChange.GONE, source)
         self._tell(CatalogueChange.GONE, module)
 
-    def _end_source(self, site: _Site, source: SiteSource) -> None:
-        site.modules[source.module].discard(source)
-        self._count(site, -1)
-        self._tell(CatalogueChange.GONE, source)
-
     def _count(self, site: _Site, more: int) -> None:
         site.sources += more
         self._sources += more
@@ -263,9 +249,6 @@ class SiteCatalogue:
         site = self._sites[name]
         if not (site.gateways or site.modules or site.orphans):
             del self._sites[name]
-
-    def _tell(self, change: CatalogueChange, item: SiteModule | SiteSource) -> None:
-        self._events.append(CatalogueEvent(change, item))
 
 
 # Which gateway of a site leads, where there are several: the others stand by, so that no message crosses twice.
@@ -324,222 +307,62 @@ class Leader:
             self._best_since = now
 
 
-# Counts messages and bytes of one topic, and their rate from report to report. Sans-I/O.
+# Which sites were there and are not, and what they had: for "unreachable since".
 
 
-class SiteTraffic:
-    """Messages and bytes, cheaply for each message: rates are computed where they are read.
+class SiteHistory:
+    """Remembers since when other sites are there or away.
 
     Args:
         now: Monotonic seconds.
     """
 
-    __slots__ = ("_at", "_bytes_at", "_messages_at", "bandwidth", "bytes", "messages", "rate")
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._there: frozenset[str] = frozenset()
+        self._since: dict[str, float] = {}
+        self._had: dict[str, dict[SiteSource, float]] = {}
+        """When each source was withdrawn: infinite while it is there, and 0 if it went with its site."""
 
-    def __init__(self, now: float) -> None:
-        self.messages = 0
-        """Messages ever seen."""
-        self.bytes = 0
-        """Bytes ever seen."""
-        self.rate = 0.0
-        """Messages a second between the last two readings."""
-        self.bandwidth = 0.0
-        """Bytes a second between the last two readings."""
-        self._at, self._messages_at, self._bytes_at = now, 0, 0
+    @property
+    def away(self) -> tuple[str, ...]:
+        """The sites that were there and are not, by name."""
+        return tuple(sorted(self._since.keys() - self._there))
 
-    def add(self, size: int, messages: int = 1) -> None:
-        """Count messages of ``size`` bytes together."""
-        self.messages += messages
-        self.bytes += size
+    def since_ago(self, site: str) -> float | None:
+        """Seconds since a site came or left; ``None``: it was never seen."""
+        return self._now() - self._since[site] if site in self._since else None
 
-    def read(self, now: float) -> None:
-        """Compute the rates since the last reading, if that is at least a second ago."""
-        passed = now - self._at
-        if passed >= 1:
-            self.rate = (self.messages - self._messages_at) / passed
-            self.bandwidth = (self.bytes - self._bytes_at) / passed
-            self._at, self._messages_at, self._bytes_at = now, self.messages, self.bytes
+    def source(self, source: SiteSource, *, there: bool) -> None:
+        """A site announces a source, or withdraws it; not called for those that go together with their site."""
+        had = self._had.setdefault(source.site, {})
+        had[source] = float("inf") if there else self._now()
+        if len(had) > 2 * limits.SITE_SOURCES_MAX:
+            self._had[source.site] = self._recent(source.site)
 
+    def had(self, name: str) -> tuple[tuple[str, str], ...]:
+        """The sites that are away and had a topic or service of this name, each with its module."""
+        sources = (source for site in self.away for source in self._had.get(site, ()))
+        return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
 
-# What may cross between this site and others, and its name here: a pure table that names the rule that decided.
+    def seen(self, sites: Iterable[str]) -> None:
+        """These sites are there now, and no others."""
+        there = frozenset(sites)
+        for site in there ^ self._there:
+            self._since[site] = self._now()
+        for site in self._there - there:
+            self._had[site] = dict.fromkeys(self._recent(site), 0.0)
+        self._there = there
+        oldest_first = sorted(self.away, key=self._since.__getitem__)
+        for site in oldest_first[: max(0, len(self._since) - limits.SITES_REMEMBERED_MAX)]:
+            del self._since[site]
+            self._had.pop(site, None)
+        total = sum(len(self._had.get(site, ())) for site in oldest_first)
+        for site in oldest_first:
+            if total > limits.SITES_SOURCES_MAX:
+                total -= len(self._had.pop(site, ()))
 
-
-_OUT: Final = (Crossing.BOTH, Crossing.OUT)
-_IN: Final = (Crossing.BOTH, Crossing.IN)
-_EVERY_SITE: Final = ("*", "**")
-_NO_RULE: Final = "no gateway.rule fits: everything crosses"
-
-
-@dataclass(frozen=True, slots=True)
-class CrossingDecision:
-    """Whether a source may cross, and how.
-
-    Args:
-        allowed: Whether it may.
-        why: The rule that decided, as text.
-        name: The name here of what comes in; empty if it may not cross.
-        rate: Messages a second of what goes out; ``None``: no limit.
-        size: Bytes a second of what goes out; ``None``: no limit.
-        addressed: Whether what goes out does not go to all other sites alike: ``outgoing_to`` decides for each.
-    """
-
-    allowed: bool
-    why: str
-    name: str = ""
-    rate: float | None = None
-    size: int | None = None
-    addressed: bool = False
-
-
-class CrossingRules:
-    """Judges sources by ``[[gateway.rule]]``: the first rule that fits holds; without one everything crosses.
-
-    Args:
-        rules: In the order of the file.
-        judge: The gateway's own policy, ``(kind, name, type, node)``, which must let a source cross too: by its name
-            in its module if it goes out, by its name here if it comes in. ``None``: it lets everything cross.
-        permissions: ``[[permission]]``, which must let other sites do it too; what they refuse is counted. ``None``:
-            trust is off.
-    """
-
-    def __init__(
-        self,
-        rules: Sequence[CrossingRule] = (),
-        judge: Judge | None = None,
-        permissions: SitePermissions | None = None,
-    ) -> None:
-        self._rules = tuple(rules)
-        self._judge = judge
-        self._permissions = permissions
-
-    def outgoing(self, kind: SourceKind, module: str, name: str, type_name: str, node: str) -> CrossingDecision:
-        """Decide whether a source of this site goes out to any other site, and whether to all of them alike.
-
-        Args:
-            kind: What it is.
-            module: The module that has it.
-            name: Its name in its module.
-            type_name: Its type.
-            node: Its node in its module.
-        """
-        decision = self._policy(kind, name, type_name, node)
-        if not decision.allowed:
-            return decision
-        found = []
-        for number, rule in self._fitting(module, name):
-            if all(site == ROS2 for site in rule.sites):
-                continue  # it is about no site
-            found.append(_outgoing(number, rule))
-            if any(glob in _EVERY_SITE for glob in rule.sites):
-                break
-        else:
-            found.append(decision)
-        first = found[0]
-        if all((each.allowed, each.rate, each.size) == (first.allowed, first.rate, first.size) for each in found):
-            return first
-        named = next(each for each in found if each.allowed)
-        return CrossingDecision(True, named.why, addressed=True)
-
-    def outgoing_to(self, site: str, module: str, name: str) -> CrossingDecision:
-        """Decide whether a source that ``outgoing`` lets out goes to one other site; permissions are not asked.
-
-        Args:
-            site: The other site; empty for a program that names none.
-            module: The module that has it.
-            name: Its name in its module.
-        """
-        for number, rule in self._fitting(module, name):
-            if any(matches(glob, site) for glob in rule.sites):
-                return _outgoing(number, rule, site)
-        return CrossingDecision(True, _NO_RULE)
-
-    def refusal(
-        self,
-        site: str,
-        module: str,
-        name: str,
-        access: Access = Access.SUBSCRIBE,
-        askers: tuple[str, ...] = (),
-        told: str | None = None,
-    ) -> str:
-        """Why another site may not have a source or parameter of this one; empty if it may.
-
-        Args:
-            site: The other site; empty for a program that names none.
-            module: The module that has it.
-            name: Its name in its module.
-            access: What the other site would do with it.
-            askers: The modules of the other site that ask, as it says.
-            told: The name for the text, if ``name`` was found in what was asked for and may be a secret.
-        """
-        decision = self.outgoing_to(site, module, name)
-        if not decision.allowed:
-            return decision.why
-        return self.denial(site, name, access, askers, told)
-
-    def denial(
-        self,
-        site: str,
-        name: str,
-        access: Access,
-        askers: tuple[str, ...] = (),
-        told: str | None = None,
-    ) -> str:
-        """Why the permissions, without the rules, do not let another site have a name; empty if they do."""
-        return "" if self._permissions is None else self._permissions.why_not(access, site, name, askers, told)
-
-    def incoming(
-        self, kind: SourceKind, site: str, module: str, name: str, type_name: str, node: str
-    ) -> CrossingDecision:
-        """Decide whether a source of another site is shown here, and under which name.
-
-        Args:
-            kind: What it is.
-            site: The other site.
-            module: The module that has it.
-            name: Its name in its module.
-            type_name: Its type.
-            node: Its node in its module.
-        """
-        here, why = name, _NO_RULE
-        for number, rule in self._fitting(module, name):
-            if not any(matches(glob, site) for glob in rule.sites):
-                continue
-            why = _named(number, rule)
-            if rule.crossing not in _IN:
-                return CrossingDecision(False, f"{why} lets it not come in")
-            here = rule.name.replace("{name}", name).replace("{site}", site).replace("{module}", module)
-            break
-        if not is_global_name(here):
-            return CrossingDecision(False, f"{why} names it {here!r}, which is no global name of ROS")
-        decision = self._policy(kind, here, type_name, node)
-        if not decision.allowed:
-            return decision
-        access = Access.PUBLISH if kind is SourceKind.TOPIC else Access.SERVE
-        if self._permissions is not None and not self._permissions.admits(access, site, module, here):
-            return CrossingDecision(False, self._permissions.judge(access, site, module, here).rule)
-        return CrossingDecision(True, why, here)
-
-    def _fitting(self, module: str, name: str) -> Iterator[tuple[int, CrossingRule]]:
-        for number, rule in enumerate(self._rules, 1):
-            if any(matches(glob, name) for glob in rule.names) and any(
-                matches(glob, module) for glob in rule.modules
-            ):
-                yield number, rule
-
-    def _policy(self, kind: SourceKind, name: str, type_name: str, node: str) -> CrossingDecision:
-        decision = None if self._judge is None else self._judge(kind, name, type_name, node)
-        if decision is None or decision.allowed:
-            return CrossingDecision(True, _NO_RULE)
-        return CrossingDecision(False, decision.rule)
-
-
-def _outgoing(number: int, rule: CrossingRule, site: str = "") -> CrossingDecision:
-    """What one rule says of a source that it fits; ``site`` is named in the reason."""
-    if rule.crossing in _OUT:
-        return CrossingDecision(True, _named(number, rule), rate=rule.rate, size=rule.size)
-    return CrossingDecision(False, f"{_named(number, rule)} lets it not go out{f' to {site}' if site else ''}")
-
-
-def _named(number: int, rule: CrossingRule) -> str:
-    return f"gateway.rule {number} ({rule.crossing}: {', '.join(rule.names)})"
+    def _recent(self, site: str) -> dict[SiteSource, float]:
+        """What a site has, or has withdrawn just now."""
+        least = self._now() - _ENDING
+        return {source: at for source, at in self._had.get(site, {}).items() if at and at >= least}

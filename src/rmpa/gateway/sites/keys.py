@@ -1,4 +1,4 @@
-"""Keys, tokens and attachments of messages between sites, and since when a site is away.
+"""Keys, tokens, attachments and headers between sites.
 
 The attachment of each message between sites.
 
@@ -20,17 +20,19 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
-from rmpa.core.errors import RemoteProtocolError
+import msgspec
+
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_global_name, is_type_name, peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
+from rmpa.ros.wire.tcpros import TopicDescription, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -45,75 +47,35 @@ _SOURCES_KEPT: Final = 256
 """Sources that a reader remembers; then it begins anew."""
 
 
-@dataclass(frozen=True, slots=True)
-class SiteAttachment:
-    """What goes with a message between sites.
+class MessageSource(NamedTuple):
+    """What the attachments of one source have in common.
 
-    Args:
-        sequence: The number of the message at its source, from 1.
-        stamp: When its gateway received it, in nanoseconds since 1970.
+    Attributes:
         md5: The md5 sum of its type, 32 hexadecimal digits.
-        node: Its publisher, ``/like/this``.
-        path: The sites that it passed, its origin first; at most ``limits.PATH_MAX``.
+        node: The publisher, ``/like/this``.
+        path: The sites that its messages passed, its origin first; at most ``limits.PATH_MAX``.
         latched: Whether its publisher is latched.
         run: The run of its exporter, by which sequence numbers are told apart; 0: not told.
     """
 
-    sequence: int
-    stamp: int
     md5: str
     node: str
     path: tuple[str, ...]
     latched: bool = False
     run: int = 0
 
-    def serialize(self) -> bytes:
-        """The bytes of the attachment."""
-        writer = AttachmentWriter(self.md5, self.node, self.path, latched=self.latched, run=self.run)
-        return writer.write(self.sequence, self.stamp)
+    def writer(self) -> Callable[[int, int], bytes]:
+        """What writes its attachments, each of a message's number from 1, and of nanoseconds since 1970.
 
-    @classmethod
-    def parse(cls, data: Buffer) -> SiteAttachment:
-        """Read an attachment; bytes behind the run are ignored, so that later versions may add to it.
+        All but these two is made once.
 
         Raises:
-            RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
+            ValueError: The md5 sum is none.
         """
-        sequence, stamp, source = AttachmentReader().read(bytes(data))
-        return cls(sequence, stamp, source.md5, source.node, source.path, source.latched, source.run)
-
-
-class AttachmentWriter:
-    """Writes the attachments of one source; all but sequence and stamp is made once.
-
-    Args:
-        md5: The md5 sum of its type, 32 hexadecimal digits.
-        node: Its publisher.
-        path: The sites that its messages passed, with this one.
-        latched: Whether its publisher is latched.
-        run: The run of its exporter; 0: not told.
-    """
-
-    def __init__(self, md5: str, node: str, path: tuple[str, ...], *, latched: bool = False, run: int = 0) -> None:
-        self._flags = _LATCHED if latched else 0
-        self._md5 = bytes.fromhex(md5)
-        told = _RUN.pack(run) if run else b""
-        self._tail = b"".join((_text(node), bytes([len(path)]), *map(_text, path), told))
-
-    def write(self, sequence: int, stamp: int) -> bytes:
-        """The attachment of one message."""
-        return _HEAD.pack(VERSION, self._flags, sequence, stamp, self._md5) + self._tail
-
-
-@dataclass(frozen=True, slots=True)
-class MessageSource:
-    """What the attachments of one source have in common; the fields are those of ``SiteAttachment``."""
-
-    md5: str
-    node: str
-    path: tuple[str, ...]
-    latched: bool
-    run: int
+        flags, md5 = _LATCHED if self.latched else 0, bytes.fromhex(self.md5)
+        told = _RUN.pack(self.run) if self.run else b""
+        tail = b"".join((_text(self.node), bytes([len(self.path)]), *map(_text, self.path), told))
+        return lambda sequence, stamp: _HEAD.pack(VERSION, flags, sequence, stamp, md5) + tail
 
 
 class AttachmentReader:
@@ -126,7 +88,8 @@ class AttachmentReader:
         """Read an attachment; bytes behind the run are ignored, so that later versions may add to it.
 
         Returns:
-            The sequence, the stamp, and the source.
+            The number of the message at its source, from 1, when its gateway received it, in nanoseconds since 1970,
+            and the source.
 
         Raises:
             RemoteProtocolError: It is shorter than it says, of another version, or has a name that is none in ROS.
@@ -150,29 +113,22 @@ def _read_source(data: bytes) -> MessageSource:
     version, flags, _, _, md5 = _HEAD.unpack_from(data)
     if version != VERSION:
         raise RemoteProtocolError(f"an attachment of a site is of version {version}; this gateway reads {VERSION}")
-    node, path, run = _read_tail(data[_HEAD.size :])
-    return MessageSource(md5.hex(), node, path, bool(flags & _LATCHED), run)
-
-
-def _read_tail(tail: bytes) -> tuple[str, tuple[str, ...], int]:
-    """Node, path and run."""
-    raw = memoryview(tail)
-    node, at = _read(raw, 0)
+    node, at = _read(data, _HEAD.size)
     if not is_global_name(node):
         raise RemoteProtocolError(f"an attachment of a site has the node {node[:80]!r}, which is no global name")
-    if at >= len(raw):
+    if at >= len(data):
         raise RemoteProtocolError("an attachment of a site ends before its path")
-    count, at = raw[at], at + 1
+    count, at = data[at], at + 1
     if not 0 < count <= limits.PATH_MAX:
         raise RemoteProtocolError(f"a message passed {count} sites; 1 to {limits.PATH_MAX} are allowed")
     path = []
     for _ in range(count):
-        site, at = _read(raw, at)
+        site, at = _read(data, at)
         if peer_name_problem(site) is not None:
             raise RemoteProtocolError(f"an attachment of a site names the site {site[:80]!r}")
         path.append(site)
-    run = _RUN.unpack_from(raw, at)[0] if len(raw) >= at + _RUN.size else 0
-    return node, tuple(path), run
+    run = _RUN.unpack_from(data, at)[0] if len(data) >= at + _RUN.size else 0
+    return MessageSource(md5.hex(), node, tuple(path), bool(flags & _LATCHED), run)
 
 
 def _text(text: str) -> bytes:
@@ -180,14 +136,123 @@ def _text(text: str) -> bytes:
     return bytes([len(raw)]) + raw
 
 
-def _read(raw: memoryview, at: int) -> tuple[str, int]:
+def _read(raw: bytes, at: int) -> tuple[str, int]:
     end = at + 1 + raw[at] if at < len(raw) else len(raw) + 1
     if end > len(raw):
         raise RemoteProtocolError("an attachment of a site ends within a name")
     try:
-        return str(raw[at + 1 : end], "utf-8"), end
+        return raw[at + 1 : end].decode(), end
     except UnicodeDecodeError as error:
         raise RemoteProtocolError(f"an attachment of a site has a name that is not UTF-8: {error}") from error
+
+
+# What gateways tell of a publisher, and what follows from the numbers of its messages.
+
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class TopicHeader(msgspec.Struct, frozen=True):
+    """What a gateway says of one publisher of its site, as JSON: the answer at ``…/d/t/<topic>``.
+
+    The question's parameters are ``node`` (one publisher of several; without it any) and ``site`` (the site that
+    asks).
+
+    Attributes:
+        type: The type, as the publisher's own header has it, and so on to ``latching``.
+        md5sum: The md5 sum of the type.
+        definition: Its definition.
+        latching: Whether the publisher is latched.
+        node: The publisher, in its module.
+        run: The run of its exporter, by which sequence numbers are told apart.
+        sequence: The number of the last message that was taken for the other sites.
+        waiting: Messages that wait there for a slow link.
+    """
+
+    type: str
+    md5sum: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z")]
+    definition: str = ""
+    latching: bool = False
+    node: str = ""
+    run: _Count = 0
+    sequence: _Count = 0
+    waiting: _Count = 0
+
+    @property
+    def description(self) -> TopicDescription:
+        """The publisher's own header."""
+        return TopicDescription(self.type, self.md5sum, self.definition, self.latching)
+
+    @classmethod
+    def parse(cls, data: Buffer) -> TopicHeader:
+        """Read an answer; unknown keys are ignored.
+
+        Raises:
+            RemoteProtocolError: It is too long, no JSON object, or type, md5 sum or a number is none.
+        """
+        if len(data) > limits.HEADER_MAX:
+            raise LimitExceeded("the header of a publisher at another site", len(data), limits.HEADER_MAX)
+        try:
+            found = msgspec.json.decode(data, type=cls)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            text = printable(str(error))
+            raise RemoteProtocolError(f"not the header of a publisher at another site: {text}") from None
+        if not is_type_name(found.type):
+            raise RemoteProtocolError(f"another site names the type {found.type[:80]!r}")
+        return found
+
+
+class SequenceCounter:
+    """Counts the messages of one source of another site that were lost, by their numbers.
+
+    They count from 1 in each run of its exporter. A latched message that comes once more (from a cache) has a number
+    that is known.
+    """
+
+    def __init__(self) -> None:
+        self._run: int | None = None
+        self._last = self._announced = self._gaps = 0
+        self._expects_first = False
+
+    @property
+    def lost(self) -> int:
+        """Messages that were sent and have not come; those on their way count too until they come."""
+        return self._gaps + max(0, self._announced - self._last)
+
+    def take(self, run: int, sequence: int) -> bool:
+        """Count a message that came.
+
+        Args:
+            run: The exporter's run.
+            sequence: Its number.
+
+        Returns:
+            Whether it is new; else it is to be dropped.
+        """
+        if run != self._run:
+            self._begin(run, sequence)
+        elif sequence > self._last or self._expects_first:
+            self._gaps += max(0, sequence - self._last - 1)
+        else:
+            return False
+        self._last, self._expects_first = sequence, False
+        return True
+
+    def announced(self, run: int, sequence: int) -> None:
+        """The exporter says how many messages it has sent; if none has come yet, what it sends later is expected."""
+        if self._run is None:
+            self._begin(run, sequence)
+            self._expects_first = True
+        elif run == self._run:
+            self._announced = max(self._announced, sequence)
+
+    def restart(self) -> None:
+        """Nothing is subscribed any more: the next message begins anew, without a loss."""
+        self._begin(None, 0)
+
+    def _begin(self, run: int | None, sequence: int) -> None:
+        self._gaps = self.lost
+        self._run, self._last, self._announced, self._expects_first = run, sequence, sequence, False
 
 
 # The keys of a site's sources in Zenoh, and the liveliness tokens that announce them.
@@ -266,6 +331,11 @@ class SiteSource:
     node: str
     name: str
     to: str = ""
+
+    @property
+    def site(self) -> str:
+        """The site that has it."""
+        return self.module.site
 
     def token(self) -> str:
         """The source's liveliness token."""
@@ -380,91 +450,3 @@ def _check_name(what: str, name: str, longest: int, key: str) -> None:
 
 def _chunk(name: str) -> str:
     return name.replace("/", "%")
-
-
-# Which sites were there and are not, and what they had: for "unreachable since". Without I/O.
-
-
-_ENDING: Final = 2.0
-"""Seconds within which a gateway that ends withdraws what it announced: that too is what its site had."""
-
-
-class SiteHistory:
-    """Remembers since when other sites are there or away.
-
-    Args:
-        now: Monotonic seconds.
-    """
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._there: frozenset[str] = frozenset()
-        self._since: dict[str, float] = {}
-        self._sources: dict[str, set[SiteSource]] = {}
-        self._withdrawn: dict[str, deque[tuple[float, SiteSource]]] = {}
-        self._ended: set[str] = set()
-        """The sites whose sources are those from before they were away."""
-
-    @property
-    def away(self) -> tuple[str, ...]:
-        """The sites that were there and are not, by name."""
-        return tuple(sorted(self._since.keys() - self._there))
-
-    def since_ago(self, site: str) -> float | None:
-        """Seconds since a site came or left; ``None``: it was never seen."""
-        return self._now() - self._since[site] if site in self._since else None
-
-    def source(self, source: SiteSource, *, there: bool) -> None:
-        """A site announces a source, or withdraws it; not called for those that go together with their site."""
-        site = source.module.site
-        if site in self._ended:
-            self._forget(site)
-        known = self._sources.setdefault(site, set())
-        if there:
-            known.add(source)
-            return
-        known.discard(source)
-        withdrawn = self._withdrawn.setdefault(site, deque(maxlen=limits.SITE_SOURCES_MAX))
-        withdrawn.append((self._now(), source))
-        while withdrawn[0][0] < self._now() - _ENDING:
-            withdrawn.popleft()
-
-    def had(self, name: str) -> tuple[tuple[str, str], ...]:
-        """The sites that are away and had a topic or service of this name, each with its module."""
-        away = self.away
-        found = {
-            (s.module.site, s.module.name) for site in away for s in self._sources.get(site, ()) if s.name == name
-        }
-        return tuple(sorted(found))
-
-    def seen(self, sites: Iterable[str]) -> None:
-        """These sites are there now, and no others."""
-        there = frozenset(sites)
-        for site in there ^ self._there:
-            self._since[site] = self._now()
-        for site in self._there - there:
-            self._ended.add(site)
-            withdrawn = self._withdrawn.pop(site, ())
-            self._sources.setdefault(site, set()).update(s for at, s in withdrawn if at >= self._now() - _ENDING)
-        self._there = there
-        while len(self._since) > limits.SITES_REMEMBERED_MAX and (away := self.away):
-            oldest = min(away, key=self._since.__getitem__)
-            del self._since[oldest]
-            self._forget(oldest)
-        self._bound()
-
-    def _bound(self) -> None:
-        """Forget what the sites had that left first, if it is too much."""
-        away = sorted(self.away, key=self._since.__getitem__)
-        total = sum(len(self._sources.get(site, ())) for site in away)
-        for site in away:
-            if total <= limits.SITES_SOURCES_MAX:
-                return
-            total -= len(self._sources.get(site, ()))
-            self._forget(site)
-
-    def _forget(self, site: str) -> None:
-        """Forget what a site had."""
-        self._ended.discard(site)
-        self._sources.pop(site, None)
-        self._withdrawn.pop(site, None)

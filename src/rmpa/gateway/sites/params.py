@@ -1,13 +1,12 @@
-"""Answers the questions of other sites about parameters of this site's modules."""
+"""Parameters between sites: gateways ask each other for their modules, and judge every one, as its owner does."""
 
 from __future__ import annotations
 
-import asyncio
 import base64
-import logging
-from dataclasses import dataclass
+import time
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
@@ -20,20 +19,27 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
-from rmpa.gateway.sites.keys import ROOT, SiteAttachment
-from rmpa.gateway.sites.plans import SitePart
-from rmpa.gateway.sites.services import NO_MD5
+from rmpa.gateway.answering import Answering
+from rmpa.gateway.sites.keys import ROOT, MessageSource
+from rmpa.gateway.sites.services import NO_MD5, caller
 from rmpa.ros.limits import PARAM_DEPTH_MAX
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Iterable
+    from collections.abc import Awaitable, Callable, Iterable, Iterator
 
+    from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.config import ArrivedQuery
-    from rmpa.gateway.zenoh.session import Declaration, OpenSession
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_NEEDS: Final = Needs(
+    (Access.PARAM,),
+    "each parameter, of the site and of the modules that ask; also by the module that has it",
+    key="rmpa/1/<site>/<module>/p/**",
+)
 
 
 # Parameters between sites. Without I/O.
@@ -53,9 +59,28 @@ if TYPE_CHECKING:
 GATEWAYS: Final = "-"
 """The last chunk of the key at which gateways ask."""
 OPERATIONS: Final = ("get", "names", "set", "delete")
+"""The requests of ``bridge.params.rules`` without ``param.``."""
 
 
-class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
+class _Text(msgspec.Struct, omit_defaults=True, kw_only=True):
+    """A text between two gateways."""
+
+    def serialize(self) -> bytes:
+        """As JSON."""
+        return msgspec.json.encode(self)
+
+    @classmethod
+    def parse(cls, data: Buffer) -> Self:
+        """Read one.
+
+        Raises:
+            RemoteProtocolError: It is none, or names something that is no parameter.
+        """
+        found: Self = _decode(data, cls)
+        return found
+
+
+class ParamQuestion(_Text):
     """One question of a gateway; see the module's text.
 
     Attributes:
@@ -70,18 +95,10 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
     text: str = ""
     askers: tuple[str, ...] = ()
 
-    def serialize(self) -> bytes:
-        """As JSON."""
-        return msgspec.json.encode(self)
-
     @classmethod
-    def parse(cls, data: Buffer) -> ParamQuestion:
-        """Read one.
-
-        Raises:
-            RemoteProtocolError: It is none, or names something that is no parameter.
-        """
-        found: ParamQuestion = _decode(data, cls)
+    def parse(cls, data: Buffer) -> Self:
+        """Of ``_Text``."""
+        found = super().parse(data)
         if found.op not in OPERATIONS:
             raise RemoteProtocolError(f"{found.op[:40]!r} is no question about parameters")
         if len(found.askers) > bridge_limits.PARAM_ASKERS_MAX or any(map(peer_name_problem, found.askers)):
@@ -92,43 +109,12 @@ class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class SiteAsker:
-    """What asks for parameters of this site.
-
-    Args:
-        site: The other site; empty for a program that names none.
-        modules: Its modules that ask, as its gateway says.
-    """
-
-    site: str
-    modules: tuple[str, ...] = ()
-
-    def args(self, args: dict[str, Any]) -> dict[str, Any]:
-        """A request's arguments (``bridge.params.rules``), for the module that has the parameters."""
-        return {**args, "site": self.site, "askers": list(self.modules)}
-
-
-class ParamAnswer(msgspec.Struct, omit_defaults=True, kw_only=True):
+class ParamAnswer(_Text):
     """The answer to a ``ParamQuestion``; the fields are those that its text names."""
 
     text: str = ""
     names: list[str] = []
     count: int = 0
-
-    def serialize(self) -> bytes:
-        """As JSON."""
-        return msgspec.json.encode(self)
-
-    @classmethod
-    def parse(cls, data: Buffer) -> ParamAnswer:
-        """Read one.
-
-        Raises:
-            RemoteProtocolError: It is none.
-        """
-        found: ParamAnswer = _decode(data, cls)
-        return found
 
 
 def _decode(data: Buffer, kind: type[Any]) -> Any:
@@ -180,17 +166,17 @@ def lost_with(written: Iterable[str], present: Iterable[str]) -> list[str]:
         present: All that are there.
     """
     wanted = {plain_key(name) for name in written}
-    around = {name[:at] for name in wanted for at, letter in enumerate(name) if letter == "/" and at}
-    return [name for name in present if name in around or (name not in wanted and _is_within(name, wanted))]
+    around = {space for name in wanted for space in _namespaces(name)}
+    return [
+        name
+        for name in present
+        if name in around
+        or (name not in wanted and ("/" in wanted or any(space in wanted for space in _namespaces(name))))
+    ]
 
 
-def _is_within(name: str, namespaces: Collection[str]) -> bool:
-    return "/" in namespaces or any(name[:at] in namespaces for at, letter in enumerate(name) if letter == "/" and at)
-
-
-def refused_one(names: Iterable[str], why_not: Callable[[str], str]) -> str:
-    """Why parameters may not cross: the first reason for one of them; empty if all may."""
-    return next((why for name in names if (why := why_not(name))), "")
+def _namespaces(name: str) -> Iterator[str]:
+    return (name[:at] for at, letter in enumerate(name) if letter == "/" and at)
 
 
 def to_json(value: XmlRpcValue) -> bytes:
@@ -230,251 +216,167 @@ def _check_members(value: object, depth: int = 0) -> None:
         _check_members(member, depth + 1)
 
 
-_log = logging.getLogger(__name__)
-_NEEDS = Needs(
-    (Access.PARAM,),
-    "each parameter, of the site and of the modules that ask; also by the module that has it",
-    key="rmpa/1/<site>/<module>/p/**",
-)
-
-
-class SiteParamExports(SitePart):
-    """The parameters of this site's modules, as queryables: a ``SitePart``.
+async def ask_judged(
+    ask: Callable[[str, dict[str, Any]], Awaitable[object]],
+    what: str,
+    key: str,
+    text: str,
+    why_not: Callable[[str, str], str] | None,
+) -> dict[str, Any]:
+    """Ask for parameters what may be asked: each one, all within a namespace, and all that would be lost.
 
     Args:
-        site: This site's name.
-        session: The Zenoh session.
-        ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
-        why_not: ``(asker, module, parameter, told)``: why a site may not have a parameter; empty if it may. ``told``
-            is what it asked for: a parameter that was found in that may be a secret.
+        ask: Asks the owner, or the gateway there: a request of ``bridge.params.rules`` and its arguments.
+        what: That request.
+        key: The parameter's name, or a namespace.
+        text: What it is set to.
+        why_not: ``(parameter, told)``: why it may not be had; empty if it may. ``told`` is what was asked for: a
+            parameter that was found in that may be a secret. ``None``: everything may.
+
+    Raises:
+        PeerRefused: It may not, or the other side has refused.
     """
 
-    name = "params"
+    def judge(names: Iterable[str]) -> None:
+        why = next((why for name in names if (why := why_not(name, key))), "") if why_not is not None else ""
+        if why:
+            raise PeerRefused("this gateway", why)
 
-    def __init__(
-        self,
-        site: str,
-        session: OpenSession,
-        ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
-        why_not: Callable[[SiteAsker, str, str, str], str],
-    ) -> None:
-        self._site = site
-        self._session = session
-        self._ask = ask
-        self._why_not = why_not
-        self._queryable: Declaration | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._asked = self._refused = 0
-
-    def lead(self, leads: bool) -> None:
-        """Answer while this gateway leads its site."""
-        if leads and self._queryable is None:
-            self._queryable = self._session.queryable(f"{ROOT}/{self._site}/*/p/**", self._take, _NEEDS)
-        elif not leads and self._queryable is not None:
-            self._queryable.close()
-            self._queryable = None
-
-    def report(self) -> dict[str, object]:
-        """Questions of other sites, and how many got an error."""
-        return {"asked": self._asked, "refused": self._refused}
-
-    async def close(self) -> None:
-        """Answer no more; questions under way get an error."""
-        self.lead(leads=False)
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    # --- inside ---------------------------------------------------------------------------------------------------
-
-    def _take(self, query: ArrivedQuery) -> None:
-        self._asked += 1
-        if len(self._tasks) >= limits.SITE_PARAMS_AT_ONCE:
-            self._refused += 1
-            query.reply_error("too many questions about parameters at once; try again later")
-            return
-        task = asyncio.get_running_loop().create_task(self._answer(query), name="parameter for a site")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _answer(self, query: ArrivedQuery) -> None:
-        try:
-            asker = SiteAsker(SiteAttachment.parse(query.attachment).path[-1] if query.attachment else "")
-            module, name = parse_param_key(query.key)
-            if name == GATEWAYS:
-                question = ParamQuestion.parse(query.payload)
-                asker = SiteAsker(asker.site, question.askers)
-                reply = (await self._for_gateway(asker, module, question)).serialize()
-            elif query.payload:
-                text = serialize_response(from_json(query.payload)).decode()
-                reply = to_json(await self._set(asker, module, name, text))
-            else:
-                reply = to_json(parse_response((await self._get(asker, module, name)).encode()))
-            query.reply(query.key, reply)
-            query.finish()
-        except PeerRefused as error:
-            self._fail(query, error.reason)
-        except RmpaError as error:
-            self._fail(query, str(error))
-        except asyncio.CancelledError:
-            query.reply_error(f"the gateway of site {self._site} ends")
-            raise
-        except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! a question about a parameter failed")
-            self._fail(query, f"the gateway of site {self._site} failed at the parameter; its log says why")
-
-    def _fail(self, query: ArrivedQuery, text: str) -> None:
-        self._refused += 1
-        query.reply_error(text)
-
-    async def _for_gateway(self, asker: SiteAsker, module: str, question: ParamQuestion) -> ParamAnswer:
-        match question.op:
-            case "get":
-                return ParamAnswer(text=await self._get(asker, module, question.key))
-            case "names":
-                return ParamAnswer(names=await self._names(asker, module))
-            case "set":
-                return ParamAnswer(count=await self._set(asker, module, question.key, question.text))
-            case _:
-                await self._delete(asker, module, question.key)
-                return ParamAnswer()
-
-    async def _get(self, asker: SiteAsker, module: str, key: str) -> str:
-        try:
-            text = transfer.text_of(await self._ask(module, transfer.GET, asker.args({"key": key})))
-        except RmpaError:
-            self._judge(asker, module, key, [key])  # it is not told whether it is there
-            raise
-        self._judge(asker, module, key, parameters_in(key, parse_response(text.encode())))
-        return text
-
-    async def _present(self, asker: SiteAsker, module: str) -> list[str]:
-        text = transfer.text_of(await self._ask(module, transfer.NAMES, asker.args({})))
-        names = parse_response(text.encode())
+    async def present() -> list[str]:
+        names = await read_text(transfer.text_of(await ask(transfer.NAMES, {})))
         return [str(name) for name in names] if isinstance(names, list) else []
 
-    async def _names(self, asker: SiteAsker, module: str) -> list[str]:
-        found = await self._present(asker, module)
-        return [name for name in found if not self._why_not(asker, module, name, name)]
+    match what:
+        case transfer.NAMES:
+            found = [name for name in await present() if why_not is None or not why_not(name, name)]
+            return {"text": await write_text("the list of parameters", list(found))}
+        case transfer.GET:
+            try:
+                got = transfer.text_of(await ask(what, {"key": key}))
+            except RmpaError:
+                judge([key])  # it is not told whether it is there
+                raise
+            judge(parameters_in(key, await read_text(got)))
+            return {"text": got}
+        case transfer.SET | transfer.DELETE:
+            setting = what == transfer.SET
+            written = parameters_in(key, await read_text(text)) if setting else [key]
+            judge(written)
+            if why_not is not None:
+                judge(lost_with(written, await present()))  # what the owner does not name it judges itself
+            answer = await ask(what, {"key": key, "text": text} if setting else {"key": key})
+            return {"count": transfer.count_of(answer)} if setting else {}
+    raise RemoteProtocolError(f"{what[:40]!r} is no question about parameters")
 
-    async def _set(self, asker: SiteAsker, module: str, key: str, text: str) -> int:
-        names = parameters_in(key, parse_response(text.encode()))
-        self._judge(asker, module, key, names)
-        # What the owner does not name it judges itself.
-        self._judge(asker, module, key, lost_with(names, await self._present(asker, module)))
-        return transfer.count_of(await self._ask(module, transfer.SET, asker.args({"key": key, "text": text})))
 
-    async def _delete(self, asker: SiteAsker, module: str, key: str) -> None:
-        self._judge(asker, module, key, [key])
-        self._judge(asker, module, key, lost_with([key], await self._present(asker, module)))
-        await self._ask(module, transfer.DELETE, asker.args({"key": key}))
-
-    def _judge(self, asker: SiteAsker, module: str, key: str, names: list[str]) -> None:
-        if why := refused_one(names, lambda name: self._why_not(asker, module, name, key)):
-            raise PeerRefused(f"site {self._site}", why)
-
-
-# Asks other sites about parameters of their modules.
-
-
-class SiteParamImports:
-    """The parameters of other sites' modules.
+class SiteParams:
+    """Answers the questions of other sites about parameters of this site's modules, and asks them about theirs.
 
     Args:
-        site: This site's name.
-        session: The Zenoh session.
-        stamp: The wall clock, nanoseconds since 1970.
+        context: What is shared with topics and services.
+        ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
         why_not: ``(asker, parameter, told)``: why a module of this site, which asks, may not have a parameter, by its
             name at the other site; empty if it may. ``told`` is the name that it asked for. ``None``: trust is off.
     """
 
     def __init__(
         self,
-        site: str,
-        session: OpenSession,
-        stamp: Callable[[], int],
+        context: SiteContext,
+        ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
         why_not: Callable[[str, str, str], str] | None = None,
     ) -> None:
-        self._site = site
-        self._session = session
-        self._stamp = stamp
+        self._context = context
+        self._ask = ask
         self._why_not = why_not
+        self._queryable: Declaration | None = None
+        self._answering = Answering(
+            "parameters", f"the gateway of site {context.name} ends", limits.SITE_PARAMS_AT_ONCE
+        )
 
-    async def ask(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
+    def lead(self, *, leads: bool) -> None:
+        """Answer while this gateway leads its site."""
+        if leads and self._queryable is None:
+            key = f"{ROOT}/{self._context.name}/*/p/**"
+            self._queryable = self._context.session.queryable(key, self._take, _NEEDS)
+        elif not leads and self._queryable is not None:
+            self._queryable.close()
+            self._queryable = None
+
+    async def close(self) -> None:
+        """Answer no more; questions under way get an error."""
+        self.lead(leads=False)
+        await self._answering.close()
+
+    # --- questions of other sites ---------------------------------------------------------------------------------
+
+    def _take(self, query: ArrivedQuery) -> None:
+        self._answering.take(query, self._respond)
+
+    async def _respond(self, query: ArrivedQuery) -> tuple[bytes, bytes]:
+        site, _ = caller(query)
+        module, name = parse_param_key(query.key)
+        if name == GATEWAYS:
+            asked = ParamQuestion.parse(query.payload)
+            found = await self._owner(site, module, asked)
+            if asked.op == "names":
+                found = {"names": await read_text(found["text"])}
+            return ParamAnswer(**found).serialize(), b""
+        if query.payload:
+            text = serialize_response(from_json(query.payload)).decode()
+            found = await self._owner(site, module, ParamQuestion(op="set", key=name, text=text))
+            return to_json(found["count"]), b""
+        found = await self._owner(site, module, ParamQuestion(op="get", key=name))
+        return to_json(parse_response(found["text"].encode())), b""
+
+    async def _owner(self, site: str, module: str, asked: ParamQuestion) -> dict[str, Any]:
+        """Ask a module of this site what another site may ask."""
+
+        def ask(what: str, args: dict[str, Any]) -> Awaitable[object]:
+            return self._ask(module, what, {**args, "site": site, "askers": list(asked.askers)})
+
+        def why_not(name: str, told: str) -> str:
+            return self._context.rules.refusal(site, module, name, Access.PARAM, asked.askers, told)
+
+        return await ask_judged(ask, f"param.{asked.op}", asked.key, asked.text, why_not)
+
+    # --- questions of this site -----------------------------------------------------------------------------------
+
+    async def ask(self, asker: str, site: str, module: str, args: dict[str, Any]) -> object:
         """Answer a request of ``bridge.params.rules`` for a module of another site.
 
         Args:
             asker: The linked module that asks; empty for this machine's user.
             site: The other site.
             module: The module there.
-            what: The request.
-            args: Its arguments.
+            args: The request, as ``what``, and its arguments.
 
         Raises:
             PeerRefused: This gateway, module or site refused.
             UnreachableError: No gateway of that site answers for the module.
         """
-        if site == self._site:
+        if site == self._context.name:
             raise PeerRefused(site, f"{module} is a module of this very site: ask it itself, by --peer {module}")
-        key, askers = plain_key(str(args.get("key", ""))), (asker,) if asker else ()
-        match what:
-            case transfer.GET:
-                question = ParamQuestion(op="get", key=key, askers=askers)
-                return {"text": await self._get(asker, site, module, question)}
-            case transfer.NAMES:
-                found = await self._names(asker, site, module)
-                names = [name for name in found if not self._denial(asker, name, name)]
-                return {"text": await write_text("the list of parameters", list(names))}
-            case transfer.SET:
-                text = transfer.text_of(args)
-                written = parameters_in(key, await read_text(text))
-                await self._judge_change(asker, site, module, key, written)
-                question = ParamQuestion(op="set", key=key, text=text, askers=askers)
-                return {"count": (await self._question(site, module, question)).count}
-            case transfer.DELETE:
-                await self._judge_change(asker, site, module, key, [key])
-                await self._question(site, module, ParamQuestion(op="delete", key=key, askers=askers))
-                return {}
-        raise RemoteProtocolError(f"{what[:40]!r} is no question about parameters")
+        what, key = str(args.get("what", "")), plain_key(str(args.get("key", "")))
+        text = transfer.text_of(args) if what == transfer.SET else ""
+        why_not = partial(self._why_not, asker) if self._why_not is not None and asker else None
+        return await ask_judged(partial(self._other_site, asker, site, module), what, key, text, why_not)
 
-    async def _get(self, asker: str, site: str, module: str, question: ParamQuestion) -> str:
-        key = question.key
-        try:
-            text = (await self._question(site, module, question)).text
-        except PeerRefused:
-            self._judge(asker, key, [key])  # it is not told whether it is there
-            raise
-        self._judge(asker, key, parameters_in(key, await read_text(text)))
-        return text
-
-    async def _names(self, asker: str, site: str, module: str) -> list[str]:
-        askers = (asker,) if asker else ()
-        return (await self._question(site, module, ParamQuestion(op="names", askers=askers))).names
-
-    async def _judge_change(self, asker: str, site: str, module: str, key: str, written: list[str]) -> None:
-        self._judge(asker, key, written)
-        if asker and self._why_not is not None:
-            self._judge(asker, key, lost_with(written, await self._names(asker, site, module)))
-
-    def _judge(self, asker: str, key: str, names: list[str]) -> None:
-        if why := refused_one(names, lambda name: self._denial(asker, name, key)):
-            raise PeerRefused(f"site {self._site}", why)
-
-    def _denial(self, asker: str, name: str, told: str) -> str:
-        return "" if self._why_not is None else self._why_not(asker, name, told)
-
-    async def _question(self, site: str, module: str, question: ParamQuestion) -> ParamAnswer:
-        origin = SiteAttachment(1, self._stamp(), NO_MD5, "/rmpa", (self._site,))
-        replies = await self._session.get(
+    async def _other_site(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
+        question = ParamQuestion(op=what.removeprefix("param."), askers=(asker,) if asker else (), **args)
+        attachment = MessageSource(NO_MD5, "/rmpa", (self._context.name,)).writer()
+        replies = await self._context.session.get(
             param_key(site, module, GATEWAYS),
             question.serialize(),
-            origin.serialize(),
+            attachment(1, time.time_ns()),
             timeout=limits.SITE_PARAM_TIMEOUT,
         )
         for reply in sorted(replies, key=lambda each: not each.ok):
-            if reply.ok:
-                return ParamAnswer.parse(reply.payload)
-            raise PeerRefused(f"{site}/{module}", reply.payload.decode(errors="replace"))
+            if not reply.ok:
+                raise PeerRefused(f"{site}/{module}", reply.payload.decode(errors="replace"))
+            answer = ParamAnswer.parse(reply.payload)
+            if what == transfer.NAMES:
+                return {"text": await write_text("the list of parameters", list(answer.names))}
+            return {"text": answer.text, "count": answer.count}
         raise UnreachableError(
             "gateway", f"site {site} for its module {module}", "`rmpa site info` shows which modules are there"
         )

@@ -9,11 +9,10 @@ from rmpa.config.rules import GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
-from rmpa.gateway.ros2.topics import Ros2Topics
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph, MemoryTopic
-from tests.gateway.memory_zenoh import MemoryZenoh
+from tests.gateway.memory_zenoh import MemoryZenoh, eventually
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import Contracts
     from rmpa.gateway.neighbour import ZenohSample
-    from rmpa.gateway.ros2.services import Ros2Context
 
 STRING = MessageType("std_msgs/String")
 
@@ -29,11 +27,6 @@ STRING = MessageType("std_msgs/String")
 def find_none(name: str) -> MessageType:
     """A machine without ROS 1 packages: only what rmpa brings."""
     return MessageType(name)
-
-
-def find_no_topics(context: Ros2Context) -> Ros2Topics:
-    """The part for topics, on a machine without definitions."""
-    return Ros2Topics(context, find_none)
 
 
 def string(text: str) -> bytes:
@@ -88,7 +81,7 @@ class Ros2TopicBed:
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules, ros2=ros2 or Ros2Settings())
         self.neighbour = Ros2Neighbour(
-            cast("Any", self.graph), cast("Any", self.network.session()), settings, [find_no_topics], contracts
+            cast("Any", self.graph), cast("Any", self.network.session()), settings, contracts, find_none
         )
         self.types = Ros2Types(settings.ros2.distribution)
         self._numbers = iter(range(1, 1000))
@@ -129,16 +122,24 @@ class Ros2TopicBed:
     def topic(self, name: str, node: str = "/bot") -> MemoryTopic | None:
         return self.graph.topics.get((name, node))
 
+    async def shown(self, name: str, node: str = "/bot") -> MemoryTopic:
+        """A topic of ROS 2, once it is in the gateway's graph."""
+        await eventually(lambda: self.topic(name, node))
+        return self.graph.topics[name, node]
+
+    async def subscribed(self, publisher: Ros2Publisher) -> MemoryTopic:
+        """The topic of a publisher, once a node here subscribes and the publisher hears of it."""
+        topic = await self.shown(publisher.endpoint.name, publisher.endpoint.node.name)
+        topic.on_demand(True)
+        await eventually(lambda: publisher.wanted)
+        return topic
+
     @property
     def problems(self) -> dict[str, str]:
-        found = self.neighbour.report()["problems"]
-        assert isinstance(found, dict)
-        return found
+        return self.neighbour.context.problems
 
     def rows(self, direction: str) -> list[dict[str, Any]]:
-        found = self.neighbour.report()["topics"]
-        assert isinstance(found, list)
-        return [row for row in found if row["direction"] == direction]
+        return [row for row in self.neighbour.topics.rows() if row["direction"] == direction]
 
 
 @contextlib.asynccontextmanager

@@ -29,7 +29,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> N
         bed.publisher("/chatter")
         bed.subscribe("/mine", [], node="/older", type_hash="RIHS01_" + "0" * 64)
         await eventually(lambda: bed.problems and bed.topic("/chatter"))
-        alone = Ros2Answers("gate", bed.neighbour, lambda: ("tcp/192.0.2.1:7447",))
+        alone = Ros2Answers(bed.neighbour)
         report: SitesReport = await alone.answer(REPORT, {})
         assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
         report = await alone.answer(INFO, {"site": "ros2"})
@@ -45,7 +45,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> N
 
 async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
     async with topic_bed() as bed:
-        both = Ros2Answers("gate", bed.neighbour, lambda: (), OtherSites())
+        both = Ros2Answers(bed.neighbour, OtherSites())
         report: SitesReport = await both.answer(REPORT, {})
         assert [site.name for site in report.sites] == ["hall", "ros2"]
         assert await both.answer(PARAM, {"site": "hall"}) == ["of a site"]

@@ -70,7 +70,7 @@ class Bed:
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
         own = self.network.session()
-        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", own), GatewaySettings(), [Ros2Actions])
+        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", own), GatewaySettings())
 
     def endpoints(self, node: str) -> set[str]:
         tokens = [parse_token(each) for each in self.network.token_keys]

@@ -14,7 +14,7 @@ from rmpa.config.rules import GatewaySettings
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph
-from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string
+from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string
 from tests.gateway.zenoh_bed import bed, until
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ async def program(net: ZenohBed) -> AsyncIterator[SdkProgram]:
 @contextlib.asynccontextmanager
 async def gateway(net: ZenohBed) -> AsyncIterator[tuple[MemoryGraph, Ros2Neighbour]]:
     graph = MemoryGraph()
-    neighbour = Ros2Neighbour(cast("Any", graph), await net.session(), GatewaySettings(), [find_no_topics])
+    neighbour = Ros2Neighbour(cast("Any", graph), await net.session(), GatewaySettings(), find=find_none)
     neighbour.start()
     try:
         yield graph, neighbour
@@ -145,8 +145,7 @@ async def test_a_topic_of_an_sdk_program_is_heard_here() -> None:
         topic = graph.topics["/from_ros2", "/talker"]
         assert topic.source.type == "std_msgs/String"
         topic.on_demand(True)
-        rows = neighbour.report()["topics"]
-        assert isinstance(rows, list)
+        rows = list(neighbour.topics.rows())
         assert rows[0]["problem"] == ""
         # The subscription reaches the program some milliseconds later: a volatile topic promises nothing before.
         number = 0

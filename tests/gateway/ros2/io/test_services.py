@@ -13,7 +13,6 @@ from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
-from rmpa.gateway.ros2.services import Ros2Services
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
@@ -37,9 +36,7 @@ class Bed:
         self.graph = MemoryGraph()
         self.ros2 = self.network.session()
         settings = GatewaySettings(rules=rules)
-        self.neighbour = Ros2Neighbour(
-            cast("Any", self.graph), cast("Any", self.network.session()), settings, [Ros2Services]
-        )
+        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", self.network.session()), settings)
         self.types = Ros2Types("jazzy")
         self.types.service_hash(ADD, ADD_2)
         self.types.service_hash(SET_BOOL)
@@ -106,9 +103,6 @@ async def test_a_call_that_fails_is_no_response_of_ros2(bed: Bed) -> None:
         assert why in reply.payload
     (reply,) = await bed.ros2.get(client.key(), bed.cdr(f"{ADD_2}_Request", a=1, b=5), b"short")
     assert not reply.ok
-    counts = bed.neighbour.report()["service_calls"]
-    assert isinstance(counts, dict)
-    assert (counts["out"], counts["out_failed"]) == (3, 3)
 
 
 async def test_a_service_that_is_gone_is_gone_in_ros2(bed: Bed) -> None:
@@ -187,14 +181,10 @@ async def test_a_service_whose_definition_differs_is_reported_and_not_shown(bed:
     for each in (other, unknown):
         bed.ros2.token(each.token())
 
-    def problems() -> dict[str, str]:
-        found = bed.neighbour.report()["problems"]
-        assert isinstance(found, dict)
-        return found
-
-    await eventually(lambda: len(problems()) == 2)
-    assert "definitions differ" in problems()["/sum"]
-    assert "odd_msgs/Odd" in problems()["/odd"]
+    problems = bed.neighbour.context.problems
+    await eventually(lambda: len(problems) == 2)
+    assert "definitions differ" in problems["/sum"]
+    assert "odd_msgs/Odd" in problems["/odd"]
     assert not bed.graph.services
 
 

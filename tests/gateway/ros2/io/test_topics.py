@@ -23,7 +23,7 @@ from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
-from tests.gateway.ros2.io.ros2_bed import STRING, find_no_topics, string, topic_bed
+from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
 from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ async def test_a_type_without_a_pair_is_told_with_what_to_write() -> None:
         (text,) = bed.problems.values()
         assert "count, text" in text
         assert "fields_1_to_2" in text
-        (way,) = await bed.neighbour.ways("/odd")
+        (way,) = bed.neighbour.ways("/odd")
         assert not way.flows
         assert way.stages[-1].text == text
         assert bed.own(EntityKind.PUBLISHER) == []
@@ -161,7 +161,7 @@ async def test_a_subscription_with_another_hash_or_type_is_told() -> None:
         assert "definitions differ" in bed.problems["/chatter of /older"]
         assert "Humble" in bed.problems["/chatter of /humble"]
         assert "std_msgs/msg/Int32" in bed.problems["/chatter of /other"]
-        (way,) = await bed.neighbour.ways("/chatter")
+        (way,) = bed.neighbour.ways("/chatter")
         assert (way.peer, way.to, way.node) == ("arm", "ros2", "/talker")
         heard = next(stage for stage in way.stages if stage.name == "heard")
         assert "/older" in heard.text
@@ -203,9 +203,7 @@ async def test_humble_has_no_hash_and_longer_gids() -> None:
 async def test_a_topic_of_ros2_is_a_source_of_its_node() -> None:
     async with topic_bed() as bed:
         talker = bed.publisher("/chatter")
-        await eventually(lambda: bed.topic("/chatter"))
-        topic = bed.topic("/chatter")
-        assert topic is not None
+        topic = await bed.shown("/chatter")
         assert (topic.source.site, topic.source.module, topic.source.type) == ("ros2", "", "std_msgs/String")
         assert topic.description == STRING.describe()
         talker.say("unheard")
@@ -228,19 +226,13 @@ async def test_a_topic_of_ros2_is_a_source_of_its_node() -> None:
 async def test_a_publisher_that_restarts_loses_nothing_while_nodes_subscribe_anew() -> None:
     async with topic_bed() as bed:
         talker = bed.publisher("/chatter")
-        await eventually(lambda: bed.topic("/chatter"))
-        topic = bed.topic("/chatter")
-        assert topic is not None
-        topic.on_demand(True)
-        await eventually(lambda: talker.wanted)
+        topic = await bed.subscribed(talker)
         talker.close()
         await eventually(lambda: bed.topic("/chatter") is None)
         again = bed.publisher("/chatter")
         for number in range(60):
             again.say(f"{number}")
-        await eventually(lambda: bed.topic("/chatter"))
-        topic = bed.topic("/chatter")
-        assert topic is not None
+        topic = await bed.shown("/chatter")
         again.say("60")
         topic.on_demand(True)
         await eventually(lambda: len(topic.messages) == 61)
@@ -251,11 +243,7 @@ async def test_a_header_is_numbered_as_its_publisher_numbers_its_messages() -> N
     kind, name = MessageType("geometry_msgs/PointStamped"), "geometry_msgs/msg/PointStamped"
     async with topic_bed() as bed:
         talker = bed.publisher("/point", type_name=name)
-        await eventually(lambda: bed.topic("/point"))
-        topic = bed.topic("/point")
-        assert topic is not None
-        topic.on_demand(True)
-        await eventually(lambda: talker.wanted)
+        topic = await bed.subscribed(talker)
         conversion = Conversion(kind, name, bed.types)
         for x in (1.0, 2.0):
             talker.put(conversion.to_ros2(kind.serialize(kind.make({"point": {"x": x}}))), skip=1)
@@ -267,35 +255,21 @@ async def test_a_header_is_numbered_as_its_publisher_numbers_its_messages() -> N
 async def test_each_node_has_its_own_messages() -> None:
     async with topic_bed() as bed:
         left, right = bed.publisher("/tf", node="/left"), bed.publisher("/tf", node="/right")
-        await eventually(lambda: bed.topic("/tf", "/left") and bed.topic("/tf", "/right"))
-        topics = [bed.topic("/tf", node) for node in ("/left", "/right")]
-        for topic in topics:
-            assert topic is not None
-            topic.on_demand(True)
-        await eventually(lambda: left.wanted and right.wanted)
+        topics = [await bed.subscribed(each) for each in (left, right)]
         left.say("l")
         right.say("r")
-        await eventually(lambda: all(topic is not None and topic.messages for topic in topics))
-        assert [topic.messages for topic in topics if topic is not None] == [[string("l")], [string("r")]]
+        await eventually(lambda: all(topic.messages for topic in topics))
+        assert [topic.messages for topic in topics] == [[string("l")], [string("r")]]
 
 
 async def test_a_program_that_chooses_its_own_gid_is_heard() -> None:
     async with topic_bed() as bed:
         talker = bed.publisher("/chatter")
         talker.gid = bytes(range(16))
-        await eventually(lambda: bed.topic("/chatter"))
-        topic = bed.topic("/chatter")
-        assert topic is not None
-        topic.on_demand(True)
-        await eventually(lambda: talker.wanted)
+        topic = await bed.subscribed(talker)
         talker.say("mine")
-        bed.ros2.publisher(talker.endpoint.key(), ZenohQos(), lambda _: None).put(
-            bytes(
-                bed.types.store.serialize_cdr(
-                    bed.types.store.types["std_msgs/msg/String"]("bare"), talker.endpoint.type
-                )
-            )
-        )
+        bare = bed.ros2.publisher(talker.endpoint.key(), ZenohQos(), lambda _: None)
+        bare.put(b"\0\1\0\0\x05\0\0\0bare\0")
         await eventually(lambda: len(topic.messages) == 2)
         assert topic.messages == [string("mine"), string("bare")]
 
@@ -303,21 +277,17 @@ async def test_a_program_that_chooses_its_own_gid_is_heard() -> None:
 async def test_losses_are_counted_by_the_numbers() -> None:
     async with topic_bed() as bed:
         talker = bed.publisher("/chatter")
-        await eventually(lambda: bed.topic("/chatter"))
-        topic = bed.topic("/chatter")
-        assert topic is not None
-        topic.on_demand(True)
-        await eventually(lambda: talker.wanted)
+        await bed.subscribed(talker)
         talker.say("a")
         talker.say("b", skip=3)
         talker.put(b"\0\1\0\0\xff")
         await eventually(lambda: bed.rows("in")[0]["unconverted"])
         (row,) = bed.rows("in")
         assert (row["received"], row["lost"], row["unconverted"]) == (2, 3, 1)
-        (way,) = await bed.neighbour.ways("/chatter", "ros2")
+        (way,) = bed.neighbour.ways("/chatter", "ros2")
         assert way.flows
         assert "3 were lost" in way.stages[-1].text
-        assert await bed.neighbour.ways("/chatter", "warehouse") == []
+        assert bed.neighbour.ways("/chatter", "warehouse") == []
         assert len(bed.problems) == 1
 
 
@@ -326,10 +296,7 @@ async def test_a_transient_local_topic_is_latched_here() -> None:
         one, two = (bed.publisher("/map", node=node, qos=LATCHED) for node in ("/one", "/two"))
         one.say("1")
         two.say("2")
-        await eventually(lambda: bed.topic("/map", "/one") and bed.topic("/map", "/two"))
-        first, second = bed.topic("/map", "/one"), bed.topic("/map", "/two")
-        assert first is not None
-        assert second is not None
+        first, second = await bed.shown("/map", "/one"), await bed.shown("/map", "/two")
         assert first.description is not None
         assert first.description.latching
         first.on_demand(True)
@@ -346,16 +313,10 @@ async def test_a_transient_local_topic_is_latched_here() -> None:
 async def test_a_transient_local_publisher_that_comes_later_has_its_history_asked() -> None:
     async with topic_bed() as bed:
         plain = bed.publisher("/map", node="/plain")
-        await eventually(lambda: bed.topic("/map", "/plain"))
-        first = bed.topic("/map", "/plain")
-        assert first is not None
-        first.on_demand(True)
-        await eventually(lambda: plain.wanted)
+        await bed.subscribed(plain)
         late = bed.publisher("/map", node="/late", qos=LATCHED)
         late.say("kept")
-        await eventually(lambda: bed.topic("/map", "/late"))
-        topic = bed.topic("/map", "/late")
-        assert topic is not None
+        topic = await bed.shown("/map", "/late")
         topic.on_demand(True)
         await eventually(lambda: topic.messages)
         assert topic.messages[0] == string("kept")
@@ -429,9 +390,7 @@ async def test_a_type_that_is_learnt_later_makes_the_topic_known() -> None:
     type_hash = theirs.type_hash("arm_msgs/msg/Grip")
     async with topic_bed() as bed:
         bed.publisher("/grip_state", type_name="arm_msgs/msg/Grip", type_hash=type_hash)
-        await eventually(lambda: bed.topic("/grip_state"))
-        topic = bed.topic("/grip_state")
-        assert topic is not None
+        topic = await bed.shown("/grip_state")
         assert topic.description is None
         bed.graph.publisher("/grip", CUSTOM)
         await eventually(lambda: topic.description)
@@ -465,10 +424,8 @@ async def test_rules_decide_what_crosses_and_its_name() -> None:
         await eventually(lambda: len(bed.graph.topics) == 2)
         assert sorted(name for name, _ in bed.graph.topics) == ["/out", "/ros2/in"]
         assert [each.name for each in bed.own(EntityKind.PUBLISHER)] == ["/out"]
-        refused = bed.neighbour.report()["topics_refused"]
-        assert isinstance(refused, dict)
-        assert "gateway.rule 1" in refused["/secret of /bot"]
-        ways = await bed.neighbour.ways("/secret")
+        assert "gateway.rule 1" in bed.neighbour.topics.refused["/secret of /bot"]
+        ways = bed.neighbour.ways("/secret")
         assert {(way.peer, way.to) for way in ways} == {("ros2", "gate"), ("gate", "ros2")}
         assert not any(way.flows for way in ways)
 
@@ -504,19 +461,15 @@ async def test_hostile_tokens_are_ignored_and_counted() -> None:
         bed.publisher("/good")
         await eventually(lambda: bed.topic("/good"))
         assert list(bed.graph.topics) == [("/good", "/bot")]
-        ignored = bed.neighbour.report()["ignored_tokens"]
-        assert isinstance(ignored, dict)
+        ignored = bed.neighbour.context.ros2.ignored
         assert sum(ignored.values()) == len(hostile)
         assert ignored["other gateway"] == 1
 
 
 async def test_of_two_gateways_of_one_mesh_one_shows_a_node_and_the_other_takes_over() -> None:
     async with topic_bed() as bed:
-        gateways = [
-            Ros2Neighbour(
-                cast("Any", bed.graph), cast("Any", bed.network.session()), GatewaySettings(), [find_no_topics]
-            )
-        ]
+        second = cast("Any", bed.network.session())
+        gateways = [Ros2Neighbour(cast("Any", bed.graph), second, GatewaySettings(), find=find_none)]
         gateways[0].start()
         source = bed.graph.publisher("/chatter", STRING)
         await eventually(lambda: len(bed.own(EntityKind.PUBLISHER)) == 1)

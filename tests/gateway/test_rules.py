@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from rmpa.bridge.policy import PermissionGate, Policy, PolicyDecision
-from rmpa.config.peer_rules import Access, PermissionRule, PolicySettings
+from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.policy import PermissionGate
+from rmpa.config.peer_rules import Access, Effect, PermissionRule, PolicySettings
 from rmpa.config.rules import Crossing, CrossingRule
-from rmpa.config.settings import TrustSettings
+from rmpa.config.settings import ServiceSettings, Settings, TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.gateway.neighbour import SitePermissions, SourceKind
-from rmpa.gateway.sites.catalogue import CrossingDecision, CrossingRules
+from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.rules import CrossingDecision, CrossingRules
 from rmpa.trust.permissions import Permissions
 
 T = SourceKind.TOPIC
 
 
-def out(rules: CrossingRules, name: str, module: str = "arm") -> CrossingDecision:
-    return rules.outgoing(T, module, name, "std_msgs/String", "/node")
+def out(
+    rules: CrossingRules, name: str, module: str = "arm", kind: SourceKind = T, type_name: str = "std_msgs/String"
+) -> CrossingDecision:
+    return rules.outgoing(MeshSource(kind, module, "0" * 32, "/node", name, type_name, name, "/proxy"))
 
 
-def into(rules: CrossingRules, name: str, site: str = "cloud", module: str = "arm") -> CrossingDecision:
-    return rules.incoming(T, site, module, name, "std_msgs/String", "/node")
+def into(
+    rules: CrossingRules, name: str, site: str = "cloud", module: str = "arm", kind: SourceKind = T
+) -> CrossingDecision:
+    return rules.incoming(ForeignSource(kind, site, module, "/node", name, "std_msgs/String"))
 
 
 def test_without_a_rule_everything_crosses_under_its_own_name() -> None:
@@ -99,25 +104,37 @@ def test_a_name_that_is_none_is_told() -> None:
     assert "'cloud/scan'" in decision.why
 
 
-def test_the_gateways_policy_stands_above_the_rules() -> None:
-    policy = Policy(PolicySettings(deny=("/secret/**",)))
-
-    def judge(_kind: SourceKind, name: str, type_name: str, node: str) -> PolicyDecision:
-        return policy.judge(name, type_name, node)
-
-    rules = CrossingRules((CrossingRule(name="/{site}{name}"),), judge)
+def test_the_gateways_policy_stands_above_the_rules_that_of_bridge_for_topics_and_of_services_for_services() -> None:
+    policy = PolicySettings(deny=("/secret/**",), deny_types=("std_msgs/Bool",))
+    own = BridgeContext.of(Settings(policy=policy, services=ServiceSettings(deny=("/stop",))))
+    rules = CrossingRules((CrossingRule(name="/{site}{name}"),), own)
     assert "bridge.deny" in out(rules, "/secret/plan").why
     assert not out(rules, "/rosout").allowed
+    assert not out(rules, "/open", type_name="std_msgs/Bool").allowed
+    assert out(rules, "/stop").allowed
+    assert not out(rules, "/stop", kind=SourceKind.SERVICE).allowed
+    assert out(rules, "/secret/plan", kind=SourceKind.SERVICE, type_name="std_msgs/Bool").allowed
     assert into(rules, "/secret/plan").name == "/cloud/secret/plan"
-    assert not into(CrossingRules((), judge), "/secret/plan").allowed
+    assert not into(CrossingRules((), own), "/secret/plan").allowed
+
+
+def test_topics_that_each_node_of_ros2_has_cross_only_if_a_rule_names_them() -> None:
+    assert "is of each ROS 2 node" in into(CrossingRules(), "/rosout", "ros2", "").why
+    assert into(CrossingRules((CrossingRule(names=("/rosout",)),)), "/rosout", "ros2", "").allowed
+    assert (
+        into(CrossingRules((CrossingRule(name="/{site}/{module}{name}"),)), "/a", "ros2", "").name == "/ros2/ros2/a"
+    )
+
+
+def permitted(*permissions: PermissionRule) -> tuple[CrossingRules, Counters]:
+    counters = Counters()
+    gate = PermissionGate(Permissions(TrustSettings(rules=permissions)), counters)
+    return CrossingRules(gate=gate), counters
 
 
 def test_permissions_stand_above_the_rules_and_what_they_refuse_is_counted() -> None:
-    counters = Counters()
-    trust = TrustSettings(
-        rules=(PermissionRule(("cloud",), names={"publish": ("/scan",), "call": ("/stop",), "param": ("/arm/**",)}),)
-    )
-    rules = CrossingRules(permissions=SitePermissions(PermissionGate(Permissions(trust), counters)))
+    names = {"publish": ("/scan",), "call": ("/stop",), "param": ("/arm/**",)}
+    rules, counters = permitted(PermissionRule(("cloud",), names=names))
     assert into(rules, "/scan").allowed
     refused = into(rules, "/cmd_vel")
     assert (refused.allowed, refused.why) == (False, "no [[permission]] lets cloud publish /cmd_vel")
@@ -127,3 +144,15 @@ def test_permissions_stand_above_the_rules_and_what_they_refuse_is_counted() -> 
     assert rules.refusal("cloud", "arm", "/arm/speed", Access.PARAM) == ""
     assert rules.refusal("", "arm", "/arm/speed", Access.PARAM), "a program that names no site"
     assert (counters["permission.publish"], counters["permission.call"], counters["permission.param"]) == (2, 1, 1)
+
+
+def test_a_module_of_another_site_gets_nothing_by_its_name_alone_but_may_be_denied_by_it() -> None:
+    rules, _ = permitted(
+        PermissionRule(("arm",), names={"publish": ("/cmd_vel",)}),
+        PermissionRule(("warehouse",), names={"publish": ("/**",)}),
+        PermissionRule(("eve",), effect=Effect.DENY, names={"publish": ("/cmd_vel",)}),
+    )
+    assert not into(rules, "/cmd_vel", "elsewhere", "arm").allowed
+    assert into(rules, "/cmd_vel", "warehouse", "arm").allowed
+    assert not into(rules, "/cmd_vel", "warehouse", "eve").allowed
+    assert into(rules, "/scan", "warehouse", "eve").allowed, "no rule denies this"

@@ -1,0 +1,190 @@
+"""What may cross between this site and others or ROS 2, and its name here: a pure table that names what decided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.policy import OPEN_GATE
+from rmpa.config.peer_rules import Access
+from rmpa.config.rules import ROS2, Crossing
+from rmpa.core.identity import is_global_name, matches
+from rmpa.gateway.neighbour import SourceKind
+from rmpa.trust.permissions import refusal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from rmpa.bridge.context import BridgeContext
+    from rmpa.bridge.policy import PermissionGate
+    from rmpa.config.rules import CrossingRule
+    from rmpa.gateway.neighbour import ForeignSource, MeshSource
+
+_EVERY_SITE: Final = ("*", "**")
+_NO_RULE: Final = "no gateway.rule fits: everything crosses"
+PLUMBING: Final = frozenset(("/rosout", "/parameter_events"))
+"""Topics that each node of ROS 2 has; they do not cross unless a rule names them as they are."""
+ACCESS: Final = {SourceKind.TOPIC: Access.SUBSCRIBE, SourceKind.SERVICE: Access.CALL}
+"""What a module or a site must be allowed to have, or to be told of, a source."""
+
+
+@dataclass(frozen=True, slots=True)
+class CrossingDecision:
+    """Whether a source may cross, and how.
+
+    Args:
+        allowed: Whether it may.
+        why: The rule that decided, as text.
+        name: The name here of what comes in; empty if it may not cross.
+        rate: Messages a second of what goes out; ``None``: no limit.
+        size: Bytes a second of what goes out; ``None``: no limit.
+        addressed: Whether what goes out does not go to all other sites alike: ``outgoing_to`` decides for each.
+    """
+
+    allowed: bool
+    why: str
+    name: str = ""
+    rate: float | None = None
+    size: int | None = None
+    addressed: bool = False
+
+
+class CrossingRules:
+    """Judges sources by ``[[gateway.rule]]``: the first rule that fits holds; without one everything crosses.
+
+    Args:
+        rules: In the order of the file.
+        context: The gateway's own ``[bridge]`` and ``[services]``, which must let a source cross too: by its name in
+            its module if it goes out, by its name here if it comes in. ``None``: they are not asked.
+        gate: ``[[permission]]``, which must let other sites do it too, as ``PermissionGate.judge_site`` says: Zenoh
+            proves which gateway is connected, but not which site or module a message is of. What it refuses is
+            counted.
+    """
+
+    def __init__(
+        self,
+        rules: Sequence[CrossingRule] = (),
+        context: BridgeContext | None = None,
+        gate: PermissionGate = OPEN_GATE,
+    ) -> None:
+        self._rules = tuple(enumerate(rules, 1))
+        self._context = context
+        self._gate = gate
+
+    def outgoing(self, source: MeshSource) -> CrossingDecision:
+        """Decide whether a source of this site goes out to any other site, and whether to all of them alike."""
+        if why := self._policy(source.kind, source.name, source.type, source.node):
+            return CrossingDecision(False, why)
+        found = []
+        for number, rule in self._fitting(source.module, source.name):
+            if all(site == ROS2 for site in rule.sites):
+                continue  # it is about no site
+            found.append(_outgoing(number, rule))
+            if any(glob in _EVERY_SITE for glob in rule.sites):
+                break
+        else:
+            found.append(CrossingDecision(True, _NO_RULE))
+        if len({(each.allowed, each.rate, each.size) for each in found}) == 1:
+            return found[0]
+        return CrossingDecision(True, next(each.why for each in found if each.allowed), addressed=True)
+
+    def outgoing_to(self, site: str, module: str, name: str) -> CrossingDecision:
+        """Decide whether a source that ``outgoing`` lets out goes to one other site; permissions are not asked.
+
+        Args:
+            site: The other site; empty for a program that names none.
+            module: The module that has it.
+            name: Its name in its module.
+        """
+        found = next(self._fitting(module, name, site), None)
+        return CrossingDecision(True, _NO_RULE) if found is None else _outgoing(*found, site)
+
+    def refusal(
+        self,
+        site: str,
+        module: str,
+        name: str,
+        access: Access = Access.SUBSCRIBE,
+        askers: Iterable[str] = (),
+        told: str | None = None,
+    ) -> str:
+        """Why another site may not have a source or parameter of this one; empty if it may.
+
+        Args:
+            site: The other site; empty for a program that names none.
+            module: The module that has it.
+            name: Its name in its module.
+            access: What the other site would do with it.
+            askers: The modules of the other site that ask, as it says.
+            told: The name for the text, if ``name`` was found in what was asked for and may be a secret.
+        """
+        decision = self.outgoing_to(site, module, name)
+        return self.denial(site, name, access, askers, told) if decision.allowed else decision.why
+
+    def denial(
+        self, site: str, name: str, access: Access, askers: Iterable[str] = (), told: str | None = None
+    ) -> str:
+        """Why the permissions, without the rules, do not let another site have a name; empty if they do."""
+        decision = self._gate.judge_site(access, site, askers, name)
+        if decision.allowed:
+            return ""
+        self._gate.refused(access, site, name, decision)
+        return refusal(access, site, name if told is None else told)
+
+    def incoming(self, source: ForeignSource) -> CrossingDecision:
+        """Decide whether a source of another site or of ROS 2 is shown here, and under which name.
+
+        Args:
+            source: The source by its name there.
+        """
+        site, module, here, why = source.site, source.module or source.site, source.name, _NO_RULE
+        if site == ROS2 and here in PLUMBING and not any(here in rule.names for _, rule in self._rules):
+            return CrossingDecision(
+                False, f"{here} is of each ROS 2 node; a gateway.rule that names it lets it cross"
+            )
+        if (found := next(self._fitting(module, here, site), None)) is not None:
+            number, rule = found
+            why = _named(number, rule)
+            if rule.crossing not in (Crossing.BOTH, Crossing.IN):
+                return CrossingDecision(False, f"{why} lets it not come in")
+            here = rule.name.replace("{name}", here).replace("{site}", site).replace("{module}", module)
+        if not is_global_name(here):
+            return CrossingDecision(False, f"{why} names it {here!r}, which is no global name of ROS")
+        if refused := self._policy(source.kind, here, source.type, source.node):
+            return CrossingDecision(False, refused)
+        access = Access.PUBLISH if source.kind is SourceKind.TOPIC else Access.SERVE
+        judged = self._gate.judge_site(access, site, (source.module,) if source.module else (), here)
+        if not judged.allowed:
+            self._gate.refused(access, site, here, judged)
+            return CrossingDecision(False, judged.rule)
+        return CrossingDecision(True, why, here)
+
+    def _fitting(self, module: str, name: str, site: str | None = None) -> Iterator[tuple[int, CrossingRule]]:
+        for number, rule in self._rules:
+            if (
+                any(matches(glob, name) for glob in rule.names)
+                and any(matches(glob, module) for glob in rule.modules)
+                and (site is None or any(matches(glob, site) for glob in rule.sites))
+            ):
+                yield number, rule
+
+    def _policy(self, kind: SourceKind, name: str, type_name: str, node: str) -> str:
+        """Why the gateway's own policy does not let a source cross; empty if it does."""
+        if self._context is None:
+            return ""
+        if kind is SourceKind.SERVICE:
+            decision = self._context.services.judge(name, node)
+        else:
+            decision = self._context.policy.judge(name, type_name, node)
+        return "" if decision.allowed else decision.rule
+
+
+def _outgoing(number: int, rule: CrossingRule, site: str = "") -> CrossingDecision:
+    """What one rule says of a source that it fits; ``site`` is named in the reason."""
+    if rule.crossing in (Crossing.BOTH, Crossing.OUT):
+        return CrossingDecision(True, _named(number, rule), rate=rule.rate, size=rule.size)
+    return CrossingDecision(False, f"{_named(number, rule)} lets it not go out{f' to {site}' if site else ''}")
+
+
+def _named(number: int, rule: CrossingRule) -> str:
+    return f"gateway.rule {number} ({rule.crossing}: {', '.join(rule.names)})"

@@ -1,0 +1,550 @@
+"""Topics between sites: publishers of this one for the others, and those of other sites in the gateway's graph."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from rmpa.bridge.policy import Needs
+from rmpa.config.peer_rules import Access
+from rmpa.core.contract import Priority, Reliability
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.gateway import limits
+from rmpa.gateway.answering import Answering
+from rmpa.gateway.neighbour import ZenohPriority, ZenohQos
+from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
+from rmpa.gateway.topics import Export
+from rmpa.ros.wire.tcpros import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.context import BridgeContext
+    from rmpa.core.contract import Contract, Contracts
+    from rmpa.core.counters import Counters
+    from rmpa.gateway.neighbour import ZenohSample
+    from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.rules import CrossingRules
+    from rmpa.gateway.sites.keys import SiteModule
+    from rmpa.gateway.sites.plans import SiteExport, SiteImport
+    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration, OpenSession
+    from rmpa.ros.wire.tcpros import TopicDescription
+
+REFUSED: Final = "refused: "
+"""What an error begins with that a rule causes: asking again is of no use."""
+_HEADER_NEEDS: Final = Needs((Access.SUBSCRIBE,), "the topic, of the site", key="rmpa/1/<site>/<module>/d/t/**")
+_DEFINITION_NEEDS: Final = Needs(
+    (), "the definition of a type whose md5 sum is known", key="rmpa/1/<site>/<module>/d/m/*"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SiteContext:
+    """What topics, services and parameters of a site share.
+
+    Args:
+        name: This site's name.
+        graph: The gateway's graph.
+        session: The Zenoh session.
+        rules: Decide what may cross.
+        bridge: The gateway's own policy: seconds for calls.
+        contracts: The contracts of topics, which become Zenoh's QoS.
+        counters: ``site.message.malformed``, ``site.message.looped``, ``site.message.unwanted_node``, and
+            ``site.message.unkept``: a latched message of a node that no node here wants, and that found no room.
+    """
+
+    name: str
+    graph: AgentGraph
+    session: OpenSession
+    rules: CrossingRules
+    bridge: BridgeContext
+    contracts: Contracts
+    counters: Counters
+
+
+def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -> ZenohQos:
+    """The QoS of one topic's publisher (docs/design/gateway.md, "Contracts"): a pure table.
+
+    A thread waits for Zenoh; what exceeds the queue before it is dropped there and counted. None has the congestion
+    control ``BLOCK``: it ends the link behind which a message waits for seconds, as each large one does on a thin
+    link. With ``DROP`` a message waits likewise (``limits.DROP_WAIT``), and the link stays; the receiver counts
+    what is lost there by its number.
+
+    Args:
+        contract: The topic's.
+        latching: Whether a late subscriber gets the last message.
+        large: Whether its messages are large: they yield to others unless the contract has a priority.
+    """
+    if contract.priority is Priority.HIGH:
+        priority = ZenohPriority.REAL_TIME
+    elif contract.priority is Priority.LOW or large:
+        priority = ZenohPriority.DATA_LOW
+    else:
+        priority = ZenohPriority.DATA
+    return ZenohQos(
+        reliable=True,
+        block=False,
+        priority=priority,
+        messages=contract.depth,
+        bytes=limits.RELIABLE_BYTES if contract.reliability is Reliability.RELIABLE else limits.BEST_EFFORT_BYTES,
+        cache=1 if latching else 0,
+    )
+
+
+class SiteDialect:
+    """To other sites messages go as they are: the dialect of an ``Export``.
+
+    Args:
+        entry: The source.
+        contract: The topic's contract.
+    """
+
+    def __init__(self, entry: SiteExport, contract: Contract) -> None:
+        self._announced = entry.announced
+        self._contract = contract
+        self.run: Final = max(1, time.time_ns())
+        """By which the numbers of its messages are told apart from those of an earlier export."""
+        self.payload: Callable[[memoryview], bytes] = bytes
+        self.attachment: Callable[[int, int], bytes]
+
+    def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos]:
+        """Of ``ExportDialect``."""
+        if about is not None:
+            source = self._announced
+            try:
+                common = MessageSource(about.md5sum, source.node, (source.site,), about.latching, self.run)
+                self.attachment = common.writer()
+            except ValueError:
+                raise RmpaError(f"its publisher names the md5 sum {about.md5sum[:40]!r}") from None
+        return self._announced.key(), qos_of(self._contract, latching=latched, large=large)
+
+    def linger(self, *, keeps: bool) -> float:
+        """A subscriber that is lost with its link is no different from one that has left.
+
+        While the publisher stays connected its messages are numbered, so that the subscriber counts them as lost when
+        it is back.
+        """
+        del keeps
+        reliable = self._contract.reliability is Reliability.RELIABLE
+        return max(limits.TAP_LINGER, self._contract.outage if reliable else 0.0)
+
+    def told(self, problem: str) -> None:
+        """``rmpa why`` tells it, and no log."""
+
+    def close(self) -> None:
+        """The neighbour takes the token back."""
+
+
+class ImportedTopic:
+    """Shows one publisher of another site, and publishes its messages while nodes subscribe.
+
+    On demand its key is subscribed to, and its gateway is asked for the publisher's header. Messages that come before
+    the header wait for it, since no subscriber is accepted before. If no message comes for a while its gateway is
+    asked for the last number too, for a loss at the end leaves no gap; again after twice the time, at most
+    ``limits.IDLE_CHECK_MAX``.
+
+    Args:
+        entry: The source.
+        part: Subscribes to its key.
+        interrupted: What ``close`` returned before, if the same topic was there and went.
+    """
+
+    # More than twelve fields: demand, header, and the counts of what was lost meanwhile change each other.
+
+    def __init__(self, entry: SiteImport, part: SiteTopics, interrupted: Interrupted | None) -> None:
+        now = time.monotonic()
+        self.entry = entry
+        self.wanted = False
+        """Whether its key is subscribed to for it."""
+        self._part = part
+        self._description: TopicDescription | None = None
+        self._problem = ""
+        self._held: deque[tuple[bytes, str]] = deque()
+        self._sequence, self._messages = interrupted or (SequenceCounter(), 0)
+        self._resumes_until = 0.0 if interrupted is None else now + limits.RESUMED_WITHIN
+        self._rate_of = 0.0, now, self._messages
+        self._fresh = False
+        self._run = 0
+        self._last_latched: bytes | None = None
+        self._mismatched = self._dropped = 0
+        self._task: asyncio.Task[None] | None = None
+        self._linger: asyncio.TimerHandle | None = None
+        self._checking: asyncio.TimerHandle | None = None
+        self._topic = part.context.graph.show_topic(entry.source, self._demand)
+
+    def take(self, payload: bytes, sequence: int, source: MessageSource) -> None:
+        """Take a message of this publisher, with what its attachment says."""
+        if not self._sequence.take(source.run, sequence):
+            return
+        self._fresh = True
+        self._messages += 1
+        if source.latched:
+            renewed, self._run = source.run != self._run, source.run
+            if renewed and payload == self._last_latched:
+                return  # another gateway of that site has taken over, and had it from the publisher again
+            self._last_latched = payload
+        if self._description is None or source.md5 != self._description.md5sum:
+            self._hold(payload, source.md5)
+        else:
+            self._dropped += self._topic.publish(payload)
+
+    def renew(self, entry: SiteImport) -> None:
+        """Its module has started anew, or the way to it was interrupted: ask for the header again."""
+        if entry.announced.module != self.entry.announced.module:
+            self._topic.forget_latched()
+            self._last_latched = None
+        moved = self.wanted and entry.announced.key() != self.entry.announced.key()
+        if moved:
+            self._part.unsubscribe(self)
+        self.entry = entry
+        if moved:
+            self._part.subscribe(self)
+        if self.wanted:
+            self._ask()
+
+    def report(self) -> dict[str, object]:
+        """What ``rmpa why`` is answered from, as JSON values."""
+        rate, since, before = self._rate_of
+        passed = time.monotonic() - since
+        if passed >= 1:
+            rate = (self._messages - before) / passed
+            self._rate_of = rate, since + passed, self._messages
+        return {
+            "name": self.entry.announced.name,
+            "wanted": self.wanted,
+            "messages": self._messages,
+            "rate": round(rate, 2),
+            "lost": self._sequence.lost,
+            "mismatched": self._mismatched,
+            "dropped": self._dropped,
+            "problem": self._problem or self._topic.problem,
+        }
+
+    def close(self) -> Interrupted | None:
+        """Take it out of the graph; what it returns is for the same topic once it is back."""
+        interrupted = None
+        if self.wanted and self._linger is None:
+            interrupted = self._sequence, self._messages
+            self._sequence = SequenceCounter()
+        if self._task is not None:
+            self._task.cancel()
+        self._detach()
+        self._topic.close()
+        return interrupted
+
+    # --- demand ---------------------------------------------------------------------------------------------------
+
+    def _demand(self, wanted: bool) -> None:
+        self._stop_lingering()
+        if not wanted:
+            if self.wanted:
+                self._linger = asyncio.get_running_loop().call_later(limits.DEMAND_LINGER, self._detach)
+        elif not self.wanted:
+            self.wanted = True
+            if time.monotonic() > self._resumes_until:
+                self._sequence.restart()
+            self._resumes_until = 0.0
+            self._part.subscribe(self)
+            self._check_in(limits.IDLE_CHECK)
+            self._ask()
+
+    def _stop_lingering(self) -> None:
+        if self._linger is not None:
+            self._linger.cancel()
+            self._linger = None
+
+    def _detach(self) -> None:
+        self._stop_lingering()
+        if not self.wanted:
+            return
+        self.wanted = False
+        if self._checking is not None:
+            self._checking.cancel()
+        self._part.unsubscribe(self)
+        # The next subscriber gets the last message from over there.
+        self._sequence.restart()
+        self._topic.forget_latched()
+        self._last_latched = None
+        self._held.clear()
+
+    def _check_in(self, pause: float) -> None:
+        if self._checking is not None:
+            self._checking.cancel()
+        self._checking = asyncio.get_running_loop().call_later(pause, self._check, pause)
+
+    def _check(self, pause: float) -> None:
+        if self._fresh:
+            self._fresh = False
+            self._check_in(limits.IDLE_CHECK)
+        else:
+            self._ask()
+            self._check_in(min(pause * 2, limits.IDLE_CHECK_MAX))
+
+    # --- the header -----------------------------------------------------------------------------------------------
+
+    def _ask(self) -> None:
+        if self._task is None or self._task.done():
+            source = self.entry.source
+            self._task = asyncio.get_running_loop().create_task(
+                self._ask_until_known(), name=f"header of {source.name} at {source.site}"
+            )
+
+    async def _ask_until_known(self) -> None:
+        pause = limits.HEADER_RETRY / 16
+        while self.wanted and not await self._ask_once():
+            await asyncio.sleep(pause)
+            pause = min(limits.HEADER_RETRY, pause * 2)
+
+    async def _ask_once(self) -> bool:
+        """Ask for the header; return whether it need not be asked again."""
+        announced, context = self.entry.announced, self._part.context
+        replies = await context.session.get(
+            f"{ROOT}/{announced.site}/{announced.module.name}/d/t{announced.name}"
+            f"?node={announced.node};site={context.name}",
+            timeout=limits.HEADER_TIMEOUT,
+            priority=ZenohPriority.INTERACTIVE_HIGH,
+        )
+        reply = next((each for each in replies if each.ok), replies[0] if replies else None)
+        if reply is None:
+            self._problem = f"site {announced.site} does not answer the question for its header"
+            return False
+        if not reply.ok:
+            text = printable(reply.payload[:400].decode(errors="replace"))
+            self._problem = f"site {announced.site} says: {text}"
+            if text.startswith(REFUSED):
+                self._detach()
+            return text.startswith(REFUSED)
+        try:
+            self._described(TopicHeader.parse(reply.payload))
+        except RemoteProtocolError as error:
+            self._problem = str(error)
+            return False
+        return True
+
+    def _described(self, header: TopicHeader) -> None:
+        self._problem = ""
+        self._sequence.announced(header.run, header.sequence - header.waiting)
+        if header.waiting and self.wanted:
+            self._check_in(limits.IDLE_CHECK)
+        described, self._description = self._description, header.description
+        if self._description != described:
+            self._topic.describe(self._description)
+        held, self._held = self._held, deque()
+        for payload, md5 in held:
+            if md5 == header.md5sum:
+                self._dropped += self._topic.publish(payload)
+            else:
+                self._mismatched += 1
+
+    def _hold(self, payload: bytes, md5: str) -> None:
+        """Keep a message until the header is known, or known anew: its publisher has another definition."""
+        self._held.append((payload, md5))
+        size = sum(len(each) for each, _ in self._held) if len(payload) > limits.LARGE_MESSAGE else 0
+        while len(self._held) > limits.HELD_MESSAGES_MAX or (size > limits.HELD_BYTES and len(self._held) > 1):
+            size -= len(self._held.popleft()[0])
+            self._dropped += 1
+        if self._description is not None:
+            self._problem = f"its messages have the md5 sum {md5}, its header {self._description.md5sum}"
+        self._ask()
+
+
+Interrupted = tuple[SequenceCounter, int]
+"""The counts of a topic that went while nodes subscribed, so that what is lost meanwhile is counted."""
+_Ident = tuple[str, str, str, str]
+"""Site, module, node and name there."""
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """The subscription to one topic of one module at another site, which its publishers share."""
+
+    declared: Declaration
+    topics: dict[str, ImportedTopic] = field(default_factory=dict)
+    """By node."""
+    latched: dict[str, tuple[bytes, int, MessageSource]] = field(default_factory=dict)
+    """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
+
+
+class SiteTopics:
+    """Topics between sites.
+
+    Args:
+        context: What is shared with services and parameters.
+    """
+
+    def __init__(self, context: SiteContext) -> None:
+        self.context = context
+        self._exported: dict[tuple[str, str], dict[tuple[str, str], tuple[Export, SiteDialect]]] = {}
+        """By module and topic, then by node and the site that it is for (empty: for all)."""
+        self._imported: dict[_Ident, ImportedTopic] = {}
+        self._interrupted: dict[_Ident, Interrupted] = {}
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._questions: dict[SiteModule, tuple[Declaration, Declaration]] = {}
+        self._reader = AttachmentReader()
+        self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
+
+    # --- what the neighbour says ----------------------------------------------------------------------------------
+
+    def export(self, entry: SiteExport) -> None:
+        """Declare a publisher of this site, for other sites."""
+        source, announced, context = entry.source, entry.announced, self.context
+        dialect = SiteDialect(entry, context.contracts.of(source.here, announced.type))
+        export = Export(source, context.graph, context.session, dialect, entry.rate, entry.size)
+        self._exported.setdefault((source.module, source.name), {})[source.node, announced.to] = export, dialect
+        export.start()
+
+    def withdraw(self, entry: SiteExport) -> None:
+        """Undeclare it."""
+        key = (entry.source.module, entry.source.name)
+        self._exported[key].pop((entry.source.node, entry.announced.to))[0].close()
+        if not self._exported[key]:
+            del self._exported[key]
+
+    def show(self, entry: SiteImport) -> None:
+        """Show a publisher of another site."""
+        ident = _ident(entry)
+        self._imported[ident] = ImportedTopic(entry, self, self._interrupted.pop(ident, None))
+
+    def renew(self, entry: SiteImport) -> None:
+        """It is of another run of its module, or comes by another gateway."""
+        self._imported[_ident(entry)].renew(entry)
+
+    def hide(self, entry: SiteImport) -> None:
+        """Take it out of the graph."""
+        interrupted = self._imported.pop(_ident(entry)).close()
+        if interrupted is not None:
+            self._interrupted[_ident(entry)] = interrupted
+            if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
+                del self._interrupted[next(iter(self._interrupted))]
+
+    def answer_for(self, module: SiteModule, *, there: bool) -> None:
+        """Answer questions for headers and definitions of a module of this site, or end that."""
+        if not there:
+            for declared in self._questions.pop(module, ()):
+                declared.close()
+            return
+        prefix, session = f"{ROOT}/{module.site}/{module.name}/d", self.context.session
+        self._questions[module] = (
+            session.queryable(f"{prefix}/t/**", partial(self._asked_header, module), _HEADER_NEEDS),
+            session.queryable(f"{prefix}/m/*", partial(self._asked_definition, module), _DEFINITION_NEEDS),
+        )
+
+    def exported(self, entry: SiteExport) -> dict[str, object]:
+        """What ``rmpa why`` is answered from of a topic that goes out, as JSON values; empty for none."""
+        topics = self._exported.get((entry.source.module, entry.source.name), {})
+        found = topics.get((entry.source.node, entry.announced.to))
+        return _report(entry.announced.to, found[0]) if found is not None else {}
+
+    def imported(self, entry: SiteImport) -> dict[str, object]:
+        """Likewise of one that comes in."""
+        found = self._imported.get(_ident(entry))
+        return found.report() if found is not None else {}
+
+    def report(self) -> dict[str, object]:
+        """The topics that go out and come in."""
+        out = [_report(to, one) for nodes in self._exported.values() for (_, to), (one, _) in nodes.items()]
+        return {"out": out, "in": [topic.report() for topic in self._imported.values()]}
+
+    async def close(self) -> None:
+        """End it: everything was withdrawn and hidden before."""
+        await self._headers.close()
+
+    # --- what comes in --------------------------------------------------------------------------------------------
+
+    def subscribe(self, topic: ImportedTopic) -> None:
+        """Subscribe to the key of a topic."""
+        announced = topic.entry.announced
+        key = announced.key()
+        if (subscription := self._subscriptions.get(key)) is None:
+            declared = self.context.session.subscribe(key, partial(self._sample, key), history=True)
+            subscription = self._subscriptions[key] = _Subscription(declared)
+        subscription.topics[announced.node] = topic
+        if (known := subscription.latched.pop(announced.node, None)) is not None:
+            topic.take(*known)
+
+    def unsubscribe(self, topic: ImportedTopic) -> None:
+        """Take that back, with the last topic of the key."""
+        announced = topic.entry.announced
+        subscription = self._subscriptions[announced.key()]
+        del subscription.topics[announced.node]
+        if not subscription.topics:
+            self._subscriptions.pop(announced.key()).declared.close()
+
+    def _sample(self, key: str, sample: ZenohSample) -> None:
+        counters, subscription = self.context.counters, self._subscriptions.get(key)
+        try:
+            sequence, _, source = self._reader.read(sample.attachment)
+        except RemoteProtocolError:
+            counters.add("site.message.malformed")
+            return
+        if self.context.name in source.path:
+            counters.add("site.message.looped")
+        elif subscription is not None and source.node in subscription.topics:
+            subscription.topics[source.node].take(sample.payload, sequence, source)
+        elif subscription is not None:
+            counters.add("site.message.unwanted_node")
+            known = subscription.latched
+            if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
+                others = sum(len(each[0]) for node, each in known.items() if node != source.node)
+                if others + len(sample.payload) > limits.HELD_BYTES:
+                    counters.add("site.message.unkept")
+                else:
+                    known[source.node] = sample.payload, sequence, source
+
+    # --- questions of other sites -----------------------------------------------------------------------------------
+
+    def _asked_header(self, module: SiteModule, query: ArrivedQuery) -> None:
+        name = query.key.removeprefix(f"{ROOT}/{module.site}/{module.name}/d/t")
+        asked = dict(pair.partition("=")[::2] for pair in query.parameters.split(";"))
+        node, site = asked.get("node", ""), asked.get("site", "")
+        if refusal := self.context.rules.refusal(site, module.name, name):
+            query.reply_error(f"{REFUSED}{refusal}")
+            return
+        topics = self._exported.get((module.name, name), {}).items()
+        found = next((each for (its, to), each in topics if node in ("", its) and to in ("", site)), None)
+        if found is None:
+            query.reply_error(f"no such publisher of {name[:200]} at {module.name}")
+        else:
+            self._headers.take(query, partial(self._header, *found))
+
+    @staticmethod
+    async def _header(export: Export, dialect: SiteDialect, _query: ArrivedQuery) -> tuple[bytes, bytes]:
+        about = await export.header(limits.HEADER_TIMEOUT * 0.8)
+        definition = about.definition.encode(errors="replace").decode()  # JSON has no bytes that are not UTF-8
+        fields = about.type, about.md5sum, definition, about.latching
+        told = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)
+        return msgspec.json.encode(told), b""
+
+    def _asked_definition(self, module: SiteModule, query: ArrivedQuery) -> None:
+        md5 = query.key.rpartition("/")[2]
+        of_module = (nodes for (name, _), nodes in self._exported.items() if name == module.name)
+        for about in (export.about for nodes in of_module for export, _ in nodes.values()):
+            if about is not None and about.md5sum == md5:
+                query.reply(query.key, about.definition.encode(errors="surrogateescape"))
+                query.finish()
+                return
+        query.reply_error(f"no publisher with the md5 sum {md5[:40]} was connected yet")
+
+
+def _report(to: str, export: Export) -> dict[str, object]:
+    return {
+        "name": export.source.name,
+        "to": to,
+        "wanted": export.wanted,
+        "messages": export.messages,
+        "waiting": export.waiting,
+        "dropped": export.dropped,
+        "limited": export.limited,
+        "problem": export.problem,
+    }
+
+
+def _ident(entry: SiteImport) -> _Ident:
+    return entry.source.site, entry.source.module, entry.source.node, entry.announced.name

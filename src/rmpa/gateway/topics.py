@@ -1,0 +1,355 @@
+"""One publisher of this mesh for other sites or for ROS 2; what differs between these is an ``ExportDialect``."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
+
+from rmpa.core.counters import TokenBucket
+from rmpa.core.errors import RmpaError
+from rmpa.gateway import limits
+from rmpa.runtime.tls import after_read
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.gateway.foreign import TopicTap
+    from rmpa.gateway.neighbour import MeshSource, ZenohQos
+    from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.zenoh.session import OpenSession
+    from rmpa.gateway.zenoh.threads import QueuedPublisher
+    from rmpa.ros.wire.tcpros import TopicDescription
+
+_BOUNDARY = 0.001
+"""Seconds by which a timer may be early."""
+
+
+class ExportDialect(Protocol):
+    """How one topic is announced to a kind of neighbour, and how its messages are written."""
+
+    def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
+        """The key and the QoS to publish by; ``None``: the publisher has to be asked for its header first.
+
+        Args:
+            about: The publisher's header; ``None`` while it is not known.
+            latched: Whether a late subscriber is to get its last message.
+            large: Whether its messages are large.
+
+        Raises:
+            RmpaError: It cannot cross; the text says why.
+        """
+
+    def payload(self, body: memoryview) -> bytes | None:
+        """A message in the neighbour's form; ``None``: it has none, and is left out."""
+
+    def attachment(self, sequence: int, stamp: int) -> bytes:
+        """What goes with a message: its number from 1, and when it came, in nanoseconds since 1970."""
+
+    def linger(self, *, keeps: bool) -> float | None:
+        """Seconds for which its publisher stays connected without demand; ``None``: for good.
+
+        Args:
+            keeps: Whether its last message is kept for late subscribers, of which one has come.
+        """
+
+    def told(self, problem: str) -> None:
+        """Why its messages do not cross has changed; empty for nothing."""
+
+    def close(self) -> None:
+        """Take the announcement back."""
+
+
+class TopicLimits:
+    """Admits the messages of one topic within its limits: a thin link is protected at its near end.
+
+    Args:
+        rate: Messages a second; ``None``: no limit.
+        size: Bytes a second; ``None``: no limit. A message that is larger than ``limits.LIMIT_BURST`` seconds of it
+            passes after a rest, and later ones wait until it is paid off.
+    """
+
+    def __init__(self, rate: float | None, size: int | None) -> None:
+        self._rate, self._size = (
+            None if each is None else TokenBucket(each, max(1.0, each * limits.LIMIT_BURST)) for each in (rate, size)
+        )
+
+    def admit(self, now: float, size: int) -> bool:
+        """Whether a message of ``size`` bytes may cross at ``now`` (monotonic seconds)."""
+        if all(bucket.has(now, amount) for bucket, amount in self._buckets(size)):
+            for bucket, amount in self._buckets(size):
+                bucket.spend(amount)
+            return True
+        return False
+
+    def next(self, now: float, size: int) -> float:
+        """When a message of this size may cross, if no other does before; not before ``now``."""
+        return max((bucket.next(now, amount) for bucket, amount in self._buckets(size)), default=now)
+
+    def _buckets(self, size: int) -> Iterator[tuple[TokenBucket, int]]:
+        if self._rate is not None:
+            yield self._rate, 1
+        if self._size is not None:
+            yield self._size, size
+
+
+class Export:
+    """Subscribes to one local publisher while there is demand, and puts its messages to Zenoh.
+
+    The Zenoh publisher is declared all the time, since it tells of demand. It is declared anew where its key or QoS
+    changes: with another type, with a cache once the topic is known to be latched, and with a lower priority once its
+    messages are large. What waits in the old one is still sent for a second. Messages that come by one read are
+    numbered, stamped and queued together.
+
+    Args:
+        source: The topic.
+        graph: The gateway's graph.
+        session: The Zenoh session.
+        dialect: Of the neighbour.
+        rate: Messages a second that cross at most; ``None``: no limit.
+        size: Bytes a second that cross at most; ``None``: no limit.
+    """
+
+    # More than twelve fields: the demand, the publisher here, that of Zenoh, and the counts change each other.
+
+    def __init__(
+        self,
+        source: MeshSource,
+        graph: AgentGraph,
+        session: OpenSession,
+        dialect: ExportDialect,
+        rate: float | None = None,
+        size: int | None = None,
+    ) -> None:
+        self.source = source
+        self._graph = graph
+        self._session = session
+        self._dialect = dialect
+        self._limits = TopicLimits(rate, size) if rate is not None or size is not None else None
+        self.about: TopicDescription | None = None
+        """The publisher's last header; ``None`` before the first."""
+        self.wanted = False
+        """Whether the neighbour subscribes."""
+        self.problem = ""
+        """Why its messages do not cross; empty for nothing."""
+        self.messages = 0
+        """Messages that were taken for the neighbour: the number of the last one."""
+        self.limited = 0
+        """Messages that a limit has kept back."""
+        self._failed = self._was_wanted = self._large = self._latched = self._repeated = False
+        self._dropped_before = 0
+        self._terms: tuple[str, ZenohQos] | None = None
+        self._publisher: QueuedPublisher | None = None
+        self._tap: TopicTap | None = None
+        self._opening = self._closed = False
+        self._linger: asyncio.TimerHandle | None = None
+        self._asking: list[asyncio.Future[TopicDescription]] = []
+        self._collected: list[bytes] = []
+        """The messages of the present read."""
+        self._last: bytes | None = None
+        """The last message of a latched topic."""
+        self._held: asyncio.TimerHandle | None = None
+        """When that is sent, which a limit holds back."""
+
+    @property
+    def announced(self) -> bool:
+        """Whether the neighbour sees it."""
+        return self._terms is not None
+
+    @property
+    def dropped(self) -> int:
+        """Messages that the queue to Zenoh dropped."""
+        return self._dropped_before + (self._publisher.dropped if self._publisher is not None else 0)
+
+    @property
+    def waiting(self) -> int:
+        """Messages in the queue to Zenoh."""
+        return self._publisher.waiting if self._publisher is not None else 0
+
+    def start(self) -> None:
+        """Announce it, or ask its publisher for its header first; again, if it is not announced yet."""
+        if not self._closed and self._terms is None:
+            self._announce()
+            self._judge()
+
+    async def header(self, within: float) -> TopicDescription:
+        """The publisher's header; it is connected for that.
+
+        Args:
+            within: Seconds.
+
+        Raises:
+            RmpaError: It does not answer in that time, or cannot cross.
+        """
+        if self._tap is None or self._tap.description is None:
+            if self._closed or len(self._asking) >= limits.HEADER_QUERIES_MAX:
+                raise RmpaError("too many questions for this publisher's header wait already, or it has gone")
+            answer: asyncio.Future[TopicDescription] = asyncio.get_running_loop().create_future()
+            self._asking.append(answer)
+            self._judge()
+            try:
+                async with asyncio.timeout(within):
+                    await answer
+            except TimeoutError:
+                why = self.problem or "no connection to it yet"
+                raise RmpaError(f"{self.source.node} of {self.source.module} does not answer: {why}") from None
+            finally:
+                self._asking.remove(answer)
+                self._judge()
+        if self.about is None or self._failed:
+            raise RmpaError(self.problem or "the publisher's header is not known")
+        return self.about
+
+    def close(self) -> None:
+        """Take everything back; what waits for Zenoh is still sent for a moment."""
+        self._closed = True
+        self._stop_lingering()
+        self._drop_held()
+        for answer in self._asking:
+            if not answer.done():
+                gone = f"{self.source.name} of {self.source.module} is not offered any more"
+                answer.set_exception(RmpaError(gone))
+        self._flush()
+        self._disconnect()
+        if self._publisher is not None:
+            self._publisher.close()
+        self._dialect.told("")
+        self._dialect.close()
+
+    # --- demand ---------------------------------------------------------------------------------------------------
+
+    def _announce(self) -> None:
+        """Declare the publisher that the facts ask for."""
+        try:
+            terms = self._dialect.announce(self.about, latched=self._latched, large=self._large)
+            self._failed = False
+        except RmpaError as error:
+            terms, self._failed = None, True
+            self._tell(str(error))
+        if terms == self._terms:
+            return
+        self._flush()
+        self._terms, old = terms, self._publisher
+        self._publisher = None
+        if terms is None:
+            self.wanted = False
+        else:
+            self._publisher = self._session.publisher(*terms, partial(self._matching, terms))
+        if old is not None:
+            self._dropped_before += old.dropped
+            old.close()
+
+    def _matching(self, terms: tuple[str, ZenohQos], there: bool) -> None:
+        if terms == self._terms and not self._closed:  # else it is of an earlier publisher
+            self.wanted = there
+            self._was_wanted = self._was_wanted or there
+            self._judge()
+
+    def _judge(self) -> None:
+        """Connect to the publisher, or disconnect after a while."""
+        if self._closed:
+            return
+        if self.wanted or self._asking or (self._terms is None and not self._failed):
+            self._stop_lingering()
+            if self._tap is None and not self._opening:
+                self._opening = True
+                self._tap = self._graph.tap(self.source, self._message, self._described, self._lost)
+                self._opening = False
+                self._judge()
+        elif self._tap is not None and self._linger is None:
+            delay = self._dialect.linger(keeps=self._latched and self._was_wanted)
+            if delay is not None:
+                self._linger = asyncio.get_running_loop().call_later(delay, self._end_demand)
+
+    def _stop_lingering(self) -> None:
+        if self._linger is not None:
+            self._linger.cancel()
+            self._linger = None
+
+    def _end_demand(self) -> None:
+        self._linger = None
+        self._disconnect()
+        # What it keeps would be told to the next subscriber, although the publisher may have a newer message.
+        self._last, self._latched, self._was_wanted = None, False, False
+        self._announce()
+
+    def _disconnect(self) -> None:
+        tap, self._tap = self._tap, None
+        if tap is not None:
+            tap.close()
+
+    # --- the publisher --------------------------------------------------------------------------------------------
+
+    def _described(self, about: TopicDescription) -> None:
+        self._flush()
+        self.about = about
+        differs = f"its publisher has the type {about.type}, the graph says {self.source.type}"
+        self._tell(differs if about.type != self.source.type else "")
+        self._latched = about.latching
+        self._repeated = about.latching and self._last is not None
+        self._announce()
+        for answer in self._asking:
+            if not answer.done():
+                answer.set_result(about)
+        self._judge()
+
+    def _lost(self, reason: str) -> None:
+        self.problem = reason
+
+    def _tell(self, problem: str) -> None:
+        self.problem = problem
+        self._dialect.told(problem)
+
+    def _message(self, body: memoryview) -> None:
+        if self._failed or (payload := self._dialect.payload(body)) is None:
+            return
+        if self._latched:
+            repeated, self._repeated = self._repeated and payload == self._last, False
+            if repeated:
+                return  # the publisher was connected anew, and gave its last message again
+            self._last = payload
+        if self._limits is not None:
+            now = time.monotonic()
+            if not self._limits.admit(now, len(payload)):
+                self.limited += 1
+                if self._latched:  # the last one is sent as soon as the limits let it
+                    self._drop_held()
+                    loop = asyncio.get_running_loop()
+                    delay = self._limits.next(now, len(payload)) - now
+                    self._held = loop.call_later(delay, self._send_last, payload)
+                return
+            self._drop_held()
+        self._send(payload)
+
+    def _send_last(self, payload: bytes) -> None:
+        self._held = None
+        if self._limits is not None and self._limits.admit(time.monotonic() + _BOUNDARY, len(payload)):
+            self.limited -= 1
+            self._send(payload)
+
+    def _drop_held(self) -> None:
+        if self._held is not None:
+            self._held.cancel()
+            self._held = None
+
+    def _send(self, payload: bytes) -> None:
+        if len(payload) >= limits.LARGE_MESSAGE and not self._large:
+            self._large = True
+            self._announce()
+        collected = self._collected
+        collected.append(payload)
+        if len(collected) == 1:
+            after_read(self._flush)
+        elif len(collected) >= limits.COLLECTED_MESSAGES:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Queue what has come by the present read."""
+        payloads, self._collected = self._collected, []
+        if payloads and self._publisher is not None:
+            first, stamp, attachment = self.messages + 1, time.time_ns(), self._dialect.attachment
+            self.messages += len(payloads)
+            self._publisher.put_all(
+                [(each, attachment(number, stamp)) for number, each in enumerate(payloads, first)]
+            )
