@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused
 from rmpa.resource import Resource
-from rmpa.resource.run.descriptor import describe
+from rmpa.resource.descriptor import describe
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
