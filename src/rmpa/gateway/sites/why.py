@@ -43,7 +43,7 @@ KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 """The words for what a source is."""
 _DEMAND_THERE: Final = "demand there"
 _NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
-_ROUTER: Final = "allow it by [[permission]] of the router, for the names of both gateways (zenohd: access_control)"
+_ROUTER: Final = "see access_control of the router, if it is a zenohd with rules of your own"
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
 _PERMISSIONS: Final = (
     "change [[permission]] in the rmpa.toml of the gateway of {} and of its modules, and reload them"
