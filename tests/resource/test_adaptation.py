@@ -89,7 +89,7 @@ def at_least(rate: float, client: str = "/client", *, hard: bool = False, **more
 def running(rate: float, *profiles: Profile, hard: bool = True) -> Loop:
     """A loop whose client has what it asked for at 1 s."""
     one = Loop(*profiles)
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     one.require(at_least(rate, hard=hard), 1.0)
     finish(one, 1.0)
@@ -113,7 +113,7 @@ def alarms(actions: list[Action]) -> list[tuple[AlarmKind, str, str]]:
 
 def test_a_request_is_translated_into_the_most_similar_profile() -> None:
     one = Loop()
-    assert applies(one.start(0.0)) == ["slow"]
+    assert applies(one.reconsider("it starts", 0.0)) == ["slow"]
     assert one.applied("slow", 0.5) == [Reacted("slow", 0.5)]
     assert applies(one.require(at_least(15), 1.0)) == ["middle"]
     assert (one.profile, one.applying) == ("slow", "middle")
@@ -199,7 +199,7 @@ def test_without_a_declared_best_effort_the_profile_stays() -> None:
 
 def test_infeasible_request_is_non_adaptable_at_once() -> None:
     one = Loop()
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     actions = one.require(at_least(100, hard=True), 1.0)
     assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "slow", "fast")]
@@ -211,7 +211,7 @@ def test_infeasible_request_is_non_adaptable_at_once() -> None:
 
 def test_failed_profile_is_excluded_for_its_cool_down() -> None:
     one = Loop()
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     assert applies(one.require(at_least(15, hard=True), 1.0)) == ["middle"]
     assert applies(one.failed("middle", "ValueError: no such mode", 1.1)) == ["fast"]
@@ -231,7 +231,7 @@ def test_failure_reapplies_the_previous_profile() -> None:
 
 def test_first_ended_cool_down_retries() -> None:
     one = Loop(FAST, SLOW)
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     assert applies(one.failed("slow", "broken", 1.0)) == ["fast"]
     assert one.failed("fast", "broken", 2.0) == []
     assert (one.applying, one.profile) == ("", "")
@@ -241,7 +241,7 @@ def test_first_ended_cool_down_retries() -> None:
 def test_cool_down_grows_with_each_violation() -> None:
     one = Loop(FAST, SLOW)
     outs = []
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     now = 0.0
     one.require(at_least(30, hard=True), now)
@@ -260,7 +260,7 @@ def test_cool_down_grows_with_each_violation() -> None:
 def test_two_that_are_nearly_alike_do_not_alternate() -> None:
     alike = Profile("alike", {"rate": 39.0, "latency": 0.01}, cost=8)
     one = Loop(FAST, alike)
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     assert one.profile == "alike"
     one.require(Requirement("/c", {"rate": bound(RATE, at_least=39.5)}), 1.0)
@@ -323,7 +323,7 @@ def test_infeasible_request_raises_one_alarm() -> None:
 
 def test_request_while_applying_counts_afterwards() -> None:
     one = Loop()
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     assert one.require(at_least(30), 0.1) == []
     assert applies(one.applied("slow", 0.2)) == ["fast"]
 
@@ -350,7 +350,7 @@ def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:
                 raised -= 1
         assert one.applying == outstanding
 
-    take(one.start(now))
+    take(one.reconsider("it starts", now))
     for _ in range(300):
         now += chance.choice((0.0, 0.1, 1.0, 4.0))
         while (due := one.next_timer()) is not None and due <= now:
@@ -403,7 +403,7 @@ def test_declared_soft_shortfall_is_no_disturbance() -> None:
 def test_restart_continues_with_profile_and_requirements() -> None:
     one = Loop()
     one.restore([at_least(15)], "fast", {}, 0.0)  # fast serves as well as middle does
-    assert applies(one.start(0.0)) == ["fast"]
+    assert applies(one.reconsider("it starts", 0.0)) == ["fast"]
     one.applied("fast", 0.1)
     assert one.requirements.keys() == {"/client"}
     assert one.window({"rate": 40.0}, 5.0) == []
@@ -411,7 +411,7 @@ def test_restart_continues_with_profile_and_requirements() -> None:
 
     worse = Loop()
     worse.restore([at_least(15, hard=True)], "slow", {}, 0.0)
-    assert applies(worse.start(0.0)) == ["middle"]
+    assert applies(worse.reconsider("it starts", 0.0)) == ["middle"]
     pinned = Loop()
     pinned.restore([], "fast", {}, 0.0)
     assert applies(pinned.pin("middle", 0.0)) == ["middle"]
@@ -442,7 +442,7 @@ def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
 
 def test_windows_within_the_settling_time_do_not_count() -> None:
     one = Loop(FAST, MIDDLE, LIMP, settings=replace(SETTINGS, settle=1.5))
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     one.require(at_least(15, hard=True), 0.0)
     finish(one, 0.0)
     assert one.profile == "middle"
@@ -459,17 +459,17 @@ def test_windows_within_the_settling_time_do_not_count() -> None:
 
 def test_a_profile_that_hung_is_in_its_cool_down_after_the_restart() -> None:
     one = Loop()
-    one.start(0.0)
-    one.hung("slow", "not applied within 5 s", 5.0)
+    one.reconsider("it starts", 0.0)
+    one.begin_cool_down("slow", "not applied within 5 s", 5.0)
     again = Loop()
     again.restore([], "", one.cooling(6.0), 6.0)
-    assert applies(again.start(6.0)) == ["middle"]
+    assert applies(again.reconsider("it starts", 6.0)) == ["middle"]
     assert {s.profile: s.excluded for s in again.explain(6.0)}["slow"] == "not applied within 5 s"
 
 
 def test_restored_cool_down_runs_to_its_end() -> None:
     one = Loop()
-    one.start(0.0)
+    one.reconsider("it starts", 0.0)
     finish(one, 0.0)
     one.require(at_least(30), 1.0)
     assert applies(one.failed("fast", "no bus", 3.0)) == ["middle"]
@@ -477,7 +477,7 @@ def test_restored_cool_down_runs_to_its_end() -> None:
     assert {name: (cool.until, cool.cool_down) for name, cool in cooling.items()} == {"fast": (13.0, 10.0)}
     again = Loop()
     again.restore([at_least(30)], "middle", cooling, 4.0)
-    assert applies(again.start(4.0)) == ["middle"]
+    assert applies(again.reconsider("it starts", 4.0)) == ["middle"]
     finish(again, 4.0)
     assert again.explain(5.0)[0].excluded == "no bus"
     assert again.next_timer() == 13.0

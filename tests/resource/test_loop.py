@@ -13,7 +13,7 @@ from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
 from rmpa.resource.client import ResourceClient
 from rmpa.resource.decision import Alarm, AlarmKind, Decider, Shortfall
-from rmpa.resource.declare import AdaptationSettings, Profile
+from rmpa.resource.declare import AdaptationSettings, Context, Profile
 from rmpa.resource.loop import HungError, Preconditions, alarm_values, answer_to, health
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Bound, Requirement, at_least, at_most
@@ -45,7 +45,7 @@ class Silent:
 def decided(*, runs: bool = True, rate: float = 20.0) -> Adaptation:
     one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, [FAST]), AdaptationSettings(), Silent())
     if runs:
-        one.start(0.0)
+        one.reconsider("it starts", 0.0)
         one.applied("fast", 0.0)
         one.require(asked(rate), 0.0)
     return one
@@ -310,8 +310,7 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
     watcher = RuntimePart()
     watcher.window_ended = lambda *_: windows.append(None)  # type: ignore[method-assign]
     member.runtime.parts.append(watcher)
-    noise = member.resource.attributes["noise"]
-    member.adapter.enter_context("lab", {"noise": at_most("5 cm").bound(noise)}, {})
+    member.adapter.enter_context(Context("lab", requires={"noise": at_most("5 cm")}))
     await until(lambda: loop.profile == "coarse")
     await until(lambda: len(windows) >= 5)
     assert excluded(member) == "its precondition has not answered for 0.3 s"

@@ -9,7 +9,7 @@ the outcome. The states are told by ``profile`` and ``applying``::
                        │  └─ next best ◄───────┘ violated
                        └─ failed: excluded for a cool-down; the next best profile is applied
 
-A profile that hangs (``hung``) is excluded for its cool-down too, and the driver ends the resource.
+A profile that hangs is excluded for its cool-down too, and the driver ends the resource.
 
 A disturbance is a violation in ``k`` of the last ``n`` windows. If another profile meets the requirements, that is an
 *adaptation event* (WARN): the violated profile is excluded for its cool-down and the other one is applied. If none
@@ -125,7 +125,7 @@ class Adaptation:
     def restore(
         self, requirements: Iterable[Requirement], profile: str, cool_downs: Mapping[str, CoolDown], now: float
     ) -> None:
-        """Take over the state that was saved before a restart; must be called before ``start``.
+        """Take over the state that was saved before a restart; must be called before the first choice.
 
         Args:
             requirements: The requirements that were in force.
@@ -139,10 +139,6 @@ class Adaptation:
         self.requirements = {requirement.client: requirement for requirement in requirements}
         self.bounds, self.conflicts = merge(self.requirements.values())
         self._restored_profile = profile
-
-    def start(self, now: float) -> None:
-        """Choose the first profile."""
-        self._plan(now, "the resource starts")
 
     def require(self, requirement: Requirement, now: float) -> None:
         """Set a client's requirement, in place of its previous one."""
@@ -181,7 +177,7 @@ class Adaptation:
         self._plan(now, f"{profile} was chosen by hand" if profile else "the choice by hand is over", at_once=True)
 
     def reconsider(self, why: str, now: float) -> None:
-        """Choose the best profile without hysteresis and dwell time, because the context has changed."""
+        """Choose the best profile without hysteresis and dwell time: at the start, or in another context."""
         self._plan(now, why, at_once=True)
 
     # --- measurements -------------------------------------------------------------------------------------------
@@ -216,7 +212,7 @@ class Adaptation:
             self.bounds, self._excluded(now) | {self.profile: "it does not give what is asked"}
         )
         if best is not None and best.feasible:
-            self._begin_cool_down(self.profile, why, now)
+            self.begin_cool_down(self.profile, why, now)
             self._set_alarm(Alarm(AlarmKind.ADAPTATION, short, self.profile, best.profile))
             self._apply(best.profile, why, since)
             return
@@ -227,7 +223,7 @@ class Adaptation:
             name = after.profile if after is not None else ""
             self._set_alarm(Alarm(AlarmKind.NON_ADAPTABLE, short, self.profile, name))
         if effort is not None:
-            self._begin_cool_down(self.profile, why, now)
+            self.begin_cool_down(self.profile, why, now)
             self._apply(effort.profile, "none can serve: best effort", since)
 
     # --- reports of the driver ----------------------------------------------------------------------------------
@@ -251,14 +247,10 @@ class Adaptation:
         """
         if not profile or profile != self.applying:
             return
-        self._begin_cool_down(profile, why, now)
+        self.begin_cool_down(profile, why, now)
         self.applying = ""
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         self._plan(now, f"{profile} failed: {why}", again=True)
-
-    def hung(self, profile: str, why: str, now: float) -> None:
-        """Begin the cool-down of a profile whose function hangs, so that the restarted resource tries another one."""
-        self._begin_cool_down(profile, why, now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""
@@ -362,7 +354,8 @@ class Adaptation:
         self._cause = min(self._cause, cause)
         self._out.apply(profile, why)
 
-    def _begin_cool_down(self, profile: str, why: str, now: float) -> None:
+    def begin_cool_down(self, profile: str, why: str, now: float) -> None:
+        """Exclude a profile; the driver calls it for one that hangs: the restarted resource tries another one."""
         before = self._cool_down_lengths.get(profile)
         first, longest = self._settings.cool_down, self._settings.cool_down_max
         length = first if before is None else min(before * COOL_DOWN_GROWTH, longest)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare import parse_rule, split_reference
+from rmpa.resource.declare import Context, parse_rule, split_reference
 from rmpa.resource.descriptor import topic_of
 from rmpa.resource.loop import HungError, call_function
 from rmpa.resource.runtime import RuntimePart
@@ -27,7 +27,7 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from rmpa.resource.declare import Context, Input, Output, Parameter, Scalar
+    from rmpa.resource.declare import Input, Output, Parameter, Scalar
     from rmpa.resource.loop import Adapter
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
@@ -244,45 +244,28 @@ class Contexts(RuntimePart):
         """
         if name == self.current or self._closed:
             return
-        runtime, context = self._runtime, self._known.get(name)
+        runtime, context = self._runtime, self._known.get(name, Context(""))
         await self._tasks.pause(_HOLDER)
         runtime.hold(_HOLDER)
         try:
-            if context is not None:
-                await self._enter(context)
-            outputs = context.outputs if context is not None else None
-            runtime.context_outputs = frozenset(outputs) if outputs is not None else None
-            self._apply(name, context)
+            if context.enter is not None:
+                limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
+                await call_function(context.enter, "context", name, limit, remedy)
+            runtime.context_outputs = context.outputs
+            self._adapter.enter_context(context)
             self.current, self._since = name, self._loop.time()
             await self._adapter.settled()
+        except HungError as error:
+            runtime.release(_HOLDER, drop=True)
+            self._adapter.end(error)
+            raise
+        except Exception as error:
+            raise PeerRefused(f"context {name}", f"{type(error).__name__}: {error}") from error
         finally:
             runtime.release(_HOLDER)
             self._tasks.resume(_HOLDER)
         _log.info("= %s: %s", runtime.node.name, f"context {name}" if name else "no context any more")
         self._publish()
-
-    async def _enter(self, context: Context) -> None:
-        if context.enter is None:
-            return
-        limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
-        try:
-            await call_function(context.enter, "context", context.name, limit, remedy)
-        except HungError as error:
-            self._runtime.release(_HOLDER, drop=True)
-            self._adapter.end(error)
-            raise
-        except Exception as error:
-            raise PeerRefused(f"context {context.name}", f"{type(error).__name__}: {error}") from error
-
-    def _apply(self, name: str, context: Context | None) -> None:
-        resource = self._runtime.resource
-        if context is None:
-            self._adapter.enter_context("", {}, {})
-            return
-        attributes = resource.attributes
-        bounds = {key: request.bound(attributes[key]) for key, request in context.requires.items()}
-        barred = set(resource.profiles).difference(context.profiles or resource.profiles)
-        self._adapter.enter_context(name, bounds, dict.fromkeys(barred, f"not in context {name}"))
 
     def _publish(self) -> None:
         if not self._closed:

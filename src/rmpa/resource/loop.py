@@ -10,7 +10,6 @@ import asyncio
 import inspect
 import logging
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Hook, Input, Output, Profile
+    from rmpa.resource.declare import Context, Hook, Input, Output, Profile
     from rmpa.resource.quality import Attribute, Bound, Value
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
@@ -55,26 +54,8 @@ _CONTEXT_CLIENT: Final = "context "
 # Calls of the user's functions: those of profiles and contexts, and preconditions.
 
 
-@dataclass(eq=False)
 class HungError(RmpaError):
-    """A function of a profile or context has not returned within its time-out; the resource ends.
-
-    Args:
-        what: ``profile`` or ``context``.
-        name: Name of the profile or context.
-        limit: The time-out in seconds.
-        remedy: What to do about it.
-    """
-
-    what: str
-    name: str
-    limit: float
-    remedy: str
-
-    def __str__(self) -> str:
-        """Say which function, which time-out, and what to do."""
-        text = f"the function of {self.what} {self.name} has not returned within {self.limit:g} s; the resource ends"
-        return f"{text}; {self.remedy}"
+    """A function of a profile or context has not returned within its time-out; the resource ends."""
 
 
 async def call_function(function: Hook, what: str, name: str, limit: float, remedy: str) -> None:
@@ -107,7 +88,8 @@ async def call_function(function: Hook, what: str, name: str, limit: float, reme
     finally:
         call.cancel()
     if not call.done():
-        raise HungError(what, name, limit, remedy)
+        text = f"the function of {what} {name} has not returned within {limit:g} s; the resource ends"
+        raise HungError(f"{text}; {remedy}")
     if call.cancelled():
         raise RuntimeError("CancelledError: something that it awaited was cancelled")
     call.result()
@@ -301,7 +283,7 @@ class Adapter(RuntimePart):
         if self.preset:
             self.loop.pin(self.preset, now, restored=True)
         else:
-            self.loop.start(now)
+            self.loop.reconsider("the resource starts", now)
         self._window_end, self._clients_check = now + self._settings.window, now + _CLIENTS_INTERVAL
         self._tell()
 
@@ -397,25 +379,23 @@ class Adapter(RuntimePart):
 
     # --- choices ------------------------------------------------------------------------------------------------
 
-    def enter_context(self, context: str, bounds: Mapping[str, Bound], blocked: Mapping[str, str]) -> None:
+    def enter_context(self, context: Context) -> None:
         """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
 
         Args:
-            context: Name of the context; empty: no context.
-            bounds: The context's requirement, by attribute; empty: none.
-            blocked: Why a profile is excluded, by profile.
+            context: The context; one without a name: no context.
         """
-        now = self._loop.time()
-        self._blocked_by_context = dict(blocked)
+        now, name = self._loop.time(), f"{_CONTEXT_CLIENT}{context.name}"
         before = [client for client in self.loop.requirements if client.startswith(_CONTEXT_CLIENT)]
-        name = f"{_CONTEXT_CLIENT}{context}"
+        barred = set(self._runtime.resource.profiles).difference(context.profiles) if context.profiles else set()
+        self._blocked_by_context = dict.fromkeys(barred, f"not in context {context.name}")
         self._update_blocked()
-        if bounds:
-            self.loop.require(Requirement(name, dict(bounds), priority=_CONTEXT_PRIORITY), now)
+        if bounds := {key: request.bound(self._attributes[key]) for key, request in context.requires.items()}:
+            self.loop.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)
         for client in before:
             if client != name or not bounds:
                 self.loop.release(client, now)
-        self.loop.reconsider(f"context {context}" if context else "no context any more", now)
+        self.loop.reconsider(f"context {context.name}" if context.name else "no context any more", now)
         self._tell()
 
     def pin(self, profile: str) -> None:
@@ -440,16 +420,15 @@ class Adapter(RuntimePart):
         self._applying = self._loop.create_task(self._apply(profile), name=f"apply {profile}")
 
     async def _apply(self, profile: str) -> None:
-        why = ""
+        function, limit, why = self._runtime.resource.profiles[profile].apply, self._settings.apply_timeout, ""
         try:
             await self._tasks.pause()
             self._runtime.hold()
-            function, limit = self._runtime.resource.profiles[profile].apply, self._settings.apply_timeout
             remedy = "mend it, or allow it longer: adaptation(apply_timeout=…)"
             await call_function(function, "profile", profile, limit, remedy)
         except HungError as error:
             self._runtime.release(drop=True)
-            self.loop.hung(profile, f"not applied within {error.limit:g} s", self._loop.time())
+            self.loop.begin_cool_down(profile, f"not applied within {limit:g} s", self._loop.time())
             self.end(error)
             return
         except Exception as error:  # noqa: BLE001 - the top of the user's code

@@ -41,39 +41,6 @@ TRANSITIONS: Final = {
 """The states from which each transition of the life cycle is valid, and the one to which it leads."""
 
 
-async def learn_outputs(resource: Resource, master_uri: str, caller_id: str) -> None:
-    """Wait until the type of each output is known: a publisher, in this module or at a peer, tells an unknown one.
-
-    Missing types and the places searched for them are logged once.
-
-    Args:
-        resource: The resource, completely declared; the function sets the types of its outputs.
-        master_uri: URI of the master whose publishers are queried.
-        caller_id: Name of the resource's node, which need not be registered yet.
-    """
-    logged: set[str] = set()
-    while missing := [output for output in resource.outputs.values() if output.known is None]:
-        for output in missing:
-            if not await _learn(output, master_uri, caller_id) and output.type_name not in logged:
-                logged.add(output.type_name)
-                _log.warning("! %s waits for the type of output %s: %s", caller_id, output.name, output.problem)
-        if any(output.known is None for output in missing):
-            await asyncio.sleep(limits.TYPE_LOOK)
-
-
-async def _learn(output: Output, master_uri: str, caller_id: str) -> bool:
-    try:
-        learnt = await fetch_type(master_uri, caller_id, output.type_name)
-    except UnreachableError as error:
-        _log.debug("! %s: %s", caller_id, error)  # the resource's start reports an unreachable master
-        return False
-    if learnt is not None:
-        output.known = learnt.kind
-        whence = printable(learnt.node), printable(learnt.topic)
-        _log.info("= %s: %s is learnt from %s, which publishes %s", caller_id, output.type_name, *whence)
-    return learnt is not None
-
-
 class ResourceNode:
     """Runs one resource on the core of its module.
 
@@ -117,8 +84,32 @@ class ResourceNode:
         self._deactivating: asyncio.Task[None] | None = None
 
     async def learn(self) -> None:
-        """Wait until the types of all outputs are known."""
-        await learn_outputs(self.resource, self.runtime.node.master_uri, self.runtime.node.name)
+        """Wait until the types of all outputs are known: a publisher, here or at a peer, tells an unknown one.
+
+        Missing types and the places searched for them are logged once.
+        """
+        name, logged = self.runtime.node.name, set[str]()
+        while missing := [output for output in self.resource.outputs.values() if output.known is None]:
+            for output in missing:
+                if not await self._learn(output) and output.type_name not in logged:
+                    logged.add(output.type_name)
+                    _log.warning("! %s waits for the type of output %s: %s", name, output.name, output.problem)
+            if any(output.known is None for output in missing):
+                await asyncio.sleep(limits.TYPE_LOOK)
+
+    async def _learn(self, output: Output) -> bool:
+        name = self.runtime.node.name
+        try:
+            learnt = await fetch_type(self.runtime.node.master_uri, name, output.type_name)
+        except UnreachableError as error:
+            _log.debug("! %s: %s", name, error)  # the start reports an unreachable master
+            return False
+        if learnt is None:
+            return False
+        output.known = learnt.kind
+        whence = printable(learnt.node), printable(learnt.topic)
+        _log.info("= %s: %s is learnt from %s, which publishes %s", name, output.type_name, *whence)
+        return True
 
     async def start(self) -> None:
         """Configure and activate the resource, once the types of all its outputs are known.

@@ -100,7 +100,7 @@ class Runtime:
         self.state = LifecycleState.UNCONFIGURED
         self.on_observation: Callable[[str, Value], None] = lambda _attribute, _value: None
         """Called in the event loop with each value that the user's code has observed."""
-        self.context_outputs: frozenset[str] | None = None
+        self.context_outputs: tuple[str, ...] | None = None
         """The only outputs that are published in the present context; ``None``: all."""
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}

@@ -175,7 +175,7 @@ def stuck_after(period: float | None, declared: float | None) -> float:
 
 
 class TaskRunner:
-    """Runs one task until it is stopped; a coroutine function in the event loop, a plain function in a thread.
+    """Base of what runs one task until it is stopped.
 
     Args:
         tasks: The tasks of the resource, which are told of failures.
@@ -194,6 +194,8 @@ class TaskRunner:
         """When the present run began, in monotonic seconds; ``None`` between two runs."""
         self.period: float | None = None
         """The period in seconds; ``None`` if the task runs on messages."""
+        self.wake: Callable[[], None] = lambda: None
+        """Wakes the run loop: a message has arrived, or the period has changed."""
         self._tasks = tasks
         self._in_a_row = 0
         """Number of failures since the last run that succeeded."""
@@ -201,23 +203,11 @@ class TaskRunner:
         if rate := task.rate_parameter.value if task.rate_parameter is not None else task.rate:
             self.period = 1 / rate
 
-    def start(self) -> None:
-        """Start the runs; must be called in the event loop."""
-        raise NotImplementedError
-
     def stop(self, *, stuck: bool = False) -> None:
         """End the runs; ``stuck``: the present run hangs, so nothing waits for it."""
         self.stopped = True
         if stuck:
             self._tasks.gate.leave(self)
-
-    async def ended(self) -> None:
-        """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
-        raise NotImplementedError
-
-    def wake(self) -> None:
-        """Wake the run loop: a message has arrived, or the period has changed."""
-        raise NotImplementedError
 
     def retime(self, rate: float) -> None:
         """Change the rate, in Hz: the next run is due one new period after the last one."""
@@ -268,6 +258,7 @@ class AsyncTaskRunner(TaskRunner):
     def start(self) -> None:
         """Start the runs in a task of the event loop."""
         self._wake = asyncio.Event()
+        self.wake = self._wake.set
         self._run_task = asyncio.get_running_loop().create_task(self._run(), name=f"task {self.task.name}")
 
     def stop(self, *, stuck: bool = False) -> None:
@@ -278,10 +269,6 @@ class AsyncTaskRunner(TaskRunner):
     async def ended(self) -> None:
         """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
         await asyncio.wait([self._run_task], timeout=limits.TASK_END_TIMEOUT)
-
-    def wake(self) -> None:
-        """Wake the run loop."""
-        self._wake.set()
 
     async def _run(self) -> None:
         if self.lost:
@@ -343,6 +330,7 @@ class ThreadTaskRunner(TaskRunner):
         """Start the runs in a new thread."""
         self._end = threading.Event()
         self._ready = threading.Semaphore(0)
+        self.wake = self._ready.release
         self._loop = asyncio.get_running_loop()
         self._done = asyncio.Event()
         # A daemon thread: a stuck one must not keep the process from exiting.
@@ -363,10 +351,6 @@ class ThreadTaskRunner(TaskRunner):
                 await self._done.wait()
         except TimeoutError:
             _log.warning("! task %s does not end; it is left behind", self.task.name)
-
-    def wake(self) -> None:
-        """Wake the run loop."""
-        self._ready.release()
 
     def _in_loop(self, function: Callable[..., object], *args: object) -> None:
         with contextlib.suppress(RuntimeError):  # the event loop has ended already
@@ -432,7 +416,7 @@ class Tasks(RuntimePart):
         self._runtime = runtime
         self._on_deactivate = on_deactivate
         self.gate = RunGate()
-        self._runners: dict[str, TaskRunner] = {}
+        self._runners: dict[str, AsyncTaskRunner | ThreadTaskRunner] = {}
         self._slow: dict[str, str] = {}
         """The problem of each task that was too slow in the last window in which it ran, by name.
 
