@@ -49,18 +49,16 @@ clients:  ## install npm and promtool for the tests of rmpa web against other pe
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
 	$(APT) scripts/install-ros
 
-tests: $(STAMP)  ## all tests, several parts at a time; some of them: make tests ARGS="tests/core -k names"
-	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),$(PYTHON) scripts/run-tests $(BIN)/python)
+tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests ARGS="tests/core -k names"
+	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)
 
-style: $(STAMP)  ## ruff, and for the pages prettier and eslint where npm is: lint and format
+style: $(STAMP)  ## ruff: lint and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	scripts/style-pages
 
 format: $(STAMP)  ## rewrite the files as `make style` wants them
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	scripts/style-pages --write
 
 types: $(STAMP)  ## mypy, strict
 	$(BIN)/mypy
@@ -68,7 +66,7 @@ types: $(STAMP)  ## mypy, strict
 imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 	$(BIN)/lint-imports
 
-reference: $(STAMP)  ## write docs/settings.md and docs/rmpa.schema.json from the declarations of the settings
+reference: $(STAMP)  ## write docs/settings.md, docs/rmpa.schema.json and the figures of docs/limits.md from the code
 	$(BIN)/python scripts/write-reference
 
 fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]

@@ -7,6 +7,7 @@ import gc
 import inspect
 import itertools
 import os
+import signal
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -33,6 +34,10 @@ _PROBES: Final = {
 _TESTS: Final = Path(__file__).parent
 _ROOMS: Final = {"core", "runtime", "discovery", "mesh", "ros", "bridge", "resource"}
 """Rooms whose coroutine tests fail when code of rmpa blocks the event loop."""
+_WAITING: Final = {"interop", "examples", "agent", "lab", "cli"}
+"""Rooms whose tests mostly wait for the processes that they start."""
+_LONG: Final = 10.0
+"""Seconds from which on a file is named at the end."""
 _TAKEN: Final = ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET", "PYTHONPATH", "SUDO_UID")
 """Settings of the user that no test may depend on, beside those of ROS and rmpa."""
 _numbers = itertools.count(1)
@@ -44,27 +49,45 @@ _SETTLE_ROUNDS: Final = 10
 """Turns of the loop that cancelled tasks and closed transports get before they count as leaked."""
 
 
+def pytest_configure() -> None:
+    """Let signals end or reload the programs of the tests: a shell's background jobs inherit some of them ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Put the guards around every coroutine test: named first, they are set up first and torn down last."""
     if not isinstance(item, pytest.Function) or not inspect.iscoroutinefunction(item.function):
         return
-    rooms = {folder.name for folder in item.path.parents if folder.parent == _TESTS}
-    if rooms & _ROOMS and "no_blocking" not in item.fixturenames:
+    if _room(item.path) in _ROOMS and "no_blocking" not in item.fixturenames:
         item.fixturenames.insert(0, "no_blocking")
     item.fixturenames.insert(0, "no_leaks")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what cannot run here; the probes run only if something asks for them."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip what cannot run here, as the probes say that something asks for; mix what waits with what computes."""
     for marker, probe in _PROBES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         if marked and (reason := probe()):
             for item in marked:
                 item.add_marker(pytest.mark.skip(reason=reason))
+    if hasattr(config, "workerinput"):  # of several processes, which take the files in this order
+        sizes = Counter(item.path for item in items)
+        places: dict[Path, float] = {}
+        for waits in (True, False):
+            paths = [path for path, _ in sizes.most_common() if (_room(path) in _WAITING) is waits]
+            places |= {path: place / len(paths) for place, path in enumerate(paths)}
+        items.sort(key=lambda item: places[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """Spare ``no_leaks`` the look through thousands of collected tests."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests were skipped, and why, where nobody overlooks it."""
+    """Say how many tests were skipped and why, and how long each room and each long file took."""
     reasons: Counter[str] = Counter()
     for report in terminalreporter.getreports("skipped"):
         where = report.longrepr
@@ -74,6 +97,21 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("not run on this machine", sep="-", yellow=True)
         for reason, count in reasons.most_common():
             terminalreporter.line(f"{count} test{'s' if count > 1 else ''} skipped: {reason}")
+    seconds: Counter[str] = Counter()
+    for report in itertools.chain.from_iterable(terminalreporter.stats.values()):
+        if isinstance(report, pytest.TestReport):
+            file = report.nodeid.partition("::")[0]
+            seconds.update({file: report.duration, "/".join(file.split("/")[:2]): report.duration})
+    if terminalreporter.config.getoption("durations"):
+        terminalreporter.section("seconds of rooms and long files", sep="-")
+        for name, took in seconds.most_common():
+            if took > _LONG or not name.endswith(".py"):
+                terminalreporter.line(f"{took:7.1f} s  {name}")
+
+
+def _room(path: Path) -> str:
+    """The folder of tests/ that a file is in; empty if it is elsewhere."""
+    return path.relative_to(_TESTS).parts[0] if path.is_relative_to(_TESTS) else ""
 
 
 def _open_sockets() -> dict[int, str]:

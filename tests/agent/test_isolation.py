@@ -57,7 +57,7 @@ TOPICS: Final = 1000
 NODES: Final = 50
 TYPE: Final = "sensor_msgs/PointCloud2"
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(240)]
 
 
 class Watched(DirectSelector):

@@ -23,7 +23,7 @@ SIZE: Final = 16_000_000
 ROUNDS: Final = 6
 ECHO: Final = ServiceDescription("rmpa_test/Echo", "6a2e34150c00229791cc89ff309fff21")
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(120)]
 
 
 def _ask(address: tuple[str, int]) -> None:

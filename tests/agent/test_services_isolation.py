@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["watched"]
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(240)]
 
 SERVICES: Final = 1000
 LARGE: Final = 5_000_000

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
     from tests.interop.conftest import ModuleFactory
 
-pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(240)]
 
 _MEMORY = 180 * 1024 * 1024
 """Above an agent's own 45 MB, its largest buffers and the proxies one peer may have; one believed length is more."""

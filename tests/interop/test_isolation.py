@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
 
-pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.alone, pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 RATE: Final = 1000
 SECONDS: Final = 8
