@@ -207,18 +207,24 @@ class _HostConnection(http.client.HTTPConnection):
     def connect(self) -> None:
         self.sock = self._from.open_socket()
         self.sock.settimeout(self.timeout)
-        self.sock.connect((self.host, self.port))
+        try:
+            self.sock.connect((self.host, self.port))
+        except OSError:
+            self.close()
+            raise
 
 
 class _HostTransport(xmlrpc.client.Transport):
     def __init__(self, host: Host) -> None:
         super().__init__()
         self._host = host
+        self._made: _HostConnection | None = None
 
     def make_connection(self, host: object) -> http.client.HTTPConnection:
-        made = _HostConnection(self._host, str(host))
-        self._connection = str(host), made  # what ``close`` closes
-        return made
+        if self._made is None:
+            self._made = _HostConnection(self._host, str(host))
+            self._connection = str(host), self._made  # what ``close`` closes
+        return self._made
 
 
 class MasterProxy(xmlrpc.client.ServerProxy):

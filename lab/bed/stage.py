@@ -1,4 +1,4 @@
-"""Where one cell of an experiment is measured."""
+"""Where one cell of an experiment is measured, on the bed that the plan names."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lab.bed import namespaces, ros
+from lab.bed.hosts import NetworkPlace
+from lab.bed.loopback import Loopback
 from lab.bed.namespaces import Lab
-from lab.bed.system import Classic, Place, Rmpa
+from lab.bed.system import Classic, Rmpa
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from lab.bed.plan import Kind, Plan, Transport
-    from lab.bed.system import System
+    from lab.bed.system import Place, System
 
 PROGRAMS = ("source", "velocity", "sink")
 """The nodes of ``nodes/``."""
 
 
-def why_not() -> str:
-    """What experiments lack here, and what would install it, or an empty string."""
-    return "; ".join(filter(None, (namespaces.why_not(), ros.why_not())))
+def why_not(plan: Plan) -> str:
+    """What a plan's bed lacks here, and what would install it, or an empty string."""
+    lacks = [namespaces.why_not()] if plan.bed == "namespaces" else []
+    if plan.bed == "namespaces" or set(plan.clients) & {"rospy", "roscpp"}:
+        lacks.append(ros.why_not())
+    return "; ".join(lack for lack in lacks if lack)
 
 
 @contextmanager
@@ -41,7 +46,7 @@ class Stage:
     """Where one cell is measured; all that was started on it has ended when the cell is over.
 
     Args:
-        plan: Says what the cables of hosts carry.
+        plan: Says where the hosts are, and what their cables carry.
         home: An empty directory.
     """
 
@@ -90,8 +95,7 @@ class Stage:
         home = self._home / f"system{next(self._numbers)}"
         home.mkdir()
         with ExitStack() as stack:
-            lab = stack.enter_context(Lab())
-            place = Place(lab, hosts, link=self._plan.link if link is None else link, bands=bands)
+            place = self._place(stack, hosts, self._plan.link if link is None else link, bands=bands)
             made: System
             if kind == "classic":
                 made = Classic(place, hosts, home)
@@ -100,3 +104,8 @@ class Stage:
             robot = stack.enter_context(made)
             robot.boot(linked=linked)
             yield robot
+
+    def _place(self, stack: ExitStack, hosts: Sequence[str], link: str, *, bands: bool) -> Place:
+        if self._plan.bed == "loopback":
+            return Loopback(hosts)
+        return NetworkPlace(stack.enter_context(Lab()), hosts, link=link, bands=bands)

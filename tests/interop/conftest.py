@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from lab.bed import namespaces
 from lab.bed.agents import Agent
 from lab.bed.namespaces import MACHINE, Host, Lab
-from tests.interop.modules import Module
+from tests.interop.modules import Bed, Module, start_linked
 from tests.interop.ros import Ros, free_port
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
 ModuleFactory = Callable[..., list[Module]]
 WebFactory = Callable[..., "Web"]
+_BEDS: Final = 3
+"""Beds that are kept for the next test; agents at rest cost little."""
 
 
 @pytest.fixture(scope="session")
@@ -64,19 +66,69 @@ def agent(tmp_path: Path) -> Iterator[AgentFactory]:
         yield make
 
 
+class Beds:
+    """The beds that tests left as they were: some of the latest."""
+
+    def __init__(self, home: Path) -> None:
+        self._home = home
+        self._beds: dict[str, Bed] = {}
+        self._made = 0
+
+    def take(self, names: tuple[str, ...], options: dict[str, object]) -> tuple[str, Bed]:
+        """A bed of such modules, one that is there or a new one, and its key for ``give_back``."""
+        key = repr((names, sorted(options.items())))
+        if (bed := self._beds.pop(key, None)) is not None:
+            return key, bed
+        self._made += 1
+        (home := self._home / str(self._made)).mkdir()
+        return key, Bed(home, names, options)
+
+    def give_back(self, key: str, bed: Bed) -> None:
+        """Keep a bed for others if its test left it as it was."""
+        if not bed.settled():
+            bed.close()
+            return
+        self._beds[key] = bed
+        while len(self._beds) > _BEDS:
+            self._beds.pop(next(iter(self._beds))).close()
+
+    def close(self) -> None:
+        """End them all."""
+        while self._beds:
+            self._beds.popitem()[1].close()
+
+
+@pytest.fixture(scope="session")
+def beds(_no_stale_namespaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beds]:
+    """Beds that tests share."""
+    made = Beds(tmp_path_factory.mktemp("beds"))
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def modules(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> ModuleFactory:
-    """Make linked modules on one network: ``a, b = modules("a", "b")``. Mark the test ``ros`` and ``netns``."""
+def modules(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ModuleFactory]:
+    """Make linked modules on one network: ``a, b = modules("a", "b")``. Mark the test ``ros`` and ``netns``.
 
-    def make(*names: str, linked: bool = True, **options: object) -> list[Module]:
-        hosts = lab.hosts(*names)
-        made = [Module(host, agent(host, name=host.name, **options), shell(host)) for host in hosts]
-        for first, one in enumerate(made if linked else []):
-            for other in made[first + 1 :]:
-                one.agent.wait_peer(other.name)
-        return made
+    They may have served an earlier test that left them as they were; but they are new where a test takes the fixture
+    ``lab``, to add to it, and with ``fresh``.
+    """
+    own_lab = "lab" in request.fixturenames
+    with ExitStack() as stack:
 
-    return make
+        def make(*names: str, linked: bool = True, fresh: bool = False, **options: object) -> list[Module]:
+            if own_lab or fresh or not linked:
+                hosts = request.getfixturevalue("lab").hosts(*names)
+                agents = start_linked(hosts, tmp_path, stack, options, linked=linked)
+            else:
+                beds = request.getfixturevalue("beds")
+                key, bed = beds.take(names, options)
+                stack.callback(beds.give_back, key, bed)
+                agents = bed.agents
+            shells = [stack.enter_context(Ros(agent.host, tmp_path, agent.core_port)) for agent in agents]
+            return [Module(agent.host, agent, ros) for agent, ros in zip(agents, shells, strict=True)]
+
+        yield make
 
 
 @pytest.fixture

@@ -27,8 +27,6 @@ from tests.interop.transports import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lab.bed.namespaces import Lab
     from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
@@ -90,12 +88,12 @@ def test_messages_go_from_node_to_node(modules: ModuleFactory, subscriber: str, 
     unbroken(flows(listener, 100))
 
 
-def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: ModuleFactory) -> None:
     """Terms of a contract at either end, and another name at either end; the rest is direct all the time."""
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
-    reload(tmp_path, a, AUTO + TERMS_THERE)
-    reload(tmp_path, b, AUTO + TERMS_HERE)
+    reload(a, AUTO + TERMS_THERE)
+    reload(b, AUTO + TERMS_HERE)
     there = (*BY_TERMS, *FREE, "/in_there", "/out_there")
     here = (*BY_TERMS, *FREE, "/in_here", "/out_here")
     a.ros.roscpp("many_talker", topics=",".join(there), rate=50)
@@ -111,8 +109,8 @@ def test_what_needs_the_agents_is_relayed_until_its_rules_change(modules: Module
     shown = {topic: condition for topic, condition in conditions(b).items() if topic in here}
     assert shown == BY_TERMS | dict.fromkeys(("/in_here", "/out_here"), "name") | dict.fromkeys(FREE, "")
     before = [heard(listener, FREE) for listener in ears]
-    reload(tmp_path, a, AUTO)
-    reload(tmp_path, b, AUTO)
+    reload(a, AUTO)
+    reload(b, AUTO)
     for listener, name, rows in zip(ears, names, before, strict=True):
         wait_direct_topics(b, f"/{name}", a, there)
         after = steady(listener, there)

@@ -24,8 +24,6 @@ from tests.interop.transports import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
@@ -48,7 +46,7 @@ def two_on_one(host: Host, agent: AgentFactory, shell: ShellFactory) -> tuple[Mo
 @pytest.mark.parametrize("bound", [True, False], ids=["loopback", "network"])
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])
 def test_modules_of_one_machine_are_direct_over_loopback(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory, tmp_path: Path, client: str, *, bound: bool
+    lab: Lab, agent: AgentFactory, shell: ShellFactory, client: str, *, bound: bool
 ) -> None:
     a, b = two_on_one(lab.host("both", 0), agent, shell)
     if not bound:
@@ -63,9 +61,9 @@ def test_modules_of_one_machine_are_direct_over_loopback(
     } == {"127.0.0.1"}
     listener.wait_event("report", where=lambda event: set(event["sources"]) == {"1", "2"})  # type: ignore[call-overload]
     home = str(flows(listener)["sources"])
-    reload(tmp_path, b, AUTO + RELAY)
+    reload(b, AUTO + RELAY)
     in_order(wait_relayed(listener, talker))
-    reload(tmp_path, b, AUTO)
+    reload(b, AUTO)
     report = wait_direct(listener, talker)
     in_order(report)
     assert report["sources"]["2"]["gaps"] == 0, home  # type: ignore[index]

@@ -21,8 +21,6 @@ from tests.interop.transports import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
 
@@ -41,7 +39,7 @@ def gaps(report: Event) -> int:
 
 @pytest.mark.parametrize(("subscriber", "publisher"), CLIENTS)
 def test_a_changed_contract_moves_a_subscriber_and_back(
-    modules: ModuleFactory, tmp_path: Path, subscriber: str, publisher: str
+    modules: ModuleFactory, subscriber: str, publisher: str
 ) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -49,9 +47,9 @@ def test_a_changed_contract_moves_a_subscriber_and_back(
     listener = b.ros.node(subscriber, "listener", topic="/chatter")
     wait_direct(listener, talker)
     for changed, turn in ((b, 1), (a, 2)):
-        reload(tmp_path, changed, AUTO + RELAY)
+        reload(changed, AUTO + RELAY)
         wait_relayed(listener, talker)
-        reload(tmp_path, changed, AUTO)
+        reload(changed, AUTO)
         report = wait_direct(listener, talker)
         in_order(report)
         assert gaps(report) <= 2 * turn * MOVE_GAP
@@ -77,7 +75,7 @@ def test_two_subscribers_of_one_publisher_move_each_for_itself(modules: ModuleFa
 
 @pytest.mark.parametrize(("subscriber", "publisher"), CLIENTS)
 def test_a_latched_message_comes_once_more_only_when_its_topic_becomes_relayed(
-    modules: ModuleFactory, tmp_path: Path, subscriber: str, publisher: str
+    modules: ModuleFactory, subscriber: str, publisher: str
 ) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_the_network(a, b)
@@ -89,17 +87,17 @@ def test_a_latched_message_comes_once_more_only_when_its_topic_becomes_relayed(
     listener.wait_event("report")
     eventually(lambda: links(listener, talker) == 1, what="a direct connection")
     wait_direct(heard, beat)
-    reload(tmp_path, b, AUTO + RELAY)
+    reload(b, AUTO + RELAY)
     eventually(lambda: links(listener, talker) == 0, what="no direct connection")
     flows(heard, 50)
-    reload(tmp_path, b, AUTO)
+    reload(b, AUTO)
     flows(heard, 50)
     _once(listener, doubled=1)
     # A new subscriber is direct, and gets it once as well; so does one that comes while it is relayed.
     late = b.ros.node(subscriber, "listener", topic="/chatter", each=True)
     late.wait_event("report")
     eventually(lambda: links(late, talker) == 1, what="a direct connection")
-    reload(tmp_path, a, AUTO + RELAY)
+    reload(a, AUTO + RELAY)
     eventually(lambda: links(late, talker) == 0, what="no direct connection")
     later = b.ros.node(subscriber, "listener", topic="/chatter", each=True)
     later.wait_event("report")
@@ -117,9 +115,7 @@ def _once(listener: Process, *, doubled: int) -> None:
 
 
 @pytest.mark.parametrize("where", ["subscriber", "publisher"])
-def test_a_renamed_topic_is_relayed_until_it_has_its_name_again(
-    modules: ModuleFactory, tmp_path: Path, where: str
-) -> None:
+def test_a_renamed_topic_is_relayed_until_it_has_its_name_again(modules: ModuleFactory, where: str) -> None:
     renamed = {
         "subscriber": '[[peer]]\nname = "a"\nremap_in = { "/chatter" = "/renamed" }\n',
         "publisher": '[[peer]]\nname = "b"\nremap_out = { "/chatter" = "/renamed" }\n',
@@ -129,11 +125,11 @@ def test_a_renamed_topic_is_relayed_until_it_has_its_name_again(
     talker = a.ros.rospy("talker", topic="/chatter", rate=RATE)
     plain, other = (b.ros.roscpp("listener", topic=topic) for topic in ("/chatter", "/renamed"))
     wait_direct(plain, talker)
-    reload(tmp_path, b if where == "subscriber" else a, AUTO + renamed)
+    reload(b if where == "subscriber" else a, AUTO + renamed)
     in_order(flows(other))
     eventually(lambda: links(plain, talker) == 0, what="no connection under the old name")
     assert links(other, talker) == 0
-    reload(tmp_path, b if where == "subscriber" else a, AUTO)
+    reload(b if where == "subscriber" else a, AUTO)
     in_order(wait_direct(plain, talker))
     eventually(lambda: links(other, talker) == 0, what="no connection under the other name")
 

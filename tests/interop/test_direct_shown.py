@@ -13,8 +13,6 @@ from tests.interop.test_direct_faults import UNPRIVILEGED
 from tests.interop.transports import AUTO, on_the_network, reload, unbroken, wait_direct
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(150)]
@@ -138,7 +136,7 @@ def test_a_relayed_topic_names_the_condition(modules: ModuleFactory, config: str
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: ModuleFactory, client: str) -> None:
-    a, b = modules("a", "b", config='[bridge]\ntransport = "direct"\n')
+    a, b = modules("a", "b", fresh=True, config='[bridge]\ntransport = "direct"\n')
     on_the_network(a, b)
     talker = a.ros.node(client, "talker", topic=TOPIC, rate=RATE, name="talker")
     viewer = b.ros.node(client, "listener", topic=TOPIC, name="viewer")
@@ -159,13 +157,13 @@ def test_tools_that_measure_are_relayed_and_leave_the_user_direct(modules: Modul
     assert "direct.relayed" not in b.agent.snapshot().counters, "a tool is relayed on purpose: no warning"
 
 
-def test_a_subscriber_that_cannot_be_moved_is_warned_of(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_a_subscriber_that_cannot_be_moved_is_warned_of(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO, prefix=UNPRIVILEGED)
     on_the_network(a, b)
     talker = a.ros.roscpp("talker", topic=TOPIC, rate=RATE, name="talker")
     viewer = b.ros.rospy("listener", topic=TOPIC, name="viewer")
     wait_direct(viewer, talker)
-    reload(tmp_path, b, f'{AUTO}[[contract]]\ntopics = ["{TOPIC}"]\ntransport = "relay"\n')
+    reload(b, f'{AUTO}[[contract]]\ntopics = ["{TOPIC}"]\ntransport = "relay"\n')
     b.agent.process.wait_for("/viewer stays connected .*see rmpa doctor")
     found = subscriber(b, "/viewer")
     assert (found["transport"], found["state"], found["condition"]) == ("direct", "relayed", "transport")

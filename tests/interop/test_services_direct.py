@@ -11,10 +11,9 @@ import pytest
 from lab.bed.processes import CommandFailed, eventually
 from tests.interop.modules import Module
 from tests.interop.ros import PYTHON
+from tests.interop.transports import reload
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lab.bed.namespaces import Lab
     from lab.bed.processes import Event, Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
@@ -251,7 +250,7 @@ def test_a_persistent_call_outlives_the_agent_of_the_client(modules: ModuleFacto
     assert known(b)["calls"] == relayed
 
 
-def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config=AUTO)
     on_network(a, b)
     server = worker(a)
@@ -261,24 +260,20 @@ def test_the_transport_follows_the_rules_of_both_modules(modules: ModuleFactory,
     client.tell("sleep 1.5 10 3 persistent")
     server.wait_event("call", where=lambda event: event["op"] == "sleep")
 
-    def rule(module: Module, text: str) -> None:
-        (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
-        assert module.agent.rmpa("reload")[0] == 0
-
-    rule(a, '[[service]]\nnames = ["/work"]\ntransport = "relay"\n' + AUTO)
+    reload(a, '[[service]]\nnames = ["/work"]\ntransport = "relay"\n' + AUTO)
     info = wait_transport(b, "relay", "transport")
     assert "the server's module" in str(info["relayed_because"])
     assert client.wait_event("done", since=since)["same"] == 3, "a persistent client keeps its connection"
     assert known(b)["calls"] == 0
     assert calls(client, "echo 0 10 2 once")["same"] == 2
     assert known(b)["calls"] == 2
-    rule(a, AUTO)
+    reload(a, AUTO)
     wait_transport(b, "direct")
-    rule(b, "")
+    reload(b, "")
     wait_transport(b, "relay", "transport")
-    rule(b, AUTO + "timeout = 5\n")
+    reload(b, AUTO + "timeout = 5\n")
     assert "5 s" in str(wait_transport(b, "relay", "contract")["relayed_because"])
-    rule(b, '[services]\ntransport = "direct"\n[[peer]]\nname = "a"\nprefix = "/robot"\n')
+    reload(b, '[services]\ntransport = "direct"\n[[peer]]\nname = "a"\nprefix = "/robot"\n')
     wait_transport(b, "relay", "name", "/robot/work")
     b.agent.process.wait_for(r'! /robot/work of a: relayed although transport is "direct"')
     assert "[name" in b.agent.rmpa("why", "/robot/work")[1] or "(name)" in b.agent.rmpa("why", "/robot/work")[1]

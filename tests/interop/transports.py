@@ -13,7 +13,6 @@ from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
-    from pathlib import Path
 
     from lab.bed.processes import Event, Process
     from rmpa.observe.snapshot import SubscriberTransport
@@ -28,9 +27,9 @@ print(json.dumps(xmlrpc.client.ServerProxy(uri).getBusInfo("/test")[2]))
 RELAY: Final = '[[contract]]\ntopics = ["/chatter"]\ntransport = "relay"\n'
 
 
-def reload(tmp_path: Path, module: Module, text: str) -> None:
+def reload(module: Module, text: str) -> None:
     """Give an agent other settings."""
-    (tmp_path / f"{module.name}.toml").write_text(text, encoding="utf-8")
+    (module.agent.home / f"{module.name}.toml").write_text(text, encoding="utf-8")
     code, said = module.agent.rmpa("reload")
     assert code == 0, said
 
