@@ -14,7 +14,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import MALFORMED, OTHER_DOMAIN, OTHER_VERSION, Beacon, BeaconKind, BeaconRefused
-from tests.fuzz import target_beacon
+from tests.fuzz.readers import READERS
 
 GOLDEN = bytes.fromhex(
     "524d5041 02 03 0005"  # RMPA, version 2, answer, domain 5
@@ -192,9 +192,4 @@ def test_a_damaged_beacon_is_a_beacon_or_the_peers_fault(beacon: Beacon, data: s
     wire = bytearray(beacon.serialize())
     for _ in range(data.draw(st.integers(1, 4))):
         wire[data.draw(st.integers(0, len(wire) - 1))] = data.draw(st.integers(0, 255))
-    target_beacon.fuzz(bytes(wire))
-
-
-@pytest.mark.parametrize("seed", target_beacon.SEEDS)
-def test_fuzz_seeds(seed: bytes) -> None:
-    target_beacon.fuzz(seed)
+    READERS["beacon"].fuzz(bytes(wire))

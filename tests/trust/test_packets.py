@@ -23,7 +23,6 @@ from rmpa.trust.packets import (
     Verdict,
     Verification,
 )
-from tests.fuzz import target_trailer
 
 KEY = GroupKey(3, bytes(range(32)))
 RUN = (16, 32)
@@ -209,8 +208,3 @@ def test_anything_at_all_is_refused(data: bytes) -> None:
 def test_what_is_signed_is_accepted(packet: bytes, wall: float) -> None:
     signed = _trust(wall=wall).sign(packet, NOW)
     assert _verify(_trust(), signed, wall) == Verification(Verdict.ACCEPTED, len(packet), 0)
-
-
-def test_the_fuzz_target_takes_its_seeds() -> None:
-    for seed in target_trailer.SEEDS:
-        target_trailer.fuzz(seed)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from rmpa.trust import limits
 from rmpa.trust.tokens import PREFIX, Invitation, Token, TokenBook, TokenError, fingerprint_of
-from tests.fuzz import target_token
 
 SECRET = bytes(range(100, 116))
 TOKEN = Token(1_790_000_000, IPv4Address("10.0.0.1"), 40001, bytes(range(16)), SECRET)
@@ -190,8 +189,3 @@ def test_anything_at_all_is_refused(text: str) -> None:
     for each in (text, PREFIX + text):
         with pytest.raises(TokenError):
             Token.parse(each)
-
-
-def test_the_fuzz_target_takes_its_seeds() -> None:
-    for seed in target_token.SEEDS:
-        target_token.fuzz(seed)

@@ -101,8 +101,7 @@ async def test_a_call_brings_the_response_and_a_query_the_type() -> None:
     sites.there.server = server
     assert await sites.describe() == MOVE
     assert await sites.call(b"abc") == b"cba"
-    service = sites.importer.imported[FOREIGN]
-    assert (service.calls, service.failed, service.problem) == (1, 0, "")
+    assert sites.importer.imported(IMPORT) == {"calls": 1, "failed": 0, "problem": ""}
     await sites.close()
 
 

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 PLANS = [
     Plan(),
     Plan(size="short"),
-    Plan("short", ("roscpp",), ""),
+    Plan(bed="loopback", clients=("own",), link=""),
+    Plan("short", "loopback", ("own",), ""),
 ]
 
 

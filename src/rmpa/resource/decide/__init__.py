@@ -1,0 +1,1 @@
+"""Decides which profile a resource applies. Pure: no I/O, no clocks."""

@@ -1,0 +1,1 @@
+"""What a user declares: resources, qualities, requirements, profiles, contexts, parameters."""

@@ -1,0 +1,1 @@
+"""Runs resources: nodes, tasks, control loop, life cycle, store."""
