@@ -52,13 +52,15 @@ ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root a
 tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests ARGS="tests/core -k names"
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)
 
-style: $(STAMP)  ## ruff: lint and format
+style: $(STAMP)  ## ruff, and for the pages prettier and eslint where npm is: lint and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	scripts/style-pages
 
 format: $(STAMP)  ## rewrite the files as `make style` wants them
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	scripts/style-pages --write
 
 types: $(STAMP)  ## mypy, strict
 	$(BIN)/mypy

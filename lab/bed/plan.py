@@ -10,8 +10,8 @@ Kind = Literal["classic", "rmpa"]
 Transport = Literal["relay", "direct"]
 """How RMPA brings messages from module to module: through both agents, or straight from node to node."""
 Size = Literal["short", "full"]
-Client = Literal["rospy", "roscpp", "own"]
-"""Whose nodes: those of the two ROS client libraries, or our own where ROS is not installed."""
+Client = Literal["rospy", "roscpp"]
+"""Whose nodes: the ROS client library."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,14 +20,12 @@ class Plan:
 
     Args:
         size: ``full`` for figures to quote; ``short`` to see in a minute or two that everything works.
-        bed: ``namespaces``: hosts with real ROS; ``loopback``: all on this machine with our own nodes and core.
         clients: Whose nodes take part.
         link: What each host's cable carries, as ``tc`` writes it (``100mbit``); empty for unshaped.
         seed: Of all that is left to chance (the order of cells, phases).
     """
 
     size: Size = "full"
-    bed: Literal["namespaces", "loopback"] = "namespaces"
     clients: tuple[Client, ...] = ("rospy", "roscpp")
     link: str = "100mbit"
     seed: int = 1

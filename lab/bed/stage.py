@@ -1,4 +1,4 @@
-"""Where one cell of an experiment is measured, on the bed that the plan names."""
+"""Where one cell of an experiment is measured."""
 
 from __future__ import annotations
 
@@ -9,27 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lab.bed import namespaces, ros
-from lab.bed.hosts import NetworkPlace
-from lab.bed.loopback import Loopback
 from lab.bed.namespaces import Lab
-from lab.bed.system import Classic, Rmpa
+from lab.bed.system import Classic, Place, Rmpa
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from lab.bed.plan import Kind, Plan, Transport
-    from lab.bed.system import Place, System
+    from lab.bed.system import System
 
 PROGRAMS = ("source", "velocity", "sink")
 """The nodes of ``nodes/``."""
 
 
-def why_not(plan: Plan) -> str:
-    """What a plan's bed lacks here, and what would install it, or an empty string."""
-    lacks = [namespaces.why_not()] if plan.bed == "namespaces" else []
-    if plan.bed == "namespaces" or set(plan.clients) & {"rospy", "roscpp"}:
-        lacks.append(ros.why_not())
-    return "; ".join(lack for lack in lacks if lack)
+def why_not() -> str:
+    """What experiments lack here, and what would install it, or an empty string."""
+    return "; ".join(filter(None, (namespaces.why_not(), ros.why_not())))
 
 
 @contextmanager
@@ -46,7 +41,7 @@ class Stage:
     """Where one cell is measured; all that was started on it has ended when the cell is over.
 
     Args:
-        plan: Says where the hosts are, and what their cables carry.
+        plan: Says what the cables of hosts carry.
         home: An empty directory.
     """
 
@@ -95,7 +90,8 @@ class Stage:
         home = self._home / f"system{next(self._numbers)}"
         home.mkdir()
         with ExitStack() as stack:
-            place = self._place(stack, hosts, self._plan.link if link is None else link, bands=bands)
+            lab = stack.enter_context(Lab())
+            place = Place(lab, hosts, link=self._plan.link if link is None else link, bands=bands)
             made: System
             if kind == "classic":
                 made = Classic(place, hosts, home)
@@ -104,8 +100,3 @@ class Stage:
             robot = stack.enter_context(made)
             robot.boot(linked=linked)
             yield robot
-
-    def _place(self, stack: ExitStack, hosts: Sequence[str], link: str, *, bands: bool) -> Place:
-        if self._plan.bed == "loopback":
-            return Loopback(hosts)
-        return NetworkPlace(stack.enter_context(Lab()), hosts, link=link, bands=bands)

@@ -1,22 +1,17 @@
-"""The two systems of an experiment, wherever their hosts are: classic ROS with one master, and RMPA.
-
-A ``Place`` is where hosts are (``bed.hosts``: network namespaces, ``bed.loopback``: this machine); a ``System`` is
-what runs on them.
-"""
+"""The two systems of an experiment: classic ROS with one master, and RMPA. A ``Place`` has the hosts they run on."""
 
 from __future__ import annotations
 
 import abc
 import collections
 import signal
-import sys
 import time
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import psutil
 
 from lab.bed import transport
-from lab.bed.agents import RMPA, Agent, last_link
+from lab.bed.agents import Agent, last_link
 from lab.bed.processes import BedError, Deadline
 from lab.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.core.errors import UnreachableError
@@ -25,58 +20,67 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from lab.bed.namespaces import Host
+    from lab.bed.namespaces import Host, Lab
     from lab.bed.plan import Client, Kind, Transport
     from lab.bed.processes import Process
     from lab.bed.transport import Pair
     from rmpa.observe.snapshot import Snapshot
 
+CORE_PORT: Final = 11311
 _UP: Final = 30.0
 """Seconds until a node must have said ``up``."""
 _LINKED: Final = 120.0
 """Seconds until all agents must be linked: 32 of them start on one machine."""
 
 
-class Place(Protocol):
-    """Where the hosts of one robot are."""
+class Place:
+    """The hosts of one robot: network namespaces on one switch, as the paper's four boards were on theirs (Fig. 7).
 
-    @property
-    def can_cut(self) -> bool:
-        """Whether hosts have cables."""
-        ...
+    What a host sends is limited to what its cable carries; what it gets is not, which makes no difference while one
+    sender alone fills its cable.
 
-    @property
-    def stock_master(self) -> bool:
-        """Whether classic ROS has its own roscore, and not ``rmpa core`` in place of it."""
-        ...
+    Args:
+        lab: Where they are made.
+        hosts: Their names.
+        link: What each cable carries (``100mbit``); empty for unshaped.
+        bands: Whether packets leave a shaped cable by the kernel's usual three bands.
+    """
+
+    def __init__(self, lab: Lab, hosts: Sequence[str], *, link: str, bands: bool) -> None:
+        self._lab = lab
+        self._link, self._bands = link, bands
+        self._hosts = {name: lab.host(name, 0) for name in hosts}
+        for host in self._hosts.values():
+            self._shape(host)
 
     def host(self, name: str) -> Host:
         """The host of this name."""
-        ...
-
-    def core_port(self, name: str) -> int:
-        """Where the master or core on this host listens."""
-        ...
+        return self._hosts[name]
 
     def off(self, name: str) -> None:
-        """Pull its plug; processes that share this machine's kernel with others are not ended."""
-        ...
+        """Pull its plug; all processes there have ended when this returns."""
+        self._lab.power_off(self._hosts[name])
 
     def on(self, name: str) -> None:
         """Switch it on again."""
-        ...
+        self._lab.power_on(self._hosts[name])
+        self._shape(self._hosts[name])
 
     def cut(self, name: str) -> None:
         """Pull its cable out."""
-        ...
+        self._hosts[name].cut()
 
     def restore(self, name: str) -> None:
         """Put its cable in again."""
-        ...
+        self._hosts[name].restore()
 
     def traffic(self, name: str) -> Mapping[str, int]:
         """What went through its cable since it was plugged."""
-        ...
+        return self._hosts[name].traffic()
+
+    def _shape(self, host: Host) -> None:
+        if self._link:
+            host.shape(self._link, bands=self._bands)
 
 
 class System(abc.ABC):
@@ -121,11 +125,6 @@ class System(abc.ABC):
         """The host of the one master; empty where each has its own."""
         return ""
 
-    @property
-    def can_cut(self) -> bool:
-        """Whether there are cables."""
-        return self._place.can_cut
-
     @abc.abstractmethod
     def boot(self, *, linked: bool = True) -> None:
         """Start what the system itself runs, and wait until it is ready.
@@ -150,13 +149,7 @@ class System(abc.ABC):
         shell = self._shells[host]
         self._numbers[host, program] += 1
         name = f"{program}_{host.replace('-', '_')}_{self._numbers[host, program]}"
-        argv: list[str | Path]
-        if client == "own":
-            argv = [sys.executable, NODES / f"own_{program}.py"]
-        elif client == "rospy":
-            argv = [PYTHON, NODES / f"{program}.py"]
-        else:
-            argv = [compiled(program)]
+        argv: list[str | Path] = [PYTHON, NODES / f"{program}.py"] if client == "rospy" else [compiled(program)]
         given = words({"name": name, **options})
         process = shell.start(*argv, *given, name=f"{client} {program}", commands=True)
         self._nodes.append(process)
@@ -201,7 +194,7 @@ class System(abc.ABC):
         """Wait until all that run are joined; when the last one was."""
 
     def cut(self, host: str) -> None:
-        """Pull its cable out; nothing happens where there are none."""
+        """Pull its cable out."""
         self._place.cut(host)
 
     def restore(self, host: str) -> None:
@@ -209,7 +202,7 @@ class System(abc.ABC):
         self._place.restore(host)
 
     def traffic(self, host: str) -> Mapping[str, int]:
-        """What went through its cable since it was plugged (a restart is a new plug); zeros without cables."""
+        """What went through its cable since it was plugged (a restart is a new plug)."""
         return self._place.traffic(host)
 
     def close(self) -> None:
@@ -259,11 +252,9 @@ class Classic(System):
         return time.monotonic()
 
     def pids(self) -> Mapping[str, int]:
-        """The master, and where it is the real one also ``rosout`` and ``roscore``, which started both."""
+        """The master, ``rosout``, and ``roscore``, which started both."""
         if self._core is None or self._core.returncode is not None:
             return {}
-        if not self._place.stock_master:
-            return {f"master@{self._at}": self._core.pid}
         found = {f"roscore@{self._at}": self._core.pid}
         for child in psutil.Process(self._core.pid).children(recursive=True):
             command = " ".join(child.cmdline())
@@ -274,20 +265,14 @@ class Classic(System):
         return found
 
     def _shell(self, host: str) -> Ros:
-        made = Ros(self._place.host(host), self._home, self._place.core_port(self._at))
+        made = Ros(self._place.host(host), self._home, CORE_PORT)
         made.env["ROS_IP"] = made.host.address
         made.env["ROS_MASTER_URI"] = f"http://{self._place.host(self._at).address}:{made.port}/"
         return made
 
     def _boot(self, host: str) -> None:
-        if host != self._at:
-            return
-        shell = self._shells[host]
-        if self._place.stock_master:
-            self._core = shell.roscore()
-        else:
-            self._core = shell.start(RMPA, "core", "--port", str(shell.port), name="rmpa core")
-            self._core.wait_for("started core service", _UP)
+        if host == self._at:
+            self._core = self._shells[host].roscore()
 
 
 class Rmpa(System):
@@ -319,7 +304,7 @@ class Rmpa(System):
                 place.host(name),
                 home,
                 name=name,
-                core_port=place.core_port(name),
+                core_port=CORE_PORT,
                 log_level="warning",
                 config=config + transport.settings(way),
                 flags=flags,
@@ -392,7 +377,7 @@ class Rmpa(System):
             agent.close()
 
     def _shell(self, host: str) -> Ros:
-        made = Ros(self._place.host(host), self._home, self._place.core_port(host))
+        made = Ros(self._place.host(host), self._home, CORE_PORT)
         made.env["ROS_IP"] = made.host.address  # as with classic ROS
         return made
 

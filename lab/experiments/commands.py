@@ -21,8 +21,7 @@ from rmpa.core.errors import ConfigError, StartError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from lab.bed.plan import Client, Plan, Size
-    from lab.experiments.asked import Bed
+    from lab.bed.plan import Client, Plan
     from lab.experiments.report import Report
     from lab.experiments.runner import Job, Outcome
     from lab.experiments.store import Store
@@ -68,8 +67,8 @@ _directory = click.Path(file_okay=False, path_type=Path)
 @click.group(
     epilog="""\
 \b
-With root, iproute2 and ROS 1 the hosts are network namespaces with a shaped cable each, and the nodes rospy's and
-roscpp's. Without them all is on loopback, with our own nodes and core, and the report says so.
+The hosts are network namespaces with a shaped cable each, and the nodes rospy's and roscpp's: root, iproute2 and
+ROS 1 are needed.
 """
 )
 def experiment() -> None:
@@ -82,20 +81,18 @@ def experiment() -> None:
 )
 @json_option
 def list_(as_json: bool) -> None:
-    """List the experiments, how long they take in full and with --short, and where they would run here."""
+    """List the experiments, and how long they take in full and with --short."""
+    from lab.bed.plan import Plan
     from lab.bed.stage import why_not
-    from lab.experiments.asked import Asked, choose
 
-    sizes: tuple[Size, Size] = ("full", "short")
-    (full, note), (short, _) = (choose(Asked(size=size), why_not) for size in sizes)
     rows = []
     for name, (_, about) in EXPERIMENTS.items():
-        cells, few = (find_experiment(name).cells(plan) for plan in (full, short))
+        cells, few = (find_experiment(name).cells(plan) for plan in (Plan(), Plan("short")))
         rows.append(
             _Row(name, about, len(cells), sum(cell.seconds for cell in cells), sum(cell.seconds for cell in few))
         )
     if as_json:
-        print_json({"experiments": rows, "bed": full.bed, "clients": full.clients, "why": note})
+        print_json({"experiments": rows, "why_not": why_not()})
         return
     right = [Column(title, right=True) for title in ("CELLS", "TIME", "SHORT")]
     print_table(
@@ -103,9 +100,8 @@ def list_(as_json: bool) -> None:
         [(row.name, str(row.cells), duration(row.seconds), duration(row.seconds_short), row.about) for row in rows],
     )
     print_line()
-    print_line(f"here: {_shown(full)}")
-    if note:
-        warn(note)
+    if why := why_not():
+        warn(f"cannot run here: {why}")
 
 
 @experiment.command(epilog=_RUN_EPILOG)
@@ -115,17 +111,11 @@ def list_(as_json: bool) -> None:
 @click.option(
     "--client",
     "clients",
-    type=click.Choice(["rospy", "roscpp", "own"]),
+    type=click.Choice(["rospy", "roscpp"]),
     multiple=True,
-    help="Whose nodes; repeatable. [default: rospy and roscpp; own on loopback]",
+    help="Whose nodes; repeatable. [default: both]",
 )
 @click.option("--link", metavar="RATE", help="What a host's cable carries, as tc has it, or none. [default: 100mbit]")
-@click.option(
-    "--bed",
-    type=click.Choice(["auto", "namespaces", "loopback"]),
-    default="auto",
-    help="Where: hosts of its own, or all on this machine. [default: auto, the former if it can be]",
-)
 @click.option("--seed", type=int, help="Of what is left to chance. [default: 1]")
 @click.option(
     "--only",
@@ -140,7 +130,6 @@ def run(
     short: bool,
     clients: tuple[Client, ...],
     link: str | None,
-    bed: Bed,
     seed: int | None,
     only: tuple[str, ...],
     as_json: bool,
@@ -153,24 +142,22 @@ def run(
     from lab.bed import namespaces
     from lab.bed.stage import make_stage, why_not
     from lab.experiments import runner
-    from lab.experiments.asked import Asked, choose
+    from lab.experiments.asked import choose
     from lab.experiments.progress import Progress, last_line
     from lab.experiments.store import Store, is_run_directory
 
     there = Store.load(out) if out is not None and is_run_directory(out) else None
-    asked = Asked("short" if short else None, bed, clients, link, seed)
-    plan, note = choose(asked, why_not, there.plan if there else None)
+    plan = choose("short" if short else None, clients, link, seed, there.plan if there else None)
+    if why := why_not():
+        raise StartError("hosts as network namespaces", why)
     jobs = _jobs(names or (there.names if there else ()) or EXPERIMENTS, plan, only)
     store = _store(there, out, plan)
     waiting = runner.to_measure(jobs, store)
-    if note:
-        warn(note)
     if not as_json:
         seconds = sum(cell.seconds for _, cell in waiting)
         print_line(f"{_shown(store.plan)}; {len(waiting)} cells, about {duration(seconds)}")
         print_line(f"into {store.directory}")
-    if store.plan.bed == "namespaces":
-        namespaces.remove_stale()
+    namespaces.remove_stale()
     try:
         with (
             _terminated(),
@@ -295,12 +282,8 @@ def _terminated() -> Iterator[None]:
 def _shown(plan: Plan) -> str:
     from lab.words import link as words_of
 
-    where = "hosts as network namespaces" if plan.bed == "namespaces" else "all on loopback"
-    link = (
-        f"cables of {words_of(plan.link)}" if plan.link else "cables not shaped" if plan.bed == "namespaces" else ""
-    )
-    nodes = f"nodes of {' and '.join(plan.clients)}" if plan.clients != ("own",) else "our own nodes"
-    return ", ".join(filter(None, (where, link, nodes, plan.size)))
+    link = f"cables of {words_of(plan.link)}" if plan.link else "cables not shaped"
+    return f"hosts as network namespaces, {link}, nodes of {' and '.join(plan.clients)}, {plan.size}"
 
 
 def _write_report(directory: Path) -> Report:
@@ -311,7 +294,6 @@ def _write_report(directory: Path) -> Report:
 
 def _outcome(store: Store, outcome: Outcome) -> dict[str, object]:
     return {
-        "bed": store.plan.bed,
         "size": store.plan.size,
         "measured": outcome.measured,
         "there": outcome.there,

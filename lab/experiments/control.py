@@ -158,7 +158,7 @@ class Control:
         way = transport_of(cell)
         with stage.system(system_of(cell), HOSTS, way=way) as system:
             if relayed:
-                _start_relays(system, "own" if client == "own" else "roscpp")
+                _start_relays(system)
             at = _at if relayed else _direct
             base = system.node("base", "sink", client, topics=at(VEL, "base"), nodelay=nodelay)
             pc = system.node("pc", "sink", client, topics=f"{at(CMD, 'pc')},{at(VEL, 'pc')}", nodelay=nodelay)
@@ -216,11 +216,11 @@ def _at(topic: str, host: str) -> str:
     return f"{topic}_{host}"
 
 
-def _start_relays(system: System, library: Client) -> None:
+def _start_relays(system: System) -> None:
     """One at each end of each flow, so that each message passes as many processes as with agents."""
 
     def relay(host: str, begin: str, end: str) -> None:
-        system.node(host, "velocity", library, cmd=begin, vel=end, mode="event", nodelay=True)
+        system.node(host, "velocity", "roscpp", cmd=begin, vel=end, mode="event", nodelay=True)
 
     for topic, (origin, *ends) in _FLOWS.items():
         out = f"{topic}_out"

@@ -305,11 +305,7 @@ class Failure:
 
     def cells(self, plan: Plan) -> list[Cell]:
         """Each scenario with each client, all in turns."""
-        scenarios = (
-            ["master"]
-            if plan.short
-            else [name for name in SCENARIOS if _has_cables(plan) or not name.startswith("cable")]
-        )
+        scenarios = ["master"] if plan.short else list(SCENARIOS)
         times = _SHORT if plan.short else _FULL
         seconds = 6.0 + times.before + times.node + times.away + times.after
         return [
@@ -343,10 +339,6 @@ class Failure:
     def findings(self, results: Results) -> Findings:
         """Say what was lost, and what came back."""
         return findings(results)
-
-
-def _has_cables(plan: Plan) -> bool:
-    return plan.bed == "namespaces"
 
 
 EXPERIMENT: Final = Failure()

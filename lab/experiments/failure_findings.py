@@ -272,10 +272,9 @@ def _again(outcome: FlowLosses) -> str:
 
 
 def _claims(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Iterable[Claim]:
-    stock = [(cell, found) for cell, found in told if cell.settings["client"] != "own"]
     classic = [
         sum(not outcome.back for outcome in found)
-        for cell, found in stock
+        for cell, found in told
         if (cell.settings["system"], cell.settings["scenario"]) == ("classic", "master")
     ]
     text = "classic, the master's host killed and on again: flows that do not come back by themselves"
@@ -337,8 +336,6 @@ def _notes(told: Sequence[tuple[Cell, Measured, list[FlowLosses]]]) -> Iterable[
                 f" that is new finds them: {never} flows needed {by_hand} nodes of other hosts to be started anew"
                 " by hand."
             )
-    if any(cell.settings["client"] == "own" for cell, _, _ in told):
-        yield "Our own nodes register again when a master comes back, which nodes of rospy and roscpp never do."
     if any(str(cell.settings["scenario"]).startswith("cable") for cell, _, _ in told):
         yield (
             "With the cable out, classic ROS's connections live on: TCP tries again 0.2, 0.6, 1.4, 3, 6.2 s after"

@@ -152,7 +152,7 @@ class Images:
         """Commands alone, then beside images."""
         client: Client = cell.settings["client"]  # type: ignore[assignment]  # cells() put it there
         times = _times(stage.plan)
-        link = (stage.plan.link or _LINK) if stage.plan.bed == "namespaces" else ""
+        link = stage.plan.link or _LINK
         contender = contender_of(cell)
         mixed: Transport | None = "direct" if contender == MIXED else None
         config = MIXED_CONTRACTS if mixed else ""

@@ -72,8 +72,7 @@ def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> I
         end = TOPIC
         for host in HOSTS[: relays_of(cell)]:
             begin, end = end, f"{end}_{host}"
-            library: Client = "own" if client == "own" else "roscpp"
-            system.node(host, "velocity", library, cmd=begin, vel=end, mode="event", queue=QUEUE, nodelay=nodelay)
+            system.node(host, "velocity", "roscpp", cmd=begin, vel=end, mode="event", queue=QUEUE, nodelay=nodelay)
         sink = system.node("pc", "sink", client, topics=end, queue=QUEUE, nodelay=nodelay)
         source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
         flow.wait_connected(source)

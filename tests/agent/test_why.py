@@ -1,9 +1,8 @@
-"""``why`` between whole agents: each side tells what only it knows."""
+"""``why`` between whole agents: facts that only one side has. A topic's whole way is walked in ``interop``."""
 
 from __future__ import annotations
 
 import asyncio
-import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,16 +10,15 @@ import pytest
 
 from rmpa.bridge.peer_offers import CONFLICT
 from rmpa.config.peer_rules import PeerRule, PolicySettings
-from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.peer_info import CheckLevel
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.agent.agent import Agent
+    from rmpa.config.settings import Settings
     from rmpa.observe.why.diagnosis import Diagnosis
 
 
@@ -51,39 +49,6 @@ def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
     assert not diagnosis.flows
     assert diagnosis.failed.remedy
     return diagnosis.failed.name, diagnosis.failed.text
-
-
-async def test_each_stage_until_a_topic_flows(settings: Callable[..., Settings]) -> None:  # noqa: F811
-    async with (
-        running(settings("a"), settings("b")) as (a, b),
-        node("talker", a) as talker,
-        node("hearer", b) as hearer,
-    ):
-        assert stopped_at(await ask(b, "/chatter", "a")) == ("publisher", "no node of a publishes /chatter")
-        assert stopped_at(await ask(b, "/chatter"))[0] == "publisher"
-        publisher = await talker.advertise("/chatter", "std_msgs/String")
-        await until(lambda: b.bridge.topics.imports.offered_by(next(iter(b.bridge.sessions.linked())).peer))
-        (idle,) = await ask(b, "/chatter", "a")
-        assert (idle.unasked, idle.failed) == (True, None)
-        assert idle.stages[-1].text == "no node here subscribes to /chatter, so nothing is sent"
-        (near,) = await ask(b, "/chater", "a")
-        assert near.failed is not None
-        assert near.failed.remedy == "did you mean /chatter?"
-        subscriber = await hearer.subscribe("/chatter", "std_msgs/String", lambda _: None)
-        await until(lambda: publisher.subscribers and subscriber.publishers)
-        stage, text = stopped_at(await ask(b, "/chatter", "a"))
-        assert (stage, text) == ("sent", "its publisher /talker is connected, and has published nothing since")
-        publisher.publish(publisher.make({"data": "one"}))
-        found = await flowing(b, "/chatter", "a")
-        assert (found.peer, found.to, found.node) == ("a", "b", "/talker")
-        assert [stage.level for stage in found.stages] == [CheckLevel.OK] * len(found.stages)
-        assert found.stages[-1].text == "/hearer takes them"
-        # Asked on the publisher's side, the subscriber's agent says the same.
-        there = await flowing(a, "/chatter")
-        assert (there.peer, there.to, there.flows) == ("a", "b", True)
-        assert there.stages[-1].text == "/hearer takes them"
-        there = await flowing(a, "/chatter", "b")
-        assert (there.peer, there.to, there.flows) == ("a", "b", True)
 
 
 @pytest.mark.parametrize("where", ["there", "here"])
@@ -149,49 +114,3 @@ async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) 
         there = await flowing(base, "/robot1/cmd_vel")
         assert (there.name, there.peer, there.to, there.flows) == ("/cmd_vel", "pc", "robot", True)
         assert there.stages[2].text == "/pilot on pc publishes /cmd_vel (/robot1/cmd_vel over there)"
-
-
-async def test_policy_for_single_peers(settings: Callable[..., Settings]) -> None:  # noqa: F811
-    rule = PeerRule("b", policy=PolicySettings(deny=("/secret",)))
-    async with running(replace(settings("a"), peers=(rule,)), settings("b")) as (a, b), node("talker", a) as talker:
-        await talker.advertise("/secret", "std_msgs/String")
-        stage, text = stopped_at(await ask(b, "/secret", "a"))
-        assert stage == "policy there"
-        assert "peer \"b\".deny has '/secret'" in text
-
-
-async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F811
-    deny = ServiceSettings(deny=("/kept",))
-    async with running(replace(settings("a"), services=deny), settings("b")) as (a, b), node("server", a) as server:
-        stage, text = stopped_at(await b.why.answer({"name": "/ask", "peer": "a", "service": True}))
-        assert (stage, text) == ("server", "no node of a provides /ask")
-
-        def answer(_: object) -> dict[str, object]:
-            return {"success": True, "message": "yes"}
-
-        for name in ("/ask", "/kept"):
-            await server.advertise_service(name, "std_srvs/Trigger", answer)
-        await until(lambda: b.core.state().services.get("/ask"))
-        for peer in ("a", None):
-            found = await flowing(b, "/ask", peer)
-            assert (found.kind, found.node, found.flows) == ("service", "/server", True), found
-            texts = {stage.name: stage.text for stage in found.stages}
-            assert texts["answer"].startswith("its server answers: std_srvs/Trigger, md5 ")
-        stage, text = stopped_at(await ask(b, "/kept", "a"))
-        assert stage == "policy there"
-        assert "services.deny has '/kept'" in text
-        (own,) = await ask(a, "/ask")
-        assert own.flows  # that no peer is needed for it is no failure
-        assert "of this module provides /ask" in own.stages[-1].text
-
-
-async def test_a_server_that_is_stuck(settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    monkeypatch.setattr(observe_limits, "WHY_PROBE", 0.3)
-    async with running(settings("a"), settings("b")) as (a, b):
-        with socket.create_server(("127.0.0.1", 0)) as stuck:  # takes connections, and says nothing
-            uri = f"rosrpc://127.0.0.1:{stuck.getsockname()[1]}"
-            a.core.call("registerService", "/stuck", "/ask", uri, "http://127.0.0.1:1/")
-            await until(lambda: b.core.state().services.get("/ask"))
-            stage, text = stopped_at(await ask(b, "/ask", "a"))
-        assert stage == "server"
-        assert text.startswith("/stuck on a is registered for it, and does not answer: ")

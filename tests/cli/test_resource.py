@@ -12,15 +12,15 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.requirements import at_least, at_most
-from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.client import ResourceClient
-from rmpa.resource.run.descriptor import describe
-from rmpa.resource.run.reconfigure import read_config
-from rmpa.resource.run.resource_node import ResourceNode
+from rmpa.resource.client import ResourceClient
+from rmpa.resource.descriptor import describe
+from rmpa.resource.node import ResourceNode
+from rmpa.resource.quality import at_least, at_most
+from rmpa.resource.reconfigure import read_config
+from rmpa.resource.resource import Resource
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
-from tests.resource.run.test_resource_node import echo
+from tests.resource.test_node import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,6 +51,7 @@ def rmpa(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
 def sonar() -> Resource:
     one = Resource("sonar", role="sensing", physical=False, description="three rings\x1b[2J")
     one.output("ranges", "sensor_msgs/Range", deadline="100 ms")
+    one.adaptation(window=0.2)
     one.parameter("gain", 1.0, low=0.5, unit="dB", description="of the amplifier")
     one.parameter("beam", "wide", choices=("wide", "narrow"))
     pace = one.parameter("pace", 2.0, low=0.5, high=9)
@@ -76,7 +77,7 @@ def running(core: RosCore, background: Background) -> Iterator[ResourceNode]:
     made: list[ResourceNode] = []
 
     async def start() -> None:
-        made.append(ResourceNode(sonar(), core.uri, window=0.2))
+        made.append(ResourceNode(sonar(), core.uri))
         await made[0].start()
 
     background.do(start())
@@ -227,7 +228,9 @@ def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Backgrou
     members: list[ResourceNode] = []
 
     async def ask() -> None:
-        members.append(ResourceNode(sonar(), core.uri, window=60))  # nothing is measured meanwhile
+        one = sonar()
+        one.adaptation(window=60)  # nothing is measured meanwhile
+        members.append(ResourceNode(one, core.uri))
         await members[0].start()
         await driver.__aenter__()
         client = await ResourceClient(driver, "sonar").__aenter__()
@@ -285,7 +288,7 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Ba
     def when_heard() -> None:
         """From a thread: the command runs in the main one."""
         deadline = time.monotonic() + 30
-        while not running.adapter.reports.publishers["alarms"].subscribers and time.monotonic() < deadline:
+        while not running.adapter.publishers["alarms"].subscribers and time.monotonic() < deadline:
             time.sleep(0.02)
         background.do(disturb())
 
@@ -300,7 +303,7 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Ba
     others: list[ResourceNode] = []
 
     async def start() -> None:
-        others.append(ResourceNode(echo(), core.uri, window=0.2))
+        others.append(ResourceNode(echo(), core.uri))
         await others[0].start()
 
     background.do(start())

@@ -59,18 +59,6 @@ def answers(place: Place, background: Background) -> Iterator[Callable[[Handler]
         background.do(server.close())
 
 
-def test_what_flows(place: Place, answers: Callable[[Handler], None]) -> None:
-    answers(lambda _: (FLOWS,))
-    code, out, err = place.run("why", "joystick:/cmd")
-    assert (code, err) == (0, "")
-    assert out.splitlines() == [
-        "/cmd of /joy from joystick to base:",
-        "  ok       peer      joystick is known",
-        "  warn     contract  3 lost (`rmpa topic info`)",
-        "it flows",
-    ]
-
-
 def test_a_module_is_asked_about_by_its_name_alone(place: Place, answers: Callable[[Handler], None]) -> None:
     asked: list[dict[str, object]] = []
 

@@ -17,7 +17,7 @@ import pytest
 from lab.bed.processes import Process, eventually
 from rmpa.cli.messages import read_values
 from rmpa.cli.run import load
-from rmpa.resource.declare.requirements import parse_requirement
+from rmpa.resource.quality import parse_requirement
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:

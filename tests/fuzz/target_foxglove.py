@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
-
-import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.session import FoxgloveSession, Output
-from rmpa.web.hub import requests
-from rmpa.web.hub.node_link import Rights
+from rmpa.web.foxglove.session import DECODER
+from rmpa.web.hub.graph import GraphService, GraphTopic
+from tests.web.foxglove.client import Client
+from tests.web.recorder import answer
 
-ALL = Rights(view=True, control=True)
 SEEDS: list[bytes] = [
     b'{"op":"subscribe","subscriptions":[{"id":0,"channelId":1},{"id":1,"channelId":5}]}',
     b'{"op":"unsubscribe","subscriptionIds":[0,1]}',
@@ -33,46 +32,13 @@ SEEDS: list[bytes] = [
 def fuzz(data: bytes) -> None:
     """Each frame is refused with a status or leads to frames and requests that make sense; the session goes on."""
     for frame in (data, data.decode("utf-8", "replace")):
-        try:
-            protocol.parse_text(frame) if isinstance(frame, str) else protocol.parse_binary(frame)
-        except RemoteProtocolError as error:
-            str(error)
-    session = FoxgloveSession("fuzz", "1", ALL)
-    for output in session.open():
-        if isinstance(output, requests.FollowGraph):
-            topics = (requests.GraphTopic("/t", ("std_msgs/String",), ("/n",)),)
-            services = (requests.GraphService("/s", "std_srvs/Empty", ("/n",)),)
-            _hub(session, session.answer(requests.GraphChanged(output.handle, topics, services)))
+        with contextlib.suppress(RemoteProtocolError):
+            protocol.parse_text(frame, DECODER) if isinstance(frame, str) else protocol.parse_binary(frame)
+    client = Client()
+    client.graph(GraphTopic("/t", ("std_msgs/String",), ("/n",)), GraphService("/s", "std_srvs/Empty", ("/n",)))
     for part in data.split(b"\n")[:50]:
-        _hub(session, session.receive(part, 0.0))
-        _hub(session, session.receive(part.decode("utf-8", "replace"), 0.0))
-    session.close()
-
-
-def _hub(session: FoxgloveSession, outputs: list[Output]) -> None:
-    todo = list(outputs)
-    while todo:
-        output = todo.pop(0)
-        answer: requests.Answer
-        match output:
-            case protocol.TextFrame():
-                msgspec.json.decode(output.data)
-                continue
-            case protocol.BinaryFrame():
-                bytes(output)
-                continue
-            case requests.DescribeType():
-                answer = requests.Described(output.handle, output.type, "string data", "")
-            case requests.SetParam():
-                answer = requests.ParamsChanged(output.handle, {output.name: output.value})
-            case requests.GetParams():
-                answer = requests.ParamsChanged(output.handle, {"/a": 1.0, "/b": b"x"})
-            case requests.CallService():
-                answer = requests.ServiceResult(output.handle, ok=True, payload=output.request)
-            case requests.Subscribe():
-                answer = requests.ReceivedMessage(output.handle, output.topic, "std_msgs/String", memoryview(b"1"), 1)
-            case requests.PublishMessage() | requests.FetchAsset():
-                answer = requests.Failed(output.handle, "cannot", "try")
-            case _:
-                continue
-        todo += session.answer(answer)
+        for each in (part, part.decode("utf-8", "replace")):
+            for asked in client.send_raw(each):
+                answer(asked, part)
+    assert all("op" in each for each in client.json)
+    client.session.closing()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.attributes import parse_rule
-from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
+from rmpa.resource.declare import parse_rule
+from rmpa.resource.reconfigure import CONFIG_TYPE, ChoiceParameter, checked, config, entries, read_config
+from rmpa.resource.resource import Resource
 from rmpa.ros.types.messages import MessageError, MessageType
 
 _ONE = Resource("one", role="sensing")
@@ -40,16 +40,16 @@ def fuzz(data: bytes) -> None:
         return
     try:
         values = read_config(_CONFIG.deserialize(data[1:]))
-        found = checked(values, _KNOWN, _ONE.parameters)
+        found = {name: checked(name, value, _KNOWN) for name, value in values.items()}
     except (MessageError, ConfigError) as error:
         str(error)
         return
     for name, value in found.items():
-        if name in _ONE.parameters:
-            _ONE.parameters[name].check(value)
-        elif value not in [choice.value for choice in _KNOWN[name].choices]:
+        parameter = _KNOWN[name]
+        if not isinstance(parameter, ChoiceParameter):
+            parameter.check(value)
+        elif value not in parameter.names:
             raise AssertionError(f"{name} = {value!r} was let through")
-    from_server(values, _KNOWN, _ONE.parameters)
 
 
 def _rule(text: str) -> None:
@@ -59,6 +59,6 @@ def _rule(text: str) -> None:
         str(error)
         return
     for value in (True, -1.5, "a"):
-        if rule.holds(dict.fromkeys((r.text for r in rule.references), value)) is None:
+        if rule.holds(dict.fromkeys(rule.references, value)) is None:
             raise AssertionError(f"{text!r}: all is known, and still nothing decided")
     rule.holds({})

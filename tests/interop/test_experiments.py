@@ -51,7 +51,7 @@ def run(*words: str | Path) -> None:
 def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     only = [word for setting in _ONLY.get(name, ()) for word in ("--only", setting)]
-    run("run", name, "--short", "--client", "roscpp", "--bed", "namespaces", "--out", out, *only)
+    run("run", name, "--short", "--client", "roscpp", "--out", out, *only)
 
     store = Store.load(out)
     assert store.names == [name]

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from lab.findings import Claim, Figure
 
 TITLE: Final = "Classic ROS beside RMPA: the paper's evaluation, run again"
-_LIBRARIES: Final = {"rospy": "rospy", "roscpp": "roscpp", "own": "our own library"}
 _SAID_WITH_THE_CODE: Final = {"rmpa", "commit"}
 _IMAGE: Final = re.compile(r'<a href="(?P<svg>[^"]+\.svg)"><img src="[^"]+\.png" alt="(?P<alt>[^"]*)" ?/?></a>')
 
@@ -54,7 +53,7 @@ def markdown(manifest: Manifest, sections: Sequence[Section], folder: Path, miss
             missing=missing,
             days=" and ".join(dict.fromkeys((days[0], days[-1]))) if days else "an unknown day",
             commit=code.version + commit,
-            nodes=" and ".join(_LIBRARIES[client] for client in manifest.plan.clients),
+            nodes=" and ".join(manifest.plan.clients),
             incomplete=_amounts(
                 "; ",
                 (words.count(sum(len(one.failures) for one in sections), "cell"), "could not be measured"),
@@ -160,7 +159,6 @@ def _facts(manifest: Manifest) -> list[list[str]]:
     plan, code, cells = manifest.plan, manifest.code, manifest.cells.values()
     rows = [
         ["size", plan.size],
-        ["bed", plan.bed],
         ["nodes of", ", ".join(plan.clients)],
         ["cables", words.link(plan.link)],
         ["seed", str(plan.seed)],

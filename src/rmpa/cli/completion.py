@@ -164,7 +164,7 @@ def _params(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _resources(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.resource.run.descriptor import TOPIC
+    from rmpa.resource.descriptor import TOPIC
 
     ending = f"/{TOPIC}"
     for topic, nodes in _graph(ctx).publishers.items():

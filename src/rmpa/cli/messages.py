@@ -30,7 +30,7 @@ from rmpa.cli.output import (
 from rmpa.cli.resource import run_stream, run_with_resources, with_node, with_resources
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import proxied_peer
-from rmpa.resource.run.descriptor import TOPIC
+from rmpa.resource.descriptor import TOPIC
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 

@@ -15,14 +15,14 @@ from rmpa.cli.options import GraphOptions, completes, graph_options
 from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.cli.resource import decision_of, known_name, run_with_resources
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.resource.declare.attributes import MEASURED
+from rmpa.resource.quality import MEASURED
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
     from rmpa.cli.resource import ResourceGraph, SeenResource
-    from rmpa.resource.run.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
+    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
 
 
 # The commands ``get`` and ``set`` of ``rmpa profile`` and ``rmpa context``.

@@ -23,7 +23,7 @@ from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.identity import proxied_node, proxied_peer
-from rmpa.resource.run.descriptor import TOPIC, Descriptor
+from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ class ResourceGraph:
 
     async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.run.reconfigure import CONFIG_TYPE, read_config
+        from rmpa.resource.reconfigure import CONFIG_TYPE, read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}
@@ -245,7 +245,7 @@ class ResourceGraph:
         Raises:
             RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
-        from rmpa.resource.run.reconfigure import SERVICE_TYPE
+        from rmpa.resource.reconfigure import SERVICE_TYPE
         from rmpa.ros.types.installed import ServiceType
 
         service = GraphName(f"{one.path}/set_parameters", one.peer)

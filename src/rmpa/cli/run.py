@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
     from rmpa.cli.resource import ResourceGraph, SeenResource
-    from rmpa.resource.declare.parameters import Parameter
-    from rmpa.resource.declare.resource import Resource
+    from rmpa.resource.declare import Parameter
+    from rmpa.resource.resource import Resource
 
 _log = logging.getLogger("rmpa.run")
 _STARTS: Final = 20.0
@@ -129,13 +129,13 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
     Raises:
         ConfigError: The file cannot be run, or a parameter cannot have its value.
     """
-    import rmpa.resource.run.resource_node  # noqa: F401 - the first import takes long
+    import rmpa.resource.node  # noqa: F401 - the first import takes long
 
     resources = load(path)
     for text in given:
         _set(resources, text)
     for resource in resources:
-        kinds = [topic.kind.known for topics in (resource.outputs, resource.inputs) for topic in topics.values()]
+        kinds = [topic.known for topics in (resource.outputs, resource.inputs) for topic in topics.values()]
         for kind in kinds:
             if kind is not None:
                 kind.deserialize(kind.serialize(kind.make()))
@@ -150,7 +150,7 @@ def load(path: Path) -> list[Resource]:
     """
     import runpy
 
-    from rmpa.resource.declare.resource import Resource
+    from rmpa.resource.resource import Resource
 
     sys.path.insert(0, str(path.resolve().parent))
     try:
@@ -335,7 +335,7 @@ def _state_dir(module: str, state: str | None) -> Path | None:
 
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
-    from rmpa.resource.run.resource_node import run_all
+    from rmpa.resource.node import run_all
     from rmpa.runtime.accept import raise_file_limit
 
     raise_file_limit()

@@ -32,9 +32,6 @@ class Answering:
         self._ends: Final = ends
         self._most: Final = most
         self._tasks: set[asyncio.Task[None]] = set()
-        self.taken = self.failed = self.refused = 0
-        self.problem = ""
-        """The last error that was answered."""
 
     def __len__(self) -> int:
         """The queries that are answered now, or wait."""
@@ -47,19 +44,12 @@ class Answering:
             Whether there was room.
         """
         if len(self._tasks) >= self._most:
-            self.refuse(query, f"{len(self._tasks)} calls of {self._what} wait already; try again later")
+            query.reply_error(f"{len(self._tasks)} calls of {self._what} wait already; try again later")
             return False
-        self.taken += 1
         task = asyncio.get_running_loop().create_task(self._answer(query, respond), name=f"answer for {self._what}")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return True
-
-    def refuse(self, query: ArrivedQuery, why: str) -> None:
-        """Answer with an error at once."""
-        self.refused += 1
-        self.problem = why
-        query.reply_error(why)
 
     def cancel(self) -> None:
         """End what is under way, with an error."""
@@ -76,17 +66,12 @@ class Answering:
             query.reply(query.key, *(await respond(query)))
             query.finish()
         except PeerRefused as error:
-            self._fail(query, error.reason)
+            query.reply_error(error.reason)
         except RmpaError as error:
-            self._fail(query, str(error))
+            query.reply_error(str(error))
         except asyncio.CancelledError:
             query.reply_error(self._ends)
             raise
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! an answer for %s failed", self._what)
-            self._fail(query, f"the gateway failed at {self._what}; its log says why")
-
-    def _fail(self, query: ArrivedQuery, why: str) -> None:
-        self.failed += 1
-        self.problem = why
-        query.reply_error(why)
+            query.reply_error(f"the gateway failed at {self._what}; its log says why")

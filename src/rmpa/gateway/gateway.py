@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 
 class Gateway:
-    """A gateway: its agent, its session and its neighbours.
+    """A gateway: its agent, its session and its neighbours; one task keeps the session and makes both anew.
 
     Args:
         settings: Complete: the name is filled in.
@@ -57,18 +57,20 @@ class Gateway:
         self.agent.bridge.add(self.graph)
         self.agent.control.add({GATEWAY_REPORT: lambda _: self.report(), ROLE: lambda _: GATEWAY_ROLE})
         self.agent.other_notes.append(self._notes)
+        self.graph.reloaded = self._reloaded
+        if self.agent.trust is not None:
+            self.agent.trust.membership.on_denied.append(self._denied)
         self.session: OpenSession | None = None
         """The session; ``None`` until it is open."""
         self.neighbours: dict[str, Neighbour] = {}
         """The neighbours by their names; empty until the session is open."""
         self._problem = ""
-        self._opening: asyncio.Task[None] | None = None
-        self.graph.reloaded = self._reloaded
-        self._rejoining: asyncio.Task[None] | None = None
-        self._changed = self._reopen = False
-        self._looking: asyncio.Task[None] | None = None
-        if self.agent.trust is not None:
-            self.agent.trust.membership.on_denied.append(self._denied)
+        self._changed = asyncio.Event()
+        """Set where the neighbours have to be made anew."""
+        self._reopen = False
+        """Whether the session has to be opened anew with them."""
+        self._leaving = asyncio.Lock()
+        self._running: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Start the agent and the neighbours; where only ``connect`` is set, a router may come later.
@@ -85,35 +87,24 @@ class Gateway:
             raise
         try:
             await self.graph.begin()
-            await self._began(opening)
+            try:
+                self._join(await opening)
+            except StartError as error:
+                if self._settings.gateway.listen or not self._settings.gateway.connect:
+                    raise
+                self._failed(error)
         except BaseException:
             await _discard(opening)
             await self.close()
             raise
-
-    async def _began(self, opening: asyncio.Future[OpenSession]) -> None:
-        try:
-            session = await opening
-        except StartError as error:
-            if self._settings.gateway.listen or not self._settings.gateway.connect:
-                raise
-            self._failed(error)
-            self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
-        else:
-            self._join(session)
-            self._reopen_if_asked()
-        self._looking = asyncio.get_running_loop().create_task(self._look(), name="look whether the session is stale")
+        self._running = asyncio.get_running_loop().create_task(self._run(), name="keep the zenoh session")
 
     async def close(self) -> None:
         """Take everything back: the neighbours first, the agent last."""
-        if self._looking is not None:
-            self._looking.cancel()
-            await asyncio.wait([self._looking])
-        if self._rejoining is not None:
-            await asyncio.wait([self._rejoining])
-        if self._opening is not None:
-            self._opening.cancel()
-            await asyncio.wait([self._opening])
+        if self._running is not None:
+            async with self._leaving:  # what is being closed is closed to the end
+                self._running.cancel()
+            await asyncio.wait([self._running])
         await self._close_neighbours()
         if self.session is not None:
             await self.session.close()
@@ -134,41 +125,48 @@ class Gateway:
         if settings.gateway.listen and before.trust != settings.trust:
             self._reopen = True  # Zenoh reads its table of access once
         if self._reopen or _rules(before) != _rules(settings):
-            self._begin_rejoin()
+            self._changed.set()
 
     def _denied(self) -> None:
         """Have the router refuse what was revoked: its session is opened anew with another table of access."""
         if self._settings.gateway.listen:
             self._reopen = True
-            self._begin_rejoin()
+            self._changed.set()
 
-    def _begin_rejoin(self) -> None:
-        self._changed = True
-        if self._rejoining is None or self._rejoining.done():
-            self._rejoining = asyncio.get_running_loop().create_task(self._rejoin(), name="take other rules")
-
-    async def _rejoin(self) -> None:
-        while self._changed and self.session is not None:
-            self._changed = False
-            await self._close_neighbours()
-            self.graph.unwatch()
-            if not self._reopen:
-                self._try_to_join(self.session)
-                continue
-            self._reopen = False
-            session, self.session = self.session, None
-            await session.close()
-            _log.info("= the zenoh session is opened anew: certificate, permissions or deny list have changed")
-            self._opening = asyncio.get_running_loop().create_task(self._open_later(), name="open the zenoh session")
-
-    async def _look(self) -> None:
-        """Opens the session anew where it listens and its certificate was renewed: Zenoh reads that once."""
+    async def _run(self) -> None:
+        """Open the session until it is open; make neighbours and session anew where other rules hold."""
+        backoff = Backoff(limits.OPEN_RETRY_FIRST, limits.OPEN_RETRY_MAX, random.random)
         while True:
-            await asyncio.sleep(limits.CERTIFICATE_LOOK_PERIOD)
+            if self.session is None:
+                await asyncio.sleep(backoff.delay())
+                self._reopen = False  # what it was asked for is read now
+                self._changed.clear()
+                try:
+                    self._try_to_join(await self._open_session(self._settings))
+                    backoff.reset()
+                except StartError as error:
+                    self._failed(error)
+                continue
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.CERTIFICATE_LOOK_PERIOD):
+                    await self._changed.wait()
             self._count()
-            if self.session is not None and self.session.stale:
+            if self.session.stale:  # its certificate was renewed, which Zenoh reads once
                 self._reopen = True
-                self._begin_rejoin()
+            if self._reopen or self._changed.is_set():
+                async with self._leaving:
+                    await self._leave(self.session)
+
+    async def _leave(self, session: OpenSession) -> None:
+        self._changed.clear()
+        await self._close_neighbours()
+        self.graph.unwatch()
+        if not self._reopen:
+            self._try_to_join(session)
+            return
+        self.session = None
+        await session.close()
+        _log.info("= the zenoh session is opened anew: certificate, permissions or deny list have changed")
 
     def _count(self) -> None:
         """Add what the session has refused to the agent's counters, which `rmpa doctor` and /diagnostics show."""
@@ -183,12 +181,9 @@ class Gateway:
         return {
             "name": self._settings.name,
             "site": self._settings.gateway.site,
-            "rank": self._settings.gateway.rank,
             "zid": session.zid if session is not None else "",
-            "endpoints": session.endpoints if session is not None else (),
             "problem": self._problem,
             "stale": session.stale if session is not None else False,
-            "sources": len(self.graph.sources),
             "neighbours": {name: neighbour.report() for name, neighbour in self.neighbours.items()},
         }
 
@@ -210,24 +205,6 @@ class Gateway:
         if str(error) != self._problem:
             self._problem = str(error)
             _log.warning("! %s; it is tried again", error)
-
-    async def _open_later(self) -> None:
-        backoff = Backoff(limits.OPEN_RETRY_FIRST, limits.OPEN_RETRY_MAX, random.random)
-        while self.session is None:
-            await asyncio.sleep(backoff.delay())
-            self._reopen = False  # what it was asked for is read now
-            try:
-                session = await self._open_session(self._settings)
-            except StartError as error:
-                self._failed(error)
-            else:
-                self._try_to_join(session)
-                self._reopen_if_asked()
-
-    def _reopen_if_asked(self) -> None:
-        """Open the session once more if its table of access has changed while it was opened."""
-        if self._reopen:
-            self._begin_rejoin()
 
     def _try_to_join(self, session: OpenSession) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""

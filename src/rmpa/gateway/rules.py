@@ -121,10 +121,25 @@ class CrossingRules:
         decision = self.outgoing_to(site, module, name)
         return self.denial(site, name, access, askers, told) if decision.allowed else decision.why
 
+    @property
+    def secured(self) -> bool:
+        """Whether ``[[permission]]`` holds."""
+        return self._gate.on
+
+    def tells(self, asker: str, kind: SourceKind, name: str) -> bool:
+        """Whether a module of this site may have, and be told of, what has this name here.
+
+        Args:
+            asker: The module; empty for this machine's user.
+            kind: What it is.
+            name: The topic or service.
+        """
+        return not asker or self._gate.judge(ACCESS[kind], asker, name).allowed
+
     def denial(
         self, site: str, name: str, access: Access, askers: Iterable[str] = (), told: str | None = None
     ) -> str:
-        """Why the permissions, without the rules, do not let another site have a name; empty if they do."""
+        """Why permissions, without the rules, do not let another site, or a module, have a name; empty if they do."""
         decision = self._gate.judge_site(access, site, askers, name)
         if decision.allowed:
             return ""

@@ -12,12 +12,12 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Final
 
-from rmpa.resource.declare.parameters import DeclaredAttribute, Demand, Input, Output, Parameter
-from rmpa.resource.declare.requirements import QoSRequest, RequirementAnswer, at_least, at_most, between, exactly
-from rmpa.resource.declare.resource import Resource, Role
+from rmpa.resource.declare import DeclaredAttribute, Demand, Input, Output, Parameter
+from rmpa.resource.quality import QoSRequest, RequirementAnswer, at_least, at_most, between, exactly
+from rmpa.resource.resource import Resource, Role
 
 if TYPE_CHECKING:
-    from rmpa.resource.run.client import ResourceClient
+    from rmpa.resource.client import ResourceClient
     from rmpa.ros.node.node import Node
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
     "between",
     "exactly",
 ]
-_LAZY: Final = {"ResourceClient": "rmpa.resource.run.client", "Node": "rmpa.ros.node.node"}
+_LAZY: Final = {"ResourceClient": "rmpa.resource.client", "Node": "rmpa.ros.node.node"}
 """Names that are imported at their first use, because their modules import asyncio and sockets."""
 
 

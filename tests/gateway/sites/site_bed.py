@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import ContractRule
+    from rmpa.gateway.sites.topics import ImportedTopic
+    from rmpa.gateway.topics import Export
     from rmpa.gateway.zenoh.session import OpenSession
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -133,11 +135,20 @@ class Site:
     def shows(self, name: str, node: str = "/talker") -> bool:
         return (name, node) in self.graph.topics
 
-    def topics(self, way: str) -> list[dict[str, object]]:
-        """The report of the topics that go ``out`` or come ``in``."""
-        found = self.neighbour.topics.report()[way]
-        assert isinstance(found, list)
-        return [each for each in found if each["wanted"] or each["messages"] or each["problem"]]
+    def exported(self, name: str, to: str = "") -> Export:
+        """A topic that goes out, to all or ``to`` one site."""
+        entries = self.neighbour.exports.entries
+        entry = next(each for each in entries if (each.announced.name, each.announced.to) == (name, to))
+        export = self.neighbour.topics.exported(entry)
+        assert export is not None
+        return export
+
+    def imported(self, name: str) -> ImportedTopic:
+        """A topic that comes in."""
+        (entry,) = (each for each in self.neighbour.imports.entries if each.source.name == name)
+        topic = self.neighbour.topics.imported(entry)
+        assert topic is not None
+        return topic
 
     async def subscribed(self, name: str, node: str = "/talker") -> MemoryTopic:
         """Subscribe to a topic of the other site, and wait until its messages come."""

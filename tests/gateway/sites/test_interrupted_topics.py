@@ -52,14 +52,10 @@ class Hall:
         self.topics.hide(ENTRY)
         await self.topics.close()
 
-    def row(self) -> dict[str, object]:
-        rows = self.topics.report()["in"]
-        assert isinstance(rows, list)
-        found: dict[str, object] = rows[0]
-        return found
-
     async def counts(self, messages: int, lost: int) -> None:
-        await eventually(lambda: (self.row()["messages"], self.row()["lost"]) == (messages, lost))
+        topic = self.topics.imported(ENTRY)
+        assert topic is not None
+        await eventually(lambda: (topic.messages, topic.lost) == (messages, lost))
 
 
 async def test_what_is_lost_while_a_site_is_away_is_counted_once_it_is_back() -> None:

@@ -101,7 +101,8 @@ async def test_a_call_brings_the_response_and_a_query_the_type() -> None:
     sites.there.server = server
     assert await sites.describe() == MOVE
     assert await sites.call(b"abc") == b"cba"
-    assert sites.importer.imported(IMPORT) == {"calls": 1, "failed": 0, "problem": ""}
+    service = sites.importer.imported[FOREIGN]
+    assert (service.calls, service.failed, service.problem) == (1, 0, "")
     await sites.close()
 
 

@@ -111,10 +111,10 @@ async def test_a_burst_of_a_thousand_messages_arrives_or_is_counted() -> None:
         await until(lambda: topic.messages)
         for number in range(1000):
             yard.graph.send(source, number.to_bytes(4, "big") * 25)
-        await until(lambda: len(topic.messages) + int(str(hall.topics("in")[0]["lost"])) >= 1001, 30)
-        report = hall.topics("in")[0]
-        assert report["messages"] == len(topic.messages) == 1001
-        assert report["lost"] == 0
+        imported = hall.imported("/burst")
+        await until(lambda: len(topic.messages) + imported.lost >= 1001, 30)
+        assert imported.messages == len(topic.messages) == 1001
+        assert imported.lost == 0
 
 
 async def test_what_the_queue_drops_is_counted_at_both_ends() -> None:
@@ -126,15 +126,9 @@ async def test_what_the_queue_drops_is_counted_at_both_ends() -> None:
         await until(lambda: yard.graph.send(source, b"first"))
         for _ in range(2000):
             yard.graph.send(source, b"x" * 2000)
-
-        def dropped() -> int:
-            return int(str(yard.topics("out")[0]["dropped"]))
-
-        def lost() -> int:
-            return int(str(hall.topics("in")[0]["lost"]))
-
-        await until(lambda: len(topic.messages) + lost() == 2001 and dropped() == lost(), 30)
-        assert dropped() > 0
+        out, into = yard.exported("/burst"), hall.imported("/burst")
+        await until(lambda: len(topic.messages) + into.lost == 2001 and out.dropped == into.lost, 30)
+        assert out.dropped > 0
 
 
 async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,8 +141,8 @@ async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypa
         monkeypatch.setattr(QueuedPublisher, "put_all", lambda *_: 0)
         for _ in range(3):
             yard.graph.send(source, b"swallowed by the network")
-        await until(lambda: hall.topics("in")[0]["lost"] == 3)
-        assert hall.topics("in")[0]["messages"] == 1
+        await until(lambda: hall.imported("/burst").lost == 3)
+        assert hall.imported("/burst").messages == 1
 
 
 async def test_a_rule_limits_the_rate_at_the_near_end_and_counts() -> None:
@@ -160,10 +154,10 @@ async def test_a_rule_limits_the_rate_at_the_near_end_and_counts() -> None:
         await until(lambda: yard.graph.send(source, b"0"))
         for _ in range(500):
             yard.graph.send(source, b"x")
-        out = yard.topics("out")[0]
-        assert int(str(out["limited"])) > 450
-        await until(lambda: len(topic.messages) == 501 - int(str(out["limited"])))
-        assert hall.topics("in")[0]["lost"] == 0
+        limited = yard.exported("/fast").limited
+        assert limited > 450
+        await until(lambda: len(topic.messages) == 501 - limited)
+        assert hall.imported("/fast").lost == 0
 
 
 async def test_the_last_message_of_a_latched_topic_is_sent_when_its_limit_lets_it() -> None:
@@ -197,8 +191,7 @@ async def test_a_topic_that_a_rule_keeps_from_one_site_is_neither_sent_nor_annou
         assert (topic.messages, other.messages) == ([b"plan"], [b"ranges"])
         assert not hall.shows("/secret")
         assert not [key for key in (*eavesdropped, *told) if "secret" in key]
-        [report] = [each for each in yard.topics("out") if each["name"] == "/secret"]
-        assert (report["to"], report["messages"]) == ("cellar", 1)
+        assert yard.exported("/secret", "cellar").messages == 1
 
 
 async def test_each_site_has_the_limits_of_the_first_rule_that_fits_it() -> None:
@@ -226,10 +219,10 @@ async def test_a_site_that_is_addressed_and_was_away_counts_what_it_lost() -> No
         yard.graph.send(source, b"2")
         await bed.zenoh.start_router()
         again = await hall.subscribed("/scan")
-        await until(lambda: yard.topics("out")[0]["wanted"])
+        await until(lambda: yard.exported("/scan", "hall").wanted)
         yard.graph.send(source, b"3")
         await until(lambda: b"3" in again.messages)
-        await until(lambda: hall.topics("in")[0]["lost"] == 1 or b"2" in again.messages)
+        await until(lambda: hall.imported("/scan").lost == 1 or b"2" in again.messages)
 
 
 async def test_a_publisher_with_another_definition_is_described_anew() -> None:

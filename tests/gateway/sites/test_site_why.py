@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
 from rmpa.bridge.policy import PermissionGate
-from rmpa.config.peer_rules import Access, PermissionRule
+from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
@@ -67,9 +68,6 @@ async def asked(
 ) -> Asked:
     gate = PermissionGate(None if permissions is None else Permissions(TrustSettings(rules=permissions)))
 
-    def may(asker: str, access: Access, name: str) -> bool:
-        return not asker or gate.judge(access, asker, name).allowed
-
     site = await bed.site(name, rules=rules, gate=gate)
     params: list[tuple[str, str, str]] = []
 
@@ -80,9 +78,7 @@ async def asked(
             return args
 
     unused: Any = None
-    answers = SiteAnswers(
-        site.neighbour, f"{name}_gateway", Params(site.neighbour.context, unused), may if gate.on else None
-    )
+    answers = SiteAnswers(site.neighbour, Params(site.neighbour.context, unused))
     await until(lambda: site.neighbour.leads)
     return Asked(site, answers, params)
 
@@ -102,7 +98,7 @@ async def test_the_way_of_a_topic_is_told_from_both_gateways() -> None:
         (leaving,) = await yard.why("/chatter", asker="arm")
         assert levels(leaving)["demand there"] == "fail"
         await hall.site.subscribed("/chatter")
-        await until(lambda: any(topic["wanted"] for topic in yard.site.topics("out")))
+        await until(lambda: yard.site.exported("/chatter").wanted)
         yard.site.graph.send(source, b"hello")
         await until(lambda: hall.site.topic("/chatter").messages)
         (way,) = await hall.why("/chatter", "yard", "arm")
@@ -222,13 +218,15 @@ async def test_questions_are_checked_before_they_are_passed_on() -> None:
 
 
 def test_losses_are_told_with_the_hop_where_they_happen() -> None:
-    there = {"wanted": True, "messages": 90, "waiting": 2, "dropped": 7, "limited": 3}
-    sent = sent_stages("yard", there, asked=True)[-1]
+    out: Any = SimpleNamespace(wanted=True, messages=90, waiting=2, dropped=7, limited=3)
+    sent = sent_stages("yard", out, asked=True)[-1]
     assert sent.level is WARN
     assert "7 were dropped by its queue" in sent.text
     assert "3 were left out by rate or size of the rule" in sent.text
-    report = {"wanted": True, "messages": 80, "rate": 9.5, "lost": 10, "dropped": 0, "mismatched": 2}
-    arrived = here_stages(SCAN, report)[-1]
+    into: Any = SimpleNamespace(
+        wanted=True, messages=80, rate=lambda: 9.5, lost=10, dropped=0, mismatched=2, problem=""
+    )
+    arrived = here_stages(SCAN, into)[-1]
     assert (arrived.name, arrived.level) == ("arrived", WARN)
     assert arrived.text == (
         "80 messages have come, 9.5 Hz; 10 were lost between the gateways; 2 have another md5 sum than their header"
@@ -236,8 +234,8 @@ def test_losses_are_told_with_the_hop_where_they_happen() -> None:
 
 
 def test_another_definition_is_the_stage_md5() -> None:
-    report = {"wanted": True, "problem": "its messages have the md5 sum aa, its header bb"}
-    stages = here_stages(SCAN, report)
+    found: Any = SimpleNamespace(problem="its messages have the md5 sum aa, its header bb")
+    stages = here_stages(SCAN, found)
     assert (stages[-1].name, stages[-1].level) == ("md5", FAIL)
 
 
@@ -280,7 +278,7 @@ async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it
         yard.site.graph.add("/chatter", TEXT)
         await cellar.site.subscribed("/chatter")
         await until(lambda: attic.site.shows("/chatter"))
-        await until(lambda: any(topic["wanted"] for topic in yard.site.topics("out")))
+        await until(lambda: yard.site.exported("/chatter", "cellar").wanted)
         (way,) = await cellar.why("/chatter")
         assert levels(way)["demand there"] == "ok"
         (way,) = await attic.why("/chatter")

@@ -1,4 +1,4 @@
-"""Both systems on both beds: they come up, carry messages, lose a host as by a pulled plug, and get it back."""
+"""Both systems: they come up, carry messages, lose a host as by a pulled plug, and get it back."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import subprocess
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, get_args
 
 import psutil
 import pytest
 
-from lab.bed import namespaces, ros
+from lab.bed import namespaces
 from lab.bed.plan import Kind, Plan, Transport
 from lab.bed.processes import BedError, Deadline, eventually, run
-from lab.bed.stage import make_stage, why_not
+from lab.bed.stage import make_stage
 from lab.experiments import flow
 
 if TYPE_CHECKING:
@@ -26,24 +26,18 @@ if TYPE_CHECKING:
     from lab.bed.stage import Stage
     from lab.bed.system import System
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = [pytest.mark.timeout(180), pytest.mark.ros, pytest.mark.netns]
 HOSTS = ["joystick", "velocity", "pc"]
 TOPICS = ["/cmd", "/vel"]
-NETWORK = Plan(bed="namespaces", clients=("roscpp",))
-LOOPBACK = Plan(bed="loopback", clients=("own",), link="")
-BEDS = [
-    pytest.param(NETWORK, id="namespaces", marks=[pytest.mark.ros, pytest.mark.netns]),
-    pytest.param(LOOPBACK, id="loopback"),
-]
+PLAN = Plan(clients=("roscpp",))
 KINDS: tuple[Kind, ...] = get_args(Kind)
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
-on_both_beds = pytest.mark.parametrize("plan", BEDS)
 of_both_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
 @contextmanager
-def _system(plan: Plan, kind: Kind) -> Iterator[tuple[Stage, System]]:
-    with make_stage(plan) as stage, stage.system(kind, HOSTS) as robot:
+def _system(kind: Kind) -> Iterator[tuple[Stage, System]]:
+    with make_stage(PLAN) as stage, stage.system(kind, HOSTS) as robot:
         yield stage, robot
 
 
@@ -58,22 +52,21 @@ def _nodes(robot: System, stage: Stage) -> tuple[Process, Process]:
     return source, sink
 
 
-def _running(plan: Plan, kind: Kind) -> set[str]:
+def _running(kind: Kind) -> set[str]:
     """The names of what a system itself runs."""
     if kind == "rmpa":
         return {f"agent@{host}" for host in HOSTS}
-    return {"master@pc"} if plan.bed == "loopback" else {"roscore@pc", "master@pc", "rosout@pc"}
+    return {"roscore@pc", "master@pc", "rosout@pc"}
 
 
 def _children() -> set[int]:
     return {child.pid for child in psutil.Process().children(recursive=True)}
 
 
-@on_both_beds
 @of_both_kinds
-def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> None:
+def test_messages_flow_and_nothing_is_left_behind(kind: Kind) -> None:
     before = _children()
-    with _system(plan, kind) as (stage, robot):
+    with _system(kind) as (stage, robot):
         assert robot.kind == kind
         assert robot.hosts == tuple(HOSTS)
         assert robot.master == ("pc" if kind == "classic" else "")
@@ -81,7 +74,7 @@ def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> Non
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=20)
         assert len(flow.sent(begun)) == 20
         assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number)) == 40
-        eventually(lambda: set(robot.pids()) == _running(plan, kind), what="all that the system itself runs")
+        eventually(lambda: set(robot.pids()) == _running(kind), what="all that the system itself runs")
         assert all(psutil.pid_exists(pid) for pid in robot.pids().values())
         scratch = stage.scratch
     assert not scratch.exists()
@@ -89,13 +82,12 @@ def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> Non
     assert f"-{os.getpid()}-" not in _namespaces()
 
 
-@on_both_beds
-def test_direct_is_from_node_to_node_and_relayed_is_not(plan: Plan) -> None:
-    with make_stage(plan) as stage:
+def test_direct_is_from_node_to_node_and_relayed_is_not() -> None:
+    with make_stage(PLAN) as stage:
         for way in TRANSPORTS:
             with stage.system("rmpa", HOSTS[1:], way=way) as robot:
-                sink = robot.node("pc", "sink", plan.clients[0], topics="/cmd")
-                source = robot.node("velocity", "source", plan.clients[0])
+                sink = robot.node("pc", "sink", PLAN.clients[0], topics="/cmd")
+                source = robot.node("velocity", "source", PLAN.clients[0])
                 flow.wait_connected(source)
                 robot.require_transport([(source, sink)])
                 flow.wait_flowing(source, sink, ["/cmd"], stage.scratch)
@@ -104,12 +96,11 @@ def test_direct_is_from_node_to_node_and_relayed_is_not(plan: Plan) -> None:
                         robot.require_transport([(source, sink)], "relay")
 
 
-@on_both_beds
 @of_both_kinds
-def test_killed_host_ends_all_at_once_and_comes_back(plan: Plan, kind: Kind) -> None:
-    with _system(plan, kind) as (stage, robot):
+def test_killed_host_ends_all_at_once_and_comes_back(kind: Kind) -> None:
+    with _system(kind) as (stage, robot):
         source, sink = _nodes(robot, stage)
-        client = plan.clients[0]
+        client = PLAN.clients[0]
         on_host = [process for process in _all(robot, "velocity") if process.returncode is None]
         assert on_host
         robot.kill("velocity")
@@ -127,11 +118,10 @@ def test_killed_host_ends_all_at_once_and_comes_back(plan: Plan, kind: Kind) -> 
         assert set(robot.pids()) >= ({"agent@velocity"} if kind == "rmpa" else {"master@pc"})
 
 
-@on_both_beds
-def test_classic_without_its_master_takes_no_new_node_until_it_is_back(plan: Plan) -> None:
-    with _system(plan, "classic") as (stage, robot):
-        source, _ = _nodes(robot, stage)
-        client = plan.clients[0]
+def test_classic_without_its_master_takes_no_new_node_until_it_is_back() -> None:
+    with _system("classic") as (stage, robot):
+        _nodes(robot, stage)
+        client = PLAN.clients[0]
         robot.kill("pc")
         assert not robot.pids()
         lost = robot.node("velocity", "sink", client, wait=False, topics="/cmd")
@@ -139,58 +129,18 @@ def test_classic_without_its_master_takes_no_new_node_until_it_is_back(plan: Pla
             lost.wait_event("up", 1.5)
         robot.start("pc")
         sink = robot.node("pc", "sink", client, nodelay=True, topics="/cmd")
-        if plan.bed == "loopback":  # our own nodes register with a new master, roscpp's do not
-            flow.wait_flowing(source, sink, ["/cmd"], stage.scratch)
-        else:
-            fresh = robot.node("joystick", "source", client)
-            flow.wait_flowing(fresh, sink, ["/cmd"], stage.scratch)
+        fresh = robot.node("joystick", "source", client)  # the old one does not register with the new master
+        flow.wait_flowing(fresh, sink, ["/cmd"], stage.scratch)
 
 
 def _all(robot: System, host: str) -> list[Process]:
     return [*robot._shells[host].processes, *robot._own(host)]
 
 
-@pytest.mark.parametrize("bed", ["namespaces", "loopback"])
-def test_says_what_a_plan_lacks(bed: Literal["namespaces", "loopback"], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(namespaces, "why_not", lambda: "no root")
-    monkeypatch.setattr(ros, "why_not", lambda: "no ROS")
-    network = bed == "namespaces"
-    assert why_not(Plan(bed=bed, clients=("own",))) == ("no root; no ROS" if network else "")
-    assert why_not(Plan(bed=bed, clients=("rospy", "own"))) == ("no root; no ROS" if network else "no ROS")
-    monkeypatch.setattr(namespaces, "why_not", lambda: "")
-    monkeypatch.setattr(ros, "why_not", lambda: "")
-    assert why_not(Plan(bed=bed)) == ""
-
-
-def test_loopback_has_no_cables() -> None:
-    with _system(LOOPBACK, "classic") as (_, robot):
-        assert not robot.can_cut
-        robot.cut("joystick")
-        robot.restore("joystick")
-        assert set(robot.traffic("pc").values()) == {0}
-
-
-def test_two_systems_on_loopback_do_not_meet() -> None:
-    with (
-        make_stage(LOOPBACK) as stage,
-        stage.system("classic", ["pc"]) as one,
-        stage.system("classic", ["pc"]) as two,
-    ):
-        source = one.node("pc", "source", "own")
-        two.node("pc", "sink", "own")
-        with pytest.raises(Deadline):
-            flow.wait_connected(source, timeout=1.0)
-        one.node("pc", "sink", "own")
-        flow.wait_connected(source)
-
-
-@pytest.mark.ros
-@pytest.mark.netns
 class TestCables:
     @of_both_kinds
     def test_cut_cable_stops_what_runs_over_it(self, kind: Kind) -> None:
-        with _system(NETWORK, kind) as (stage, robot):
-            assert robot.can_cut
+        with _system(kind) as (stage, robot):
             source, sink = _nodes(robot, stage)
             robot.cut("joystick")
             begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
@@ -200,7 +150,7 @@ class TestCables:
             flow.wait_flowing(source, sink, TOPICS, stage.scratch, timeout=60.0)
 
     def test_traffic_counts_what_leaves_and_comes(self) -> None:
-        with _system(NETWORK, "classic") as (stage, robot):
+        with _system("classic") as (stage, robot):
             source, sink = _nodes(robot, stage)
             before = robot.traffic("joystick"), robot.traffic("pc")
             begun = flow.begin(source, stage.scratch, size=10_000, rate=100, count=20)
@@ -216,7 +166,7 @@ class TestCables:
 
     @pytest.mark.parametrize(("link", "bands"), [("100mbit", True), ("100mbit", False), ("", True)])
     def test_cables_carry_what_was_asked_for_and_still_do_after_a_restart(self, link: str, bands: bool) -> None:
-        with make_stage(NETWORK) as stage, stage.system("rmpa", ["a"], link=link, bands=bands) as robot:
+        with make_stage(PLAN) as stage, stage.system("rmpa", ["a"], link=link, bands=bands) as robot:
             for _ in range(2):
                 shown = run(robot._place.host("a").command(["tc", "qdisc", "show", "dev", "eth0"]))
                 assert ("tbf" in shown, "100Mbit" in shown) == (bool(link), bool(link))
@@ -225,7 +175,7 @@ class TestCables:
                 robot.start("a")
 
     def test_host_comes_back_with_its_addresses(self) -> None:
-        with make_stage(NETWORK) as stage, stage.system("rmpa", ["a", "b"]) as robot:
+        with make_stage(PLAN) as stage, stage.system("rmpa", ["a", "b"]) as robot:
             host = robot._place.host("b")
             before = host.address, host.ip("-brief", "link", "show", "eth0").split()[2]
             robot.kill("b")
@@ -235,7 +185,7 @@ class TestCables:
 
     def test_pulled_plug_tells_nobody(self) -> None:
         """A killed process's kernel closes its connections; a host without power does not, so others keep theirs."""
-        with _system(NETWORK, "classic") as (stage, robot):
+        with _system("classic") as (stage, robot):
             source, _ = _nodes(robot, stage)
             address = robot._place.host("velocity").address
             standing = _connections(robot, address)
@@ -246,26 +196,15 @@ class TestCables:
             assert _connections(robot, address) == standing
             assert not [event for event in source.events("connected") if event["subscribers"] == 1][1:]
 
-    def test_own_clients_run_here_too(self) -> None:
-        plan = Plan(bed="namespaces", clients=("own",))
-        with _system(plan, "rmpa") as (stage, robot):
-            _nodes(robot, stage)
-
     def test_config_and_flags_reach_each_agent(self) -> None:
         with (
-            make_stage(NETWORK) as stage,
+            make_stage(PLAN) as stage,
             stage.system("rmpa", ["a"], config="domain = 7\n", flags=["--realtime"]) as robot,
         ):
             words = Path(f"/proc/{robot.pids()['agent@a']}/cmdline").read_text(encoding="utf-8").split("\0")
             assert "--realtime" in words
             config = Path(words[words.index("--config") + 1])
             assert config.read_text(encoding="utf-8").startswith("domain = 7\n")
-
-    def test_agents_need_not_be_linked_to_begin(self) -> None:
-        with make_stage(NETWORK) as stage, stage.system("rmpa", ["a", "b"], linked=False) as robot:
-            began = time.monotonic()
-            robot.linked()
-            assert time.monotonic() - began < 30
 
 
 def _connections(robot: System, address: str) -> set[str]:

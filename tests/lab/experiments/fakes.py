@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lab.bed.stage import Stage
     from lab.experiments.model import Results
 
-PLAN = Plan(size="short", bed="loopback", clients=("own",), link="")
+PLAN = Plan(size="short", link="")
 CODE = Code(version="1.0", digest="0123456789ab", commit="abc1234")
 MACHINE: dict[str, object] = {"cpu": "a cpu", "cores": 2, "kernel": "6.1", "load": (0.1, 0.2, 0.3), "python": "3.11"}
 

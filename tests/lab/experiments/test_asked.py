@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from lab.bed.plan import Plan
-from lab.experiments.asked import Asked, choose, parse_only, select
+from lab.experiments.asked import choose, parse_only, select
 from lab.experiments.model import Cell
-from rmpa.core.errors import ConfigError, StartError
+from rmpa.core.errors import ConfigError
 
 CELLS = [
     Cell("rates", {"system": "classic", "nodelay": True, "rate": 10}),
@@ -17,70 +19,37 @@ CELLS = [
 ]
 
 
-def everything(_: Plan) -> str:
-    return ""
-
-
-def no_root(plan: Plan) -> str:
-    return "network namespaces need root" if plan.bed == "namespaces" else ""
-
-
-def test_nothing_asked_is_the_whole_evaluation_where_that_can_be() -> None:
-    assert choose(Asked(), everything) == (Plan("full", "namespaces", ("rospy", "roscpp"), "100mbit", 1), "")
-
-
-def test_without_root_all_is_on_loopback_and_that_is_said() -> None:
-    plan, note = choose(Asked(), no_root)
-    assert plan == Plan("full", "loopback", ("own",), "", 1)
-    assert note == "network namespaces need root: all on loopback, with our own nodes and core"
-
-
 @pytest.mark.parametrize(
     ("asked", "plan"),
     [
-        (Asked(link="none"), Plan(link="")),
-        (Asked(link="1gbit", seed=0), Plan(link="1gbit", seed=0)),
-        (Asked(size="short", clients=("rospy",)), Plan(size="short", clients=("rospy",))),
-        (Asked(bed="loopback"), Plan(bed="loopback", clients=("own",), link="")),
-        (Asked(bed="loopback", clients=("rospy",), link="none"), Plan(bed="loopback", clients=("rospy",), link="")),
-        (Asked(bed="namespaces"), Plan()),
+        ((None, (), None, None), Plan("full", ("rospy", "roscpp"), "100mbit", 1)),
+        ((None, (), "none", None), Plan(link="")),
+        ((None, (), "1gbit", 0), Plan(link="1gbit", seed=0)),
+        (("short", ("rospy",), None, None), Plan(size="short", clients=("rospy",))),
     ],
 )
-def test_what_is_asked_is_done(asked: Asked, plan: Plan) -> None:
-    assert choose(asked, everything) == (plan, "")
-
-
-def test_a_bed_that_was_named_is_not_exchanged_for_another() -> None:
-    with pytest.raises(StartError, match="hosts as network namespaces: network namespaces need root"):
-        choose(Asked(bed="namespaces"), no_root)
-    with pytest.raises(StartError, match="network namespaces need root"):
-        choose(Asked(link="10mbit"), no_root)
+def test_what_is_asked_is_done(asked: tuple[Any, ...], plan: Plan) -> None:
+    assert choose(*asked) == plan
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("link", "clients", "why"),
     [
-        (Asked(link="fast"), "--link: 'fast' is no rate; write it as tc does"),
-        (Asked(link=""), "--link: '' is no rate"),
-        (Asked(link="100"), "is no rate"),
-        (Asked(bed="loopback", link="100mbit"), "--link: loopback has no cables"),
-        (Asked(clients=("rospy", "rospy")), "--client: one was given twice"),
+        ("fast", (), "--link: 'fast' is no rate; write it as tc does"),
+        ("", (), "--link: '' is no rate"),
+        ("100", (), "is no rate"),
+        (None, ("rospy", "rospy"), "--client: one was given twice"),
     ],
 )
-def test_contradictions_are_refused(asked: Asked, why: str) -> None:
+def test_contradictions_are_refused(link: str | None, clients: Any, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
-        choose(asked, everything)
+        choose(None, clients, link, None)
 
 
 def test_a_run_goes_on_as_it_was() -> None:
-    before = Plan("short", "loopback", ("own",), "", 7)
-    assert choose(Asked(), everything, before) == (before, "")  # though namespaces could be had now
-    assert choose(Asked(seed=8), everything, before)[0].seed == 8  # which the store then refuses
-    assert choose(Asked(bed="namespaces"), everything, before)[0] == Plan("short", "namespaces", seed=7)
-    shaped = Plan(link="10mbit", clients=("roscpp",))
-    assert choose(Asked(), everything, shaped) == (shaped, "")
-    with pytest.raises(StartError, match="need root"):
-        choose(Asked(), no_root, shaped)
+    before = Plan("short", ("rospy",), "", 7)
+    assert choose(None, (), None, None, before) == before
+    assert choose(None, (), None, 8, before).seed == 8  # which the store then refuses
 
 
 def chosen(*texts: str) -> list[Cell]:

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 PLANS = [
     Plan(),
     Plan(size="short"),
-    Plan(bed="loopback", clients=("own",), link=""),
-    Plan("short", "loopback", ("own",), ""),
+    Plan("short", ("roscpp",), ""),
 ]
 
 

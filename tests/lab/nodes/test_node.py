@@ -17,8 +17,6 @@ from lab.nodes.node import (
     source_options,
     velocity_options,
 )
-from lab.nodes.own_ends import DATA, KIND, framed
-from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,15 +74,6 @@ def test_first_message_of_each_topic_is_said_and_the_first_after_a_pause(
         {"event": "first", "topic": "/vel", "came_ns": 5 * SECOND + SECOND // 2},
         {"event": "again", "topic": "/cmd", "came_ns": now, "gap_ns": SECOND},
     ]
-
-
-def test_our_own_frame_is_the_message_that_ros_knows() -> None:
-    data = bytearray(range(40))
-    kind = MessageType(KIND)
-    raw = framed(data)
-    assert bytes(kind.deserialize(raw).data) == bytes(data)
-    assert raw[DATA:] == data
-    assert raw == kind.serialize(kind.make({"data": list(data)}))
 
 
 def test_options_have_the_defaults_of_the_nodes_in_cpp() -> None:

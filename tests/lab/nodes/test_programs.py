@@ -1,4 +1,4 @@
-"""The nodes as programs, in all three client libraries, on loopback with one core: they do and say the same."""
+"""The nodes as programs, in both client libraries, on one host with one master: they do and say the same."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ if TYPE_CHECKING:
     from lab.bed.processes import Event, Process
     from lab.bed.system import System
 
-pytestmark = pytest.mark.timeout(120)
+pytestmark = [pytest.mark.timeout(120), pytest.mark.ros, pytest.mark.netns]
 TOPICS = ["/cmd", "/vel"]
 MILLISECOND = 1_000_000
-CLIENTS = [pytest.param(one, marks=[] if one == "own" else [pytest.mark.ros]) for one in get_args(Client)]
 
 
-@pytest.fixture(params=CLIENTS)
+@pytest.fixture(params=get_args(Client))
 def client(request: pytest.FixtureRequest) -> Client:
     made: Client = request.param
     return made
@@ -36,7 +35,7 @@ def client(request: pytest.FixtureRequest) -> Client:
 @pytest.fixture
 def robot(client: Client) -> Iterator[System]:
     """One host is enough: what nodes do is none of the hosts' business."""
-    plan = Plan(bed="loopback", clients=(client,))
+    plan = Plan(clients=(client,), link="")
     with make_stage(plan) as stage, stage.system("classic", ["pc"]) as made:
         yield made
 

@@ -15,6 +15,7 @@ from lab.web.subscriptions import How, head_of
 from lab.web.websocket import BINARY, TEXT, Frame
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
+from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.rosbridge.protocol import Compression, PublishFrames, encode_cbor_raw
 
 if TYPE_CHECKING:
@@ -32,8 +33,9 @@ def ours(how: How) -> Frame:
     else:
         compression = Compression.CBOR if how == "cbor" else Compression.NONE
         made = PublishFrames().encode("/for_rmpa", PAYLOAD, compression, codec_for(MessageType(TYPE)))
-    data = b"".join(made.parts)
-    return Frame(BINARY if made.binary else TEXT, len(data), data[:512])
+    opcode, parts = made
+    data = b"".join(parts)
+    return Frame(BINARY if opcode is Opcode.BINARY else TEXT, len(data), data[:512])
 
 
 def theirs(how: How) -> Frame:

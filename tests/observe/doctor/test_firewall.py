@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.observe.doctor.network import judge_rules, names_port, read_iptables, read_nft
+from rmpa.observe.doctor.network import FirewallRules, judge_rules, names_port, read_iptables, read_nft
 from rmpa.observe.peer_info import CheckLevel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 PORTS = frozenset({11411, 40001})
 NFT_OPEN = """\
@@ -58,47 +64,48 @@ IPTABLES_UFW = """\
 """
 
 
-@pytest.mark.parametrize(
-    ("text", "level", "part"),
-    [
-        ("", CheckLevel.OK, "0 rules"),
-        (NFT_OPEN, CheckLevel.OK, "1 rules, and none against agents"),
-        (NFT_CLOSED, CheckLevel.WARN, "inet filter input drops what no rule lets in"),
-        (NFT_OURS, CheckLevel.OK, "lets ours in: udp dport { 5353, 11400-11450 } accept"),
-        (NFT_AGAINST, CheckLevel.FAIL, "drops what agents send: udp dport 11411 counter"),
-        (NFT_UDP, CheckLevel.FAIL, "drops all UDP, also beacons of agents: meta l4proto udp drop"),
-        (NFT_UDP.replace("l4proto udp", "l4proto { tcp, udp }"), CheckLevel.FAIL, "drops all UDP"),
-        (NFT_UDP.replace('iif "lo"', "udp dport 11411"), CheckLevel.OK, "none against agents"),
-        (NFT_UDP.replace('iif "lo"', "tcp dport 40001"), CheckLevel.FAIL, "drops all UDP"),
-        (NFT_UDP.replace("l4proto udp", "l4proto tcp"), CheckLevel.OK, "none against agents"),
-        (NFT_UDP.replace("meta", 'iifname "docker0" meta'), CheckLevel.OK, "none against agents"),
-    ],
-)
-def test_nft(text: str, level: CheckLevel, part: str) -> None:
-    found = judge_rules(read_nft(text, PORTS), "UDP port 11411")
-    assert (found.level, found.where) == (level, "nft")
-    assert part in found.text
-    assert bool(found.remedy) is (level is not CheckLevel.OK)
+def nft(text: str) -> Callable[[], FirewallRules]:
+    return partial(read_nft, text, PORTS)
 
 
-@pytest.mark.parametrize(
-    ("text", "level"),
-    [
-        ("-P INPUT ACCEPT\n-P FORWARD ACCEPT\n-P OUTPUT ACCEPT\n", CheckLevel.OK),
-        (IPTABLES_UFW, CheckLevel.WARN),
-        (IPTABLES_UFW + "-A ufw-user-input -p udp -m udp --dport 11411 -j ACCEPT\n", CheckLevel.OK),
-        (IPTABLES_UFW + "-A ufw-user-input -p tcp -m multiport --dports 40000:40010 -j ACCEPT\n", CheckLevel.OK),
-        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 40001 -j REJECT\n", CheckLevel.FAIL),
-        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 22 -j REJECT\n", CheckLevel.OK),
-        ("-P INPUT ACCEPT\n-A INPUT -p udp -j DROP\n", CheckLevel.FAIL),
-        ("-P INPUT ACCEPT\n-A INPUT -p udp -j REJECT --reject-with icmp-port-unreachable\n", CheckLevel.FAIL),
-        ('-P INPUT ACCEPT\n-A INPUT -p udp -m comment --comment "no UDP" -j DROP\n', CheckLevel.FAIL),
-        ("-P INPUT ACCEPT\n-A INPUT -s 10.0.0.0/8 -p udp -j DROP\n", CheckLevel.OK),
-        ("-P INPUT ACCEPT\n-A INPUT -p udp -m udp --dport 53 -j DROP\n", CheckLevel.OK),
-    ],
-)
-def test_iptables(text: str, level: CheckLevel) -> None:
-    assert judge_rules(read_iptables(text, PORTS), "UDP port 11411").level is level
+def iptables(*rules: str) -> Callable[[], FirewallRules]:
+    return partial(read_iptables, "\n".join(rules), PORTS)
+
+
+OPEN = "-P INPUT ACCEPT"
+RULES: dict[str, Callable[[], FirewallRules]] = {
+    "ok, none": nft(""),
+    "ok, of containers": nft(NFT_OPEN),
+    "warn, closed": nft(NFT_CLOSED),
+    "ok, ours": nft(NFT_OURS),
+    "fail, against ours": nft(NFT_AGAINST),
+    "fail, all UDP": nft(NFT_UDP),
+    "fail, all UDP among others": nft(NFT_UDP.replace("l4proto udp", "l4proto { tcp, udp }")),
+    "ok, all UDP but ours": nft(NFT_UDP.replace('iif "lo"', "udp dport 11411")),
+    "fail, all UDP, though TCP comes in": nft(NFT_UDP.replace('iif "lo"', "tcp dport 40001")),
+    "ok, all TCP": nft(NFT_UDP.replace("l4proto udp", "l4proto tcp")),
+    "ok, UDP of one interface": nft(NFT_UDP.replace("meta", 'iifname "docker0" meta')),
+    "ok, iptables": iptables(OPEN, "-P FORWARD ACCEPT", "-P OUTPUT ACCEPT"),
+    "warn, ufw": iptables(IPTABLES_UFW),
+    "ok, ufw with UDP": iptables(IPTABLES_UFW, "-A ufw-user-input -p udp -m udp --dport 11411 -j ACCEPT"),
+    "ok, ufw with TCP": iptables(
+        IPTABLES_UFW, "-A ufw-user-input -p tcp -m multiport --dports 40000:40010 -j ACCEPT"
+    ),
+    "fail, a reject": iptables(OPEN, "-A INPUT -p tcp -m tcp --dport 40001 -j REJECT"),
+    "ok, another port": iptables(OPEN, "-A INPUT -p tcp -m tcp --dport 22 -j REJECT"),
+    "fail, no UDP": iptables(OPEN, "-A INPUT -p udp -j DROP"),
+    "fail, UDP rejected": iptables(OPEN, "-A INPUT -p udp -j REJECT --reject-with icmp-port-unreachable"),
+    "fail, a comment": iptables(OPEN, '-A INPUT -p udp -m comment --comment "no UDP" -j DROP'),
+    "ok, UDP of one network": iptables(OPEN, "-A INPUT -s 10.0.0.0/8 -p udp -j DROP"),
+    "ok, UDP of one port": iptables(OPEN, "-A INPUT -p udp -m udp --dport 53 -j DROP"),
+}
+
+
+@pytest.mark.parametrize(("name", "rules"), RULES.items(), ids=RULES)
+def test_signs(name: str, rules: Callable[[], FirewallRules]) -> None:
+    found = judge_rules(rules(), "UDP port 11411")
+    assert found.level == name.partition(",")[0]
+    assert bool(found.remedy) is (found.level is not CheckLevel.OK)
 
 
 def test_a_port_is_not_its_neighbour() -> None:

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.config import limits as config_limits
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.peer_info import Check, CheckLevel, LinkInfo, PeerInfo
-from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot
+from rmpa.observe.snapshot import FilesInfo, RouteInfo, SampleSpread, Snapshot, SubscriberTransport
 from rmpa.observe.why.diagnosis import Diagnosis, PublisherReport, TopicAtPublisher
 from rmpa.observe.why.stages import Arrival, Ends, diagnose_topic
 from tests.observe.samples import SNAPSHOT
@@ -126,6 +125,55 @@ def route(**changes: object) -> dict[str, Any]:
     return {"route": changed, "later": changed}
 
 
+def peer(**changes: object) -> PeerInfo:
+    return msgspec.structs.replace(PEER, **changes)
+
+
+def unlinked(state: str, **changes: object) -> PeerInfo:
+    return peer(state=state, link=None, **changes)
+
+
+def silent(seconds: float, **changes: object) -> PeerInfo:
+    return peer(link=msgspec.structs.replace(LINK, heard_ago=seconds, **changes))
+
+
+def source(**changes: object) -> PublisherReport:
+    return msgspec.structs.replace(SOURCE, **changes)
+
+
+def sources(**changes: object) -> dict[str, Any]:
+    """The publisher's word at both looks."""
+    return {"source": source(**changes), "source_later": source(**changes)}
+
+
+HERE = SubscriberTransport(node="/base", transport="direct", state="direct", wanted="auto", endpoint="10.0.0.2:41234")
+NOTHING_SENT: dict[str, Any] = {"messages": 0, "age": None, "rate": None, "period": None}
+
+
+def direct(**changes: object) -> Case:
+    """``/cmd`` whose only subscriber ``/base`` is direct."""
+    here = msgspec.structs.replace(HERE, **changes)
+    idle = route(**NOTHING_SENT, state="idle", lane="", md5="", transport="direct", subscribers=(here,))
+    return Case(readers=(), readers_later=(), **idle, **sources(route="", messages=0))
+
+
+def both() -> Case:
+    """``/cmd`` with ``/base`` direct, beside ``/rec``, which is relayed."""
+    changes: dict[str, Any] = {"transport": "both", "subscribers": (HERE,)}
+    readers, subscribers = (connected("/rec"),), ("/base", "/rec")
+    first, later = (msgspec.structs.replace(one, **changes) for one in (ROUTE, ROUTE_LATER))
+    return Case(route=first, later=later, readers=readers, readers_later=readers, subscribers=subscribers)
+
+
+def relayed(**changes: object) -> Case:
+    """``/cmd`` whose subscriber is relayed for a reason."""
+    here = msgspec.structs.replace(HERE, transport="relay", state="relayed", endpoint="", **changes)
+    first, later = (
+        msgspec.structs.replace(one, transport="relay", subscribers=(here,)) for one in (ROUTE, ROUTE_LATER)
+    )
+    return Case(route=first, later=later)
+
+
 def test_a_flowing_topic_passes_all_stages() -> None:
     found = one(Case())
     assert found.flows
@@ -133,147 +181,70 @@ def test_a_flowing_topic_passes_all_stages() -> None:
     assert [stage.name for stage in found.stages] == [name for name in ORDER if name not in ONLY_FAILS]
     assert {stage.level for stage in found.stages} == {CheckLevel.OK}
     assert (found.name, found.peer, found.to, found.node) == ("/cmd", "joystick", "base", "/joy")
-    by_name = {stage.name: stage.text for stage in found.stages}
-    assert by_name["arrived"] == "120 messages, the last 0.03 s ago, 20.0 Hz"
-    assert by_name["reader"] == "/base takes them"
 
 
-def test_two_modules_of_one_name_are_told_and_what_they_publish_arrives() -> None:
-    twin = msgspec.structs.replace(PEER, conflicts=("two modules are named joystick; rename one",))
-    found = one(Case(peer=twin))
-    assert found.flows
-    stage = found.stages[0]
-    assert (stage.name, stage.level, stage.remedy) == ("peer", CheckLevel.WARN, "rename one")
-
-
-def test_a_module_of_another_mesh_is_told_as_such() -> None:
-    told = "not of this mesh: it has not joined; let it join"
-    stranger = msgspec.structs.replace(PEER, state="foreign", link=None, last_error=told)
-    found = one(Case(peer=None, stranger=stranger))
-    (stage,) = found.stages
-    assert (stage.name, stage.level) == ("peer", CheckLevel.FAIL)
-    assert (stage.text, stage.remedy) == ("joystick is not of this mesh: it has not joined", "let it join")
-
-
-FAILURES: dict[str, tuple[Case, str, str, str]] = {
-    # What is different: the stage that fails, a part of its text, a part of its remedy.
-    "unknown peer": (Case(peer=None), "peer", "base knows no peer 'joystick' (domain 3", "rmpa doctor"),
+FAILURES: dict[str, tuple[str, Case]] = {
+    # What is different: the stage that fails, and the facts.
+    "unknown peer": ("peer", Case(peer=None)),
     "conflict": (
-        Case(peer=msgspec.structs.replace(PEER, state="conflict", conflicts=("shares its address",))),
         "peer",
-        "shares its address",
-        "--name",
+        Case(peer=peer(state="conflict", conflicts=("shares its address",))),
     ),
     "shared address": (
-        Case(
-            peer=msgspec.structs.replace(
-                PEER, state="conflict", conflicts=("its address is also b's; give one another",)
-            )
-        ),
         "peer",
-        "its address is also b's",
-        "give one another",
+        Case(peer=peer(state="conflict", conflicts=("its address is also b's; give one another",))),
     ),
     "unreachable": (
-        Case(source=msgspec.structs.replace(SOURCE, offered=False, unreachable="http://nosuch:1/: no such name")),
         "reachable",
-        "/joy is registered on joystick, but cannot be reached at http://nosuch:1/: no such name",
-        "ROS_IP=127.0.0.1",
+        Case(source=source(offered=False, unreachable="http://nosuch:1/: no such name")),
     ),
     "not linked": (
-        Case(peer=msgspec.structs.replace(PEER, state="linking", link=None, last_error="timed out")),
         "link",
-        "joystick is linking: timed out",
-        "firewall",
+        Case(peer=unlinked("linking", last_error="timed out")),
     ),
-    "only beacons": (
-        Case(peer=msgspec.structs.replace(PEER, state="linking", link=None, beacon_ago=1.5)),
-        "link",
-        "its beacons come (the last 1.5 s ago), but there is no TCP connection",
-        "TCP to 10.0.0.2:40002",
-    ),
+    "only beacons": ("link", Case(peer=unlinked("linking", beacon_ago=1.5))),
     "refused": (
-        Case(peer=msgspec.structs.replace(PEER, state="refused", link=None, last_error="domain 4 is not 3")),
         "link",
-        "domain 4 is not 3",
-        "do what the text says",
+        Case(peer=unlinked("refused", last_error="domain 4 is not 3")),
     ),
-    "nobody publishes": (Case(source=None, route=None), "publisher", "no node of joystick publishes", "start its"),
-    "nearly its name": (
-        Case(source=None, route=None, there=TopicAtPublisher(similar="/cmd_vel")),
-        "publisher",
-        "no node of joystick publishes /cmd",
-        "did you mean /cmd_vel?",
-    ),
+    "nobody publishes": ("publisher", Case(source=None, route=None)),
+    "nearly its name": ("publisher", Case(source=None, route=None, there=TopicAtPublisher(similar="/cmd_vel"))),
     "only subscribed there": (
-        Case(source=None, route=None, there=TopicAtPublisher(subscribers=("/echo",))),
         "publisher",
-        "/echo there only subscribe",
-        "start its",
+        Case(source=None, route=None, there=TopicAtPublisher(subscribers=("/echo",))),
     ),
     "an older agent, nothing offered": (
-        Case(route=None, there=None, refusal="it does not know the question"),
         "publisher",
-        "does not tell why (it does not know the question)",
-        "rostopic info",
+        Case(route=None, there=None, refusal="it does not know the question"),
     ),
     "policy there": (
-        Case(source=msgspec.structs.replace(SOURCE, crosses=False, rule="bridge.deny has '/cmd'"), route=None),
         "policy there",
-        "joystick keeps it at home: bridge.deny has '/cmd'",
-        "rmpa.toml of joystick",
+        Case(source=source(crosses=False, rule="bridge.deny has '/cmd'"), route=None),
     ),
     "built in": (
-        Case(source=msgspec.structs.replace(SOURCE, crosses=False, rule="built in: time stays home"), route=None),
         "policy there",
-        "time stays home",
-        "another name",
+        Case(source=source(crosses=False, rule="built in: time stays home"), route=None),
     ),
-    "no type": (
-        Case(source=msgspec.structs.replace(SOURCE, type="*"), route=None),
-        "offer",
-        "what type",
-        "registers",
-    ),
-    "too many": (
-        Case(source=msgspec.structs.replace(SOURCE, offered=False, beyond=70), route=None),
-        "offer",
-        "does not offer it: it has more topics than limits.topics = 70",
-        "bridge.deny",
-    ),
-    "too long a name": (
-        Case(source=msgspec.structs.replace(SOURCE, offered=False), route=None),
-        "offer",
-        "does not offer it: its name or type",
-        str(config_limits.CROSSING_NAME_MAX),
-    ),
+    "no type": ("offer", Case(source=source(type="*"), route=None)),
+    "too many": ("offer", Case(source=source(offered=False, beyond=70), route=None)),
+    "too long a name": ("offer", Case(source=source(offered=False), route=None)),
     "no place for its node": (
-        Case(**route(state="hidden", problem="joystick has more nodes than limits.nodes = 2", limit="nodes")),
         "limit",
-        "more nodes than limits.nodes = 2",
-        "raise limits.nodes",
+        Case(**route(state="hidden", problem="joystick has more nodes than limits.nodes = 2", limit="nodes")),
     ),
-    "not told yet": (Case(route=None), "offer", "has not come here (3 topics of joystick have)", "both logs"),
-    "policy here": (
-        Case(**route(state="hidden", problem="bridge.deny has '/cmd'")),
-        "policy here",
-        "does not take it: bridge.deny has '/cmd'",
-        "rmpa reload",
-    ),
+    "not told yet": ("offer", Case(route=None)),
+    "policy here": ("policy here", Case(**route(state="hidden", problem="bridge.deny has '/cmd'"))),
     "type": (
-        Case(**route(state="hidden", problem="its type is a/B, but c/D here; rename one"), conflict=True),
         "type",
-        "its type is a/B, but c/D here",
-        "rename one",
+        Case(**route(state="hidden", problem="its type is a/B, but c/D here; rename one"), conflict=True),
     ),
-    "not registered": (Case(registered=False), "graph", "/rmpa/joystick/joy is not in the local graph", "5 s"),
+    "not registered": ("graph", Case(registered=False)),
     "no descriptor for its proxy": (
-        Case(registered=False, **route(state="idle", problem="no file descriptor is left for its proxy; raise it")),
         "graph",
-        "of /cmd: no file descriptor is left for its proxy",
-        "raise it",
+        Case(registered=False, **route(state="idle", problem="no file descriptor is left for its proxy; raise it")),
     ),
     "no descriptor for its subscriber": (
+        "subscriber",
         Case(
             readers=(),
             files=FilesInfo(
@@ -281,99 +252,68 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
             ),
             **route(state="idle"),
         ),
-        "subscriber",
-        "the agent has no file descriptor to accept it with: node /x has to wait: none left",
-        "raise it",
     ),
-    "not connected": (
-        Case(readers=(), **route(state="idle")),
-        "subscriber",
-        "/base subscribes, but has not connected",
-        "ROS_IP",
-    ),
-    "md5": (
-        Case(readers=(), mismatches=("/base: wants 1234",), **route(state="idle")),
-        "md5",
-        "/base: wants 1234",
-        "one version of the message",
-    ),
+    "not connected": ("subscriber", Case(readers=(), **route(state="idle"))),
+    "md5": ("md5", Case(readers=(), mismatches=("/base: wants 1234",), **route(state="idle"))),
     "publisher does not answer": (
+        "route",
         Case(
             **route(state="opening", md5=""),
-            source=msgspec.structs.replace(SOURCE, route="opening"),
-            source_later=msgspec.structs.replace(SOURCE, route="opening"),
+            **sources(route="opening"),
         ),
-        "route",
-        "waits for the publisher /joy to answer",
-        "rosnode ping /joy",
     ),
-    "peer does not answer": (Case(**route(state="opening", md5="")), "route", "has not answered", "log there"),
-    "route closed": (
-        Case(**route(state="waiting", md5="", problem="its publisher refuses: no")),
-        "route",
-        "waiting: its publisher refuses: no",
-        "tried again by itself",
-    ),
+    "peer does not answer": ("route", Case(**route(state="opening", md5=""))),
+    "route closed": ("route", Case(**route(state="waiting", md5="", problem="its publisher refuses: no"))),
     "nothing published": (
-        Case(
-            **route(messages=0, age=None, rate=None, period=None),
-            source=msgspec.structs.replace(SOURCE, messages=0),
-            source_later=msgspec.structs.replace(SOURCE, messages=0),
-        ),
         "sent",
-        "/joy is connected, and has published nothing since",
-        "rostopic hz /cmd",
+        Case(
+            **route(**NOTHING_SENT),
+            **sources(messages=0),
+        ),
     ),
     "too long": (
-        Case(
-            **route(messages=0, age=None, rate=None, period=None),
-            source=msgspec.structs.replace(SOURCE, messages=0, oversized=4, oversized_bytes=270_000_000),
-            source_later=msgspec.structs.replace(SOURCE, messages=0, oversized=5, oversized_bytes=270_000_000),
-        ),
         "sent",
-        "5 messages of its publisher /joy are too long, the last has 270000000 bytes, and at most 268435452 cross",
-        "send them in parts, or compressed",
+        Case(
+            **route(**NOTHING_SENT),
+            source=source(messages=0, oversized=4, oversized_bytes=270_000_000),
+            source_later=source(messages=0, oversized=5, oversized_bytes=270_000_000),
+        ),
     ),
-    "nothing arrives": (
-        Case(**route(messages=0, age=None, rate=None, period=None)),
-        "arrived",
-        "joystick has sent 20 meanwhile, and none arrived at base",
-        "max_rate",
-    ),
+    "nothing arrives": ("arrived", Case(**route(**NOTHING_SENT))),
     "nothing arrives any more": (
-        Case(later=ROUTE, source_later=msgspec.structs.replace(SOURCE, messages=120, dropped=20)),
         "arrived",
-        "(20 were given up over there)",
-        "link too slow",
+        Case(later=ROUTE, source_later=source(messages=120, dropped=20)),
     ),
-    "silent": (
-        Case(**route(age=8.0), source_later=SOURCE),
-        "arrived",
-        "nothing for 8.0 s; until then a message came every 52 ms at the latest",
-        "fallen silent",
+    "silent": ("arrived", Case(**route(age=8.0), source_later=SOURCE)),
+    "readers have left": ("reader", Case(readers_later=())),
+    "whether it is direct is not decided yet": ("subscriber", direct(transport="", state="asking", endpoint="")),
+    "of another mesh": (
+        "peer",
+        Case(peer=None, stranger=unlinked("foreign", last_error="not of this mesh: it has not joined; let it join")),
     ),
-    "readers have left": (Case(readers_later=()), "reader", "have just left", "again"),
+    "what a relay brings of other modules": (
+        "publisher",
+        Case(peer=unlinked("relayed", via="gate"), known=False, source=None, source_later=None),
+    ),
+    "too many messages for a max_rate": ("arrived", Case(**route(contract={"max_rate": 10.0}))),
     "reader stuck": (
+        "reader",
         Case(
             readers=(connected("/base", waiting=70_000),),
             readers_later=(connected("/base", waiting=90_000, dropped=3),),
         ),
-        "reader",
-        "/base (90000 B wait, 3 dropped) does not read",
-        "callbacks",
     ),
 }
 
 
-@pytest.mark.parametrize(("case", "stage", "text", "remedy"), FAILURES.values(), ids=FAILURES)
-def test_the_first_stage_that_fails(case: Case, stage: str, text: str, remedy: str) -> None:
+@pytest.mark.parametrize(("stage", "case"), FAILURES.values(), ids=FAILURES)
+def test_the_first_stage_that_fails(stage: str, case: Case) -> None:
     found = one(case)
     assert not found.flows
     assert found.failed is not None
     assert found.failed is found.stages[-1], "nothing behind it is looked at"
     assert found.failed.name == stage
-    assert text in found.failed.text
-    assert remedy in found.failed.remedy
+    assert found.failed.remedy
     # The stages before it are those of a topic that flows; md5 is only there where something is known of it.
     names = [s.name for s in found.stages]
     assert names == [name for name in ORDER if name in names]
@@ -381,60 +321,33 @@ def test_the_first_stage_that_fails(case: Case, stage: str, text: str, remedy: s
     assert missing <= {"md5", *ONLY_FAILS}
 
 
-def test_a_topic_that_no_node_subscribes_to_has_no_fault() -> None:
-    found = one(Case(subscribers=(), readers=(), **route(state="idle")))
-    assert found.flows
-    assert found.unasked
-    assert found.failed is None
-    last = found.stages[-1]
-    assert (last.text, last.remedy) == (
-        "no node here subscribes to /cmd, so nothing is sent",
-        "to try it: rmpa topic echo /cmd",
-    )
-
-
 def test_every_stage_can_fail_but_transport_and_contract() -> None:
-    assert {stage for _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"contract", "transport"}
+    assert {stage for stage, _ in FAILURES.values()} == set(ORDER) - {"contract", "transport"}
 
 
-WARNINGS: dict[str, tuple[Case, str, str]] = {
+WARNINGS: dict[str, tuple[str, Case]] = {
     "a link that is silent": (
-        Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, heard_ago=0.8))),
         "link",
-        "silent for 0.8 s",
+        Case(peer=silent(0.8)),
     ),
     "a link at rest that is silent": (
-        Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, heard_ago=8.2, rests=True))),
         "link",
-        "silent for 8.2 s",
+        Case(peer=silent(8.2, rests=True)),
     ),
-    "one was refused": (Case(mismatches=("/old: wants 1234",)), "md5", "/old: wants 1234"),
-    "dropped there": (
-        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, dropped=2)),
-        "sent",
-        "2 given up over there",
-    ),
+    "one was refused": ("md5", Case(mismatches=("/old: wants 1234",))),
+    "dropped there": ("sent", Case(source_later=source(messages=120, dropped=2))),
     "some too long": (
-        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, oversized=1, oversized_bytes=270_000_000)),
         "sent",
-        "1 messages of its publisher /joy are too long, the last has 270000000 bytes, and at most 268435452 cross",
+        Case(source_later=source(messages=120, oversized=1, oversized_bytes=270_000_000)),
     ),
-    "given up": (
-        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, lost=7046)),
-        "sent",
-        "7046 of them given up, while joystick had no link to this module",
-    ),
-    "few messages": (
-        Case(**route(messages=1, age=30.0, rate=None, period=None), source_later=SOURCE),
-        "arrived",
-        "1 messages, the last 30.00 s ago",
-    ),
+    "given up": ("sent", Case(source_later=source(messages=120, lost=7046))),
+    "few messages": ("arrived", Case(**route(messages=1, age=30.0, rate=None, period=None), source_later=SOURCE)),
     "contract": (
-        Case(later=msgspec.structs.replace(ROUTE, messages=120, lost=3, events={"deadline_missed": 2})),
         "contract",
-        "3 lost, deadline missed 2 times",
+        Case(later=msgspec.structs.replace(ROUTE, messages=120, lost=3, events={"deadline_missed": 2})),
     ),
     "one reader of two is stuck": (
+        "reader",
         Case(
             readers=(
                 connected("/base"),
@@ -445,58 +358,52 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
                 connected("/slow", waiting=1),
             ),
         ),
-        "reader",
-        "/slow (1 B wait, 0 dropped) does not keep up",
     ),
-    "a reader was slow": (
-        Case(readers_later=(connected("/base", dropped=9),)),
-        "reader",
-        "/base has missed 9",
-    ),
+    "a reader was slow": ("reader", Case(readers_later=(connected("/base", dropped=9),))),
 }
 
 
-@pytest.mark.parametrize(("case", "stage", "text"), WARNINGS.values(), ids=WARNINGS)
-def test_warnings_of_a_flowing_topic(case: Case, stage: str, text: str) -> None:
+@pytest.mark.parametrize(("stage", "case"), WARNINGS.values(), ids=WARNINGS)
+def test_warnings_of_a_flowing_topic(stage: str, case: Case) -> None:
     found = one(case)
     assert found.flows
-    warned = [s for s in found.stages if s.level is CheckLevel.WARN]
-    assert [s.name for s in warned] == [stage]
-    assert text in warned[0].text
+    assert [s.name for s in found.stages if s.level is CheckLevel.WARN] == [stage]
 
 
-def test_bytes_that_wait_once_are_no_fault() -> None:
-    found = one(Case(readers_later=(connected("/base", waiting=70_000),)))
-    assert found.stages[-1].level is CheckLevel.OK
+FLOWING: dict[str, Case] = {
+    "a topic": Case(),
+    "no node subscribes": Case(subscribers=(), readers=(), **route(state="idle")),
+    "two modules of one name": Case(peer=peer(conflicts=("two modules are named joystick; rename one",))),
+    "bytes that wait once": Case(readers_later=(connected("/base", waiting=70_000),)),
+    "an agent that does not answer": Case(there=None, refusal="it is older"),
+    "a latched topic of one old message": Case(
+        **route(messages=1, age=3600.0, rate=None, period=None, latched=True), source_later=SOURCE
+    ),
+    "a message on its way": Case(later=ROUTE, source_later=source(messages=101)),
+    "a topic that is thinned out": Case(**route(contract={"max_rate": 0.5})),
+    "a relayed module": Case(peer=unlinked("relayed", via="gate")),
+    "another name at the peer": Case(**route(wire="/stick"), **sources(topic="/joy/stick"), wire="/stick"),
+    "a single look": Case(readers_later=None),
+    "direct": direct(),
+    "direct and relayed": both(),
+    "direct, without the peer's agent": replace(direct(), peer=unlinked("linking", last_error="connection reset")),
+    "direct, and it cannot be moved": direct(state="relayed", condition="name", text="other name"),
+    "relayed by a condition": relayed(condition="caller_id", text="taken"),
+    "relayed although direct is wanted": relayed(condition="caller_id", text="taken", wanted="direct"),
+    "relayed by a rule": relayed(condition="transport", text='it is "relay"', wanted="direct"),
+}
 
 
-def test_stages_are_unknown_without_an_answer() -> None:
-    found = one(Case(there=None, refusal="it is older"))
+@pytest.mark.parametrize("case", FLOWING.values(), ids=FLOWING)
+def test_what_is_no_fault(case: Case) -> None:
+    found = one(case)
     assert found.flows
-    unknown = [stage.name for stage in found.stages if stage.level is CheckLevel.UNKNOWN]
-    assert unknown == ["publisher", "policy there", "sent"]
-
-
-def test_a_latched_topic_of_one_old_message_flows() -> None:
-    quiet = route(messages=1, age=3600.0, rate=None, period=None, latched=True)
-    found = one(Case(**quiet, source_later=SOURCE))
-    assert {stage.level for stage in found.stages} == {CheckLevel.OK}
-
-
-def test_a_message_that_is_on_its_way_is_not_missing() -> None:
-    found = one(Case(later=ROUTE, source_later=msgspec.structs.replace(SOURCE, messages=101)))
-    assert found.flows
-
-
-def test_a_topic_that_is_thinned_out_is_not_missing() -> None:
-    thin = msgspec.structs.replace(ROUTE, contract={"max_rate": 0.5})
-    assert one(Case(route=thin, later=thin)).flows
-    quick = msgspec.structs.replace(ROUTE, contract={"max_rate": 10.0})
-    assert not one(Case(route=quick, later=quick)).flows
+    assert found.failed is None
+    assert all(stage.level is not CheckLevel.FAIL for stage in found.stages)
 
 
 def test_each_publisher_has_its_diagnosis() -> None:
-    second = msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")
+    second = source(node="/second", crosses=False, rule="no")
     there = TopicAtPublisher(sources=(SOURCE, second))
     first, other = Case(there=there, source=None, source_later=None).walk()
     assert (first.node, first.flows) == ("/joy", True)
@@ -506,7 +413,7 @@ def test_each_publisher_has_its_diagnosis() -> None:
 
 
 def test_the_number_of_diagnoses_is_bounded() -> None:
-    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * observe_limits.WHY_SOURCES_MAX))
+    many = tuple(source(node=f"/n{i}") for i in range(10 * observe_limits.WHY_SOURCES_MAX))
     found = Case(there=TopicAtPublisher(sources=many), source=None, source_later=None).walk()
     assert len(found) == observe_limits.WHY_SOURCES_MAX
 
@@ -517,30 +424,6 @@ def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
     found = one(Case(), "joystik")
     assert found.failed is not None
     assert found.failed.remedy.startswith("did you mean joystick?")
-
-
-def test_a_relayed_module_has_no_link_of_its_own() -> None:
-    relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
-    found = one(Case(peer=relayed), "arm")
-    assert found.flows
-    assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
-    # What the relay brings of other modules is not this one's.
-    nothing = one(Case(peer=relayed, known=False, source=None, source_later=None), "arm")
-    assert nothing.failed is not None
-    assert nothing.failed.name == "publisher"
-
-
-def test_names_at_both_ends_are_shown() -> None:
-    source = msgspec.structs.replace(SOURCE, topic="/joy/stick")
-    found = one(Case(**route(wire="/stick"), source=source, wire="/stick", readers_later=None))
-    texts = {stage.name: stage.text for stage in found.stages}
-    assert texts["publisher"] == "/joy on joystick publishes /stick (/joy/stick over there)"
-    assert texts["policy here"] == "this module takes it as /cmd (its /stick)"
-
-
-def test_a_single_look_is_judged() -> None:
-    found = one(replace(Case(), readers_later=None))
-    assert found.flows
 
 
 _names = st.text(max_size=20)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
@@ -10,24 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import UNSET
 
+from rmpa.core.errors import RmpaError
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.channels import ParameterError, ParameterRequests, from_parameter, to_parameter
-from rmpa.web.hub import requests
+from rmpa.web.foxglove.protocol import from_parameter, to_parameter
+from tests.web.foxglove.client import Client
 
-NAMES = ("/a", "/b")
-
-
-@pytest.fixture
-def params() -> ParameterRequests:
-    return ParameterRequests(itertools.count(1).__next__)
+if TYPE_CHECKING:
+    from rmpa.web.hub.node_link import ParamValue
+    from tests.web.recorder import Asked
 
 
 @pytest.mark.parametrize(
     "value",
     [1, -3, True, 1.0, 2.5, "text", b"\x00\xff", [1.0, 2.0], [1, 2], [1, 2.5], [], ["a"], {"x": [True, {"y": 1}]}],
 )
-def test_a_value_comes_back_as_it_went(value: requests.ParamValue) -> None:
+def test_a_value_comes_back_as_it_went(value: ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
     received = msgspec.json.decode(sent, type=protocol.FoxgloveParameter)
     back = from_parameter(received)
@@ -46,7 +44,7 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_any_value_comes_back(value: requests.ParamValue) -> None:
+def test_any_value_comes_back(value: ParamValue) -> None:
     sent = protocol.encode_json(to_parameter("/p", value))
     assert from_parameter(msgspec.json.decode(sent, type=protocol.FoxgloveParameter)) == value
 
@@ -99,86 +97,92 @@ def nested(depth: int) -> object:
     ids=lambda parameter: f"{parameter.name} {parameter.value!r:.20}",
 )
 def test_what_ros_cannot_hold_is_refused(parameter: protocol.FoxgloveParameter) -> None:
-    with pytest.raises(ParameterError):
+    with pytest.raises(RmpaError):
         from_parameter(parameter)
 
 
-def test_parameters_are_got_by_name_or_all(params: ParameterRequests) -> None:
-    assert params.get(protocol.GetParameters(("/a", "/b", "/a"), "r1")) == [requests.GetParams(1, ("/a", "/b"))]
-    assert params.get(protocol.GetParameters()) == [requests.GetParams(2, (), "/")]
-    first = params.answer(requests.ParamsChanged(1, {"/a": 1, "/b": None}))
-    assert first == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/a", value=1),), id="r1")
-    second = params.answer(requests.ParamsChanged(2, {}))
-    assert second == protocol.ParameterValues(parameters=())
-    assert not params.owns(1)
+# --- what a session asks of the hub ---
 
 
-def test_setting_is_answered_once_all_are_set(params: ParameterRequests) -> None:
-    message = protocol.SetParameters(
-        (protocol.FoxgloveParameter(name="/a", value=1), protocol.FoxgloveParameter(name="/b")), "r"
-    )
-    assert params.set(message) == [requests.SetParam(1, "/a", 1), requests.DeleteParam(2, "/b")]
-    assert params.answer(requests.ParamsChanged(1, {"/a": 1})) is None
-    answer = params.answer(requests.ParamsChanged(2, {"/b": None}))
-    assert answer == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/a", value=1),), id="r")
+def _values(client: Client) -> dict[str, Any]:
+    """The last values that the client was sent."""
+    return {each["name"]: each.get("value") for each in client.of("parameterValues")[-1]["parameters"]}
 
 
-def test_setting_without_an_id_is_not_answered(params: ParameterRequests) -> None:
-    params.set(protocol.SetParameters((protocol.FoxgloveParameter(name="/a", value=1),)))
-    assert params.answer(requests.ParamsChanged(1, {"/a": 1})) is None
-    assert not params.owns(1)
+def _follow(client: Client, *names: str, op: str = "subscribe") -> list[Asked]:
+    return client.send({"op": f"{op}ParameterUpdates", "parameterNames": names})
 
 
-def test_one_bad_parameter_leaves_all_as_they_are(params: ParameterRequests) -> None:
-    bad = (protocol.FoxgloveParameter(name="/a", value=1), protocol.FoxgloveParameter(name="b", value=1))
-    with pytest.raises(ParameterError):
-        params.set(protocol.SetParameters(bad))
-    assert not params.owns(1)
+def test_parameters_are_got_by_name_or_all() -> None:
+    client = Client()
+    client.send({"op": "getParameters", "parameterNames": ["/a", "/b", "/a"], "id": "r1"})
+    assert client.last("get_params").names == ("/a", "/b")
+    client.last("get_params").done({"/a": 1})
+    assert client.of("parameterValues") == [
+        {"op": "parameterValues", "parameters": [{"name": "/a", "value": 1}], "id": "r1"}
+    ]
+    client.send({"op": "getParameters"})
+    assert client.last("get_params").names == ()
+    client.last("get_params").failed(RmpaError("the core is away"))
+    assert client.errors == ["the core is away"]
+    assert _values(client) == {}
 
 
-def test_a_parameter_is_followed_once(params: ParameterRequests) -> None:
-    assert params.follow(["/a"]) == [requests.FollowParams(1, ("/a",))]
-    assert params.follow(["/a", "/b"]) == [requests.FollowParams(2, ("/b",))]
-    assert params.unfollow(["/a", "/never"]) == [requests.UnfollowParams(1)]
-    assert params.close() == [requests.UnfollowParams(2)]
+def test_parameters_are_set_and_deleted_and_what_is_refused_is_told() -> None:
+    client = Client()
+    changes = [{"name": "/a", "value": 3, "type": "float64"}, {"name": "/b"}, {"name": "/denied", "value": 1}]
+    client.send({"op": "setParameters", "parameters": changes, "id": "r"})
+    assert client.hub.params.changes == [("/a", 3.0), ("/b", None)]
+    assert client.errors == ["the core refuses it"]
+    assert _values(client) == {"/a": 3.0}
+    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]})
+    assert len(client.of("parameterValues")) == 1  # without an id it is not answered
 
 
-def test_all_parameters_are_followed_and_some_left_out(params: ParameterRequests) -> None:
-    params.follow(["/a"])
-    assert params.follow([]) == [requests.UnfollowParams(1), requests.FollowParams(2)]
-    assert params.follow([]) == []
-    assert params.unfollow(["/a"]) == []
-    assert params.answer(requests.ParamsChanged(2, {"/a": 1})) is None
-    changed = params.answer(requests.ParamsChanged(2, {"/a": 1, "/b": None}))
-    assert changed == protocol.ParameterValues(parameters=(protocol.FoxgloveParameter(name="/b"),))
-    assert params.follow(["/a"]) == []
-    assert params.answer(requests.ParamsChanged(2, {"/a": 1})) is not None
-    assert params.unfollow([]) == [requests.UnfollowParams(2)]
+def test_one_bad_parameter_leaves_all_as_they_are() -> None:
+    client = Client()
+    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}, {"name": "b", "value": 1}]})
+    assert "write it like /base/rate" in client.errors[0]
+    assert client.hub.params.changes == []
 
 
-def test_requests_without_answers_are_bounded(params: ParameterRequests) -> None:
-    for _ in range(limits.FOXGLOVE_PARAMETER_REQUESTS_MAX):
-        params.get(protocol.GetParameters())
-    with pytest.raises(ParameterError, match="try again later"):
-        params.get(protocol.GetParameters())
-    params.answer(requests.ParamsChanged(1, {}))
-    params.get(protocol.GetParameters())
+def test_parameters_are_followed_by_name() -> None:
+    client = Client()
+    first = client.one("follow_params", _follow(client, "/a"))
+    both = client.one("follow_params", _follow(client, "/a", "/b"))
+    assert (first.names, first.closed, both.names) == (("/a",), True, ("/a", "/b"))
+    both.changed({"/a": None})
+    assert client.of("parameterValues")[-1]["parameters"] == [{"name": "/a"}]
+    rest = client.one("follow_params", _follow(client, "/a", "/never", op="unsubscribe"))
+    assert rest.names == ("/b",)
+    assert _follow(client, op="unsubscribe") == []
+    assert rest.closed
 
 
-def test_followed_names_are_bounded(params: ParameterRequests, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_parameters_are_followed_and_some_left_out() -> None:
+    client = Client()
+    _follow(client, "/a")
+    assert client.one("follow_params", _follow(client)).names == ()
+    client.one("follow_params", _follow(client, "/a", op="unsubscribe")).changed({"/a": 1})
+    assert client.of("parameterValues") == []
+    client.last("follow_params").changed({"/a": 1, "/b": None})
+    assert _values(client) == {"/b": None}
+    client.one("follow_params", _follow(client, "/a")).changed({"/a": 1})
+    assert _values(client) == {"/a": 1}
+
+
+def test_requests_without_answers_and_followed_names_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client()
+    for _ in range(limits.FOXGLOVE_PARAMETER_REQUESTS_MAX + 1):
+        client.send({"op": "getParameters"})
+    assert len(client.errors) == 1
+    assert "try again later" in client.errors[0]
+    client.last("get_params")
+    client.all("get_params")[0].done({})
+    client.send({"op": "getParameters"})
+    assert len(client.errors) == 1
     monkeypatch.setattr(limits, "FOXGLOVE_PARAMETERS_MAX", 2)
-    params.follow(NAMES)
-    with pytest.raises(ParameterError, match="empty list"):
-        params.follow(["/c"])
-    params.follow([])
-    params.unfollow(NAMES)
-    with pytest.raises(ParameterError):
-        params.unfollow(["/c"])
-
-
-def test_a_failed_request_still_ends(params: ParameterRequests) -> None:
-    params.get(protocol.GetParameters((), "r"))
-    assert params.failed(1) == protocol.ParameterValues(parameters=(), id="r")
-    params.follow(["/a"])
-    assert params.failed(2) is None
-    assert params.follow(["/a"]) == [requests.FollowParams(3, ("/a",))]
+    for name in ("/a", "/b"):
+        _follow(client, name)
+    _follow(client, "/c")
+    assert "empty list" in client.errors[1]

@@ -17,19 +17,19 @@ websockets_client = pytest.importorskip("websockets.sync.client", reason="websoc
 
 from foxglove import Channel, Schema, websocket  # noqa: E402 - after the skip
 
+from rmpa.core.errors import RmpaError  # noqa: E402
 from rmpa.ros.types.installed import ServiceType  # noqa: E402
 from rmpa.ros.types.messages import MessageType  # noqa: E402
-from rmpa.web.foxglove import protocol  # noqa: E402
-from rmpa.web.hub import requests  # noqa: E402
+from rmpa.web.hub.graph import GraphTopic  # noqa: E402
 from tests.web.foxglove.client import SET_BOOL, Client  # noqa: E402
+from tests.web.recorder import NOW_NS as STAMP  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 TEXT = MessageType("nav_msgs/Odometry").definition
-TOPIC = requests.GraphTopic("/odom", ("nav_msgs/Odometry",), ("/base",), ("/map",))
-PARAMETERS: dict[str, requests.ParamValue] = {"/a": 1, "/b": b"ABCD", "/c": [1.5, 2.0], "/d": {"x": [True, "y"]}}
-STAMP = 1234567890123456789
+TOPIC = GraphTopic("/odom", ("nav_msgs/Odometry",), ("/base",), ("/map",))
+PARAMETERS: dict[str, Any] = {"/a": 1, "/b": b"ABCD", "/c": [1.5, 2.0], "/d": {"x": [True, "y"]}}
 
 
 class Listener(websocket.ServerListener):  # type: ignore[misc]
@@ -121,18 +121,9 @@ def reference() -> Iterator[Reference]:
 class Ours(Client):
     """Our session; its frames as bytes, in order."""
 
-    def __init__(self) -> None:
-        self.said: list[bytes] = []
-        super().__init__()
-
-    def do(self, outputs: list[Any]) -> None:
-        frames = protocol.TextFrame | protocol.BinaryFrame
-        self.said += [
-            each.data if isinstance(each, protocol.TextFrame) else bytes(each)
-            for each in outputs
-            if isinstance(each, frames)
-        ]
-        super().do(outputs)
+    @property
+    def said(self) -> list[bytes]:
+        return [b"".join(parts) for _, parts in self.connection.sent]
 
     def ask(self, frame: dict[str, Any] | bytes) -> bytes | None:
         count = len(self.said)
@@ -156,26 +147,25 @@ def test_both_servers_say_the_same(reference: Reference) -> None:
     wrong = {"op": "fetchAsset", "uri": "package://robot/none", "requestId": 9}
     failed = reference.ask(wrong)  # its answer shows that the subscription has been read
     reference.channel.log(b"payload", log_time=STAMP)
-    handle = ours.subscribe(1, 7)
-    ours.hub(requests.ReceivedMessage(handle, "/odom", "nav_msgs/Odometry", memoryview(b"payload"), STAMP))
+    ours.subscribe(1, 7).message(b"payload", "nav_msgs/Odometry")
     assert ours.said[-1] == reference.receive()
     ours.ask(wrong)
-    ours.hub(requests.Failed(ours.last(requests.FetchAsset).handle, "OSError: not found"))
+    ours.last("fetch_asset").failed(RmpaError("OSError: not found"))
     assert ours.said[-1] == failed
 
     call = struct.pack("<BIII", 2, 1, 12, 4) + b"ros1\x01"
     ours.ask(call)
-    ours.hub(requests.ServiceResult(ours.last(requests.CallService).handle, ok=True, payload=b"\x01\x00\x00\x00\x00"))
+    ours.last("call").done(b"\x01\x00\x00\x00\x00")
     assert ours.said[-1] == reference.ask(call)
 
     fetch = {"op": "fetchAsset", "uri": "package://robot/base.stl", "requestId": 5}
     ours.ask(fetch)
-    ours.hub(requests.AssetFetched(ours.last(requests.FetchAsset).handle, b"solid"))
+    ours.last("fetch_asset").done(b"solid")
     assert ours.said[-1] == reference.ask(fetch)
 
     get = {"op": "getParameters", "parameterNames": [], "id": "r1"}
     ours.ask(get)
-    ours.hub(requests.ParamsChanged(ours.last(requests.GetParams).handle, PARAMETERS))
+    ours.last("get_params").done(PARAMETERS)
     assert ours.said[-1] == reference.ask(get)
 
     change = {
@@ -184,8 +174,6 @@ def test_both_servers_say_the_same(reference: Reference) -> None:
         "id": "r2",
     }
     ours.ask(change)
-    asked = ours.last(requests.SetParam)
-    ours.hub(requests.ParamsChanged(asked.handle, {asked.name: asked.value}))
     assert ours.said[-1] == reference.ask(change)
 
     follow = {"op": "subscribeConnectionGraph"}

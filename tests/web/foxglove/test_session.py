@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
 from typing import Any
 
@@ -10,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.errors import LocalProtocolError
+from rmpa.core.errors import RmpaError
+from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
-from rmpa.web.foxglove import protocol
-from rmpa.web.hub import requests
-from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_REMEDY, Rights
-from rmpa.web.hub.requests import GraphService, GraphTopic
-from tests.web.foxglove.client import CHATTER, SET_BOOL, Client, described, message
+from rmpa.web.hub.graph import GraphService, GraphTopic
+from rmpa.web.hub.node_link import CONTROL_REMEDY, Rights
+from tests.web.foxglove.client import CHATTER, SET_BOOL, Client
+from tests.web.recorder import NOW_NS
 
 # --- opening, channels ---
 
@@ -38,11 +37,6 @@ def test_a_client_without_rights_is_offered_nothing_but_data_and_graph() -> None
     assert Client(Rights(), sim_time=True).json[0]["capabilities"] == ["time", "connectionGraph"]
 
 
-def test_a_session_opens_once() -> None:
-    with pytest.raises(LocalProtocolError):
-        Client().session.open()
-
-
 def test_a_topic_is_offered_with_the_full_text_of_its_definition() -> None:
     client = Client()
     client.graph(GraphTopic("/odom", ("nav_msgs/Odometry",), ("/base",)))
@@ -61,7 +55,7 @@ def test_two_types_on_one_topic_are_two_channels() -> None:
     names = {c["schemaName"]: c["id"] for m in client.of("advertise") for c in m["channels"]}
     assert names.keys() == {"std_msgs/String", "std_msgs/Bool"}, advertised
     client.subscribe(names["std_msgs/Bool"])
-    assert client.last(requests.Subscribe).type == "std_msgs/Bool"
+    assert client.last("subscribe").type == "std_msgs/Bool"
 
 
 def test_topics_without_publishers_or_type_are_not_offered() -> None:
@@ -89,34 +83,35 @@ def test_a_graph_that_did_not_change_says_nothing() -> None:
 
 
 def test_an_unknown_type_is_told_and_offered_once_it_is_known() -> None:
-    client = Client(knows=False)
+    client = Client()
+    client.hub.types.missing["std_msgs/String"] = RmpaError("no definition; install its package")
     client.graph(CHATTER)
-    asked = client.last(requests.DescribeType)
-    client.hub(requests.Failed(asked.handle, "no definition of std_msgs/String", "install its package"))
     (status,) = client.of("status")
     assert status["level"] == 1
     assert "install its package" in status["message"]
     assert not client.of("advertise")
-    client.hub(described(asked))
+    assert Client(beside=client).of("status") == [status]
+    client.hub.types.on_learnt(MessageType("std_msgs/String"))
     assert client.of("removeStatus") == [{"op": "removeStatus", "statusIds": [status["id"]]}]
     assert client.of("advertise")[0]["channels"][0]["topic"] == "/chatter"
 
 
 def test_the_warning_about_a_type_ends_with_its_last_topic() -> None:
-    client = Client(knows=False)
+    client = Client()
+    client.hub.types.missing["std_msgs/String"] = RmpaError("no definition")
     client.graph(CHATTER)
-    asked = client.last(requests.DescribeType)
-    client.hub(requests.Failed(asked.handle, "no definition"))
     client.graph()
     assert client.of("removeStatus")
-    client.hub(described(asked))
+    client.hub.types.on_learnt(MessageType("std_msgs/String"))
     assert not client.of("advertise")
 
 
-def test_a_type_is_asked_for_once() -> None:
+def test_a_type_is_asked_for_once_for_all_topics_and_clients() -> None:
     client = Client()
     client.graph(*(GraphTopic(f"/t{n}", ("std_msgs/String",), ("/n",)) for n in range(50)))
-    assert sum(isinstance(each, requests.DescribeType) for each in client.asked) == 1
+    beside = Client(beside=client)
+    assert client.hub.types.asked == ["std_msgs/String"]
+    assert beside.of("advertise") == client.of("advertise")
 
 
 def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,31 +127,22 @@ def test_many_channels_come_in_several_messages(monkeypatch: pytest.MonkeyPatch)
 def test_messages_reach_the_subscription_untouched() -> None:
     client = Client()
     client.graph(CHATTER)
-    handle = client.subscribe()
     payload = memoryview(b"\x02\x00\x00\x00hi")
-    client.hub(requests.ReceivedMessage(handle, "/chatter", "std_msgs/String", payload, 9, latched=True))
-    (frame,) = client.frames
-    assert frame.header == struct.pack("<BIQ", 1, 7, 9)
-    assert frame.payload is payload
+    client.subscribe().message(payload)
+    _, (header, sent) = client.connection.sent[-1]
+    assert header == struct.pack("<BIQ", 1, 7, NOW_NS)
+    assert sent is payload
 
 
-def test_messages_of_an_ended_subscription_are_not_sent() -> None:
+def test_a_withdrawn_channel_and_the_client_end_a_subscription() -> None:
     client = Client()
     client.graph(CHATTER)
-    handle = client.subscribe()
+    asked = client.subscribe()
     client.send({"op": "unsubscribe", "subscriptionIds": [7]})
-    assert client.last(requests.Unsubscribe).handle == handle
-    client.hub(message(handle, "/chatter", b""))
-    assert not client.frames
-    assert client.subscribe() != handle
-
-
-def test_a_withdrawn_channel_ends_its_subscription() -> None:
-    client = Client()
-    client.graph(CHATTER)
-    handle = client.subscribe()
+    assert asked.closed
+    asked = client.subscribe()
     client.graph()
-    assert client.last(requests.Unsubscribe).handle == handle
+    assert asked.closed
     client.graph(CHATTER)
     client.subscribe(channel=2)
     assert not client.errors
@@ -168,7 +154,7 @@ def test_wrong_subscriptions_are_refused_and_the_right_ones_kept() -> None:
     pairs = [(7, 1), (7, 2), (8, 1), (9, 99), (10, 2)]
     client.send({"op": "subscribe", "subscriptions": [{"id": i, "channelId": c} for i, c in pairs]})
     assert len(client.errors) == 3
-    assert [each.topic for each in client.asked if isinstance(each, requests.Subscribe)] == ["/chatter", "/b"]
+    assert [each.topic for each in client.all("subscribe")] == ["/chatter", "/b"]
     client.send({"op": "unsubscribe", "subscriptionIds": [99, 7]})
     assert len(client.errors) == 4
 
@@ -185,8 +171,7 @@ def test_subscriptions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_failed_subscription_is_told_and_can_be_ended() -> None:
     client = Client()
     client.graph(CHATTER)
-    handle = client.subscribe()
-    client.hub(requests.Failed(handle, "md5 sums differ", "rebuild the talker"))
+    client.subscribe().failed(RmpaError("md5 sums differ; rebuild the talker"))
     assert client.errors == ["md5 sums differ; rebuild the talker"]
     client.send({"op": "unsubscribe", "subscriptionIds": [7]})
     assert len(client.errors) == 1
@@ -197,18 +182,19 @@ def test_a_failed_subscription_is_told_and_can_be_ended() -> None:
 
 def test_the_clock_is_sent_on_and_stamps_the_messages() -> None:
     client = Client(sim_time=True)
-    clock = client.last(requests.Subscribe)
+    clock = client.last("subscribe")
     assert clock.topic == "/clock"
     client.graph(CHATTER)
-    handle = client.subscribe()
-    client.hub(message(handle, "/chatter", b"", stamp=77))
-    client.hub(message(clock.handle, "/clock", struct.pack("<II", 3, 4)))
-    client.hub(message(clock.handle, "/clock", b"broken"))
-    client.hub(message(handle, "/chatter", b"", stamp=78))
-    first, time, second = (bytes(frame) for frame in client.frames)
-    assert first == struct.pack("<BIQ", 1, 7, 77)
-    assert time == struct.pack("<BQ", 2, 3_000_000_004)
-    assert second == struct.pack("<BIQ", 1, 7, 3_000_000_004)
+    asked = client.subscribe()
+    asked.message(b"")
+    clock.message(struct.pack("<II", 3, 4))
+    clock.message(b"broken")
+    asked.message(b"")
+    assert client.binary == [
+        struct.pack("<BIQ", 1, 7, NOW_NS),
+        struct.pack("<BQ", 2, 3_000_000_004),
+        struct.pack("<BIQ", 1, 7, 3_000_000_004),
+    ]
 
 
 # --- publishing ---
@@ -221,13 +207,12 @@ def advertise(number: int = 3, topic: str = "/cmd", encoding: str = "ros1", type
 
 def test_a_client_publishes() -> None:
     client = Client()
-    client.send(advertise(topic="cmd"))
-    handle = client.last(requests.AdvertiseTopic).handle
-    assert client.last(requests.AdvertiseTopic) == requests.AdvertiseTopic(handle, "/cmd", "std_msgs/String")
+    publisher = client.one("advertise", client.send(advertise(topic="cmd")))
+    assert (publisher.topic, publisher.type) == ("/cmd", "std_msgs/String")
     client.send(struct.pack("<BI", 1, 3) + b"\x02\x00\x00\x00hi")
-    assert client.last(requests.PublishMessage) == requests.PublishMessage(handle, memoryview(b"\x02\x00\x00\x00hi"))
+    assert publisher.published == [b"\x02\x00\x00\x00hi"]
     client.send({"op": "unadvertise", "channelIds": [3]})
-    assert client.last(requests.UnadvertiseTopic).handle == handle
+    assert publisher.closed
     client.send(struct.pack("<BI", 1, 3))
     assert "not advertised" in client.errors[0]
 
@@ -246,7 +231,7 @@ def test_a_topic_that_cannot_be_published_is_refused(wrong: Any) -> None:
     client = Client()
     client.send(wrong)
     assert len(client.errors) == 1
-    assert not any(isinstance(each, requests.AdvertiseTopic) for each in client.asked)
+    assert not client.all("advertise")
 
 
 def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
@@ -256,17 +241,20 @@ def test_published_topics_are_bounded_and_numbers_are_used_once() -> None:
     client.send(advertise(0))
     client.send(advertise(9999))
     assert len(client.errors) == 2
-    assert sum(isinstance(each, requests.AdvertiseTopic) for each in client.asked) == limits.FOXGLOVE_ADVERTISED_MAX
+    assert len(client.all("advertise")) == limits.FOXGLOVE_ADVERTISED_MAX
 
 
-def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each() -> None:
+def test_messages_of_a_failed_publisher_are_dropped_without_a_status_each(monkeypatch: pytest.MonkeyPatch) -> None:
     client = Client()
+
+    def refuse(*_: Any) -> None:
+        raise RmpaError("others publish it with another type")
+
+    monkeypatch.setattr(client.session, "advertise", refuse)
     client.send(advertise())
-    client.hub(requests.Failed(client.last(requests.AdvertiseTopic).handle, "its type is not known"))
     for _ in range(10):
         client.send(struct.pack("<BI", 1, 3))
-    assert client.errors == ["its type is not known"]
-    assert not any(isinstance(each, requests.PublishMessage) for each in client.asked)
+    assert client.errors == ["others publish it with another type"]
 
 
 # --- services ---
@@ -283,28 +271,21 @@ def test_a_service_is_offered_and_called() -> None:
     assert service["name"] == "/set_bool"
     assert service["request"]["schema"].strip().startswith("bool data")
     assert service["response"]["schemaName"] == "std_srvs/SetBoolResponse"
-    client.send(call(service["id"], 12))
-    asked = client.last(requests.CallService)
+    asked = client.one("call", client.send(call(service["id"], 12)))
     assert (asked.service, asked.type, asked.request) == ("/set_bool", "std_srvs/SetBool", b"\x01")
-    client.hub(requests.ServiceResult(asked.handle, ok=True, payload=b"\x01\x00\x00\x00\x00"))
-    assert bytes(client.frames[0]) == struct.pack("<BIII", 3, 1, 12, 4) + b"ros1\x01\x00\x00\x00\x00"
-    client.hub(requests.ServiceResult(asked.handle, ok=True))
-    assert len(client.frames) == 1
+    asked.done(b"\x01\x00\x00\x00\x00")
+    assert client.binary == [struct.pack("<BIII", 3, 1, 12, 4) + b"ros1\x01\x00\x00\x00\x00"]
 
 
 def test_calls_that_fail_say_why() -> None:
     client = Client()
     client.graph(SET_BOOL)
-    client.send(call(1, 1))
-    client.hub(requests.ServiceResult(client.last(requests.CallService).handle, ok=False, error="no motor"))
-    client.send(call(1, 2))
-    client.hub(requests.Failed(client.last(requests.CallService).handle, "timed out", "is it hanging?"))
+    client.one("call", client.send(call(1, 1))).failed(RmpaError("timed out; is it hanging?"))
     client.send(call(77, 3))
     client.send(call(1, 4, encoding=b"json"))
     failures = {each["callId"]: each["message"] for each in client.of("serviceCallFailure")}
-    assert failures.keys() == {1, 2, 3, 4}
-    assert failures[1] == "no motor"
-    assert failures[2] == "timed out; is it hanging?"
+    assert failures.keys() == {1, 3, 4}
+    assert failures[1] == "timed out; is it hanging?"
     assert "'json'" in failures[4]
 
 
@@ -319,50 +300,20 @@ def test_waiting_calls_are_bounded() -> None:
 
 def test_the_type_of_a_service_is_searched_where_the_graph_does_not_say_it() -> None:
     client = Client()
+    unknown = GraphService("/set_bool", "", ("/server",))
     for _ in range(2):
-        client.graph(GraphService("/set_bool", "", ("/server",)))
-    (asked,) = (each for each in client.asked if isinstance(each, requests.FindService))
-    client.hub(requests.ServiceFound(asked.handle, "std_srvs/SetBool"))
+        client.graph(unknown)
+    assert client.hub.graph.searched == ["/set_bool"]
+    assert not client.of("advertiseServices")
+    client.graph()
+    client.hub.graph.found["/set_bool"] = "std_srvs/SetBool"
+    client.graph(unknown)
     assert client.of("advertiseServices")[0]["services"][0]["type"] == "std_srvs/SetBool"
-    client.graph(GraphService("/set_bool", "", ("/server",)))
-    assert not client.of("unadvertiseServices")
     client.graph()
     assert client.of("unadvertiseServices") == [{"op": "unadvertiseServices", "serviceIds": [1]}]
 
 
-def test_a_service_without_a_type_that_is_found_is_not_offered() -> None:
-    client = Client()
-    client.graph(GraphService("/s", "", ("/server",)))
-    client.hub(requests.Failed(client.last(requests.FindService).handle, "does not answer"))
-    assert not client.of("advertiseServices")
-
-
-# --- parameters, graph, assets ---
-
-
-def test_parameters_are_read_followed_and_set() -> None:
-    client = Client()
-    client.send({"op": "getParameters", "parameterNames": [], "id": "r1"})
-    client.hub(requests.ParamsChanged(client.last(requests.GetParams).handle, {"/rate": 2.0}))
-    rate = {"name": "/rate", "type": "float64", "value": 2.0}
-    assert client.of("parameterValues") == [{"op": "parameterValues", "parameters": [rate], "id": "r1"}]
-    client.send({"op": "subscribeParameterUpdates", "parameterNames": ["/rate"]})
-    client.hub(requests.ParamsChanged(client.last(requests.FollowParams).handle, {"/rate": None}))
-    assert client.of("parameterValues")[-1]["parameters"] == [{"name": "/rate"}]
-    client.send({"op": "setParameters", "parameters": [{"name": "/rate", "value": 3, "type": "float64"}]})
-    assert client.last(requests.SetParam).value == 3.0
-    client.send({"op": "unsubscribeParameterUpdates", "parameterNames": []})
-    assert client.last(requests.UnfollowParams).handle == client.last(requests.FollowParams).handle
-    client.send({"op": "setParameters", "parameters": [{"name": "rate", "value": 3}], "id": "r2"})
-    assert "/base/rate" in client.errors[0]
-
-
-def test_a_parameter_that_cannot_be_set_is_told() -> None:
-    client = Client()
-    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}], "id": "r"})
-    client.hub(requests.Failed(client.last(requests.SetParam).handle, "the core refuses it"))
-    assert client.errors == ["the core refuses it"]
-    assert client.of("parameterValues")[0]["id"] == "r"
+# --- graph, assets ---
 
 
 def test_the_graph_comes_whole_and_then_by_its_changes() -> None:
@@ -425,157 +376,75 @@ def fetch(uri: str, number: int = 5) -> dict[str, Any]:
 
 def test_a_file_of_a_package_is_fetched() -> None:
     client = Client()
-    client.send(fetch("package://robot/meshes/base.stl"))
-    asked = client.last(requests.FetchAsset)
-    assert asked.uri == "package://robot/meshes/base.stl"
-    client.hub(requests.AssetFetched(asked.handle, b"solid"))
-    assert bytes(client.frames[0]) == struct.pack("<BIBI", 4, 5, 0, 0) + b"solid"
-    client.send(fetch("package://robot/none"))
-    client.hub(requests.Failed(client.last(requests.FetchAsset).handle, "no such file"))
-    assert bytes(client.frames[1]) == struct.pack("<BIBI", 4, 5, 1, 12) + b"no such file"
+    asked = client.one("fetch_asset", client.send(fetch("package://robot/meshes/base.stl")))
+    assert (asked.uri, asked.most) == ("package://robot/meshes/base.stl", limits.FOXGLOVE_ASSET_MAX)
+    asked.done(b"solid")
+    assert client.binary[0] == struct.pack("<BIBI", 4, 5, 0, 0) + b"solid"
+    client.one("fetch_asset", client.send(fetch("package://robot/none"))).failed(RmpaError("no such file"))
+    assert client.binary[1] == struct.pack("<BIBI", 4, 5, 1, 12) + b"no such file"
 
 
-@pytest.mark.parametrize(
-    "uri",
-    [
-        "file:///etc/passwd",
-        "http://127.0.0.1/x",
-        "/etc/passwd",
-        "package://",
-        "package://robot",
-        "package://robot/",
-        "package:///etc/passwd",
-        "package://robot/../../etc/passwd",
-        "package://../x",
-        "package://robot/%2e%2e/x",
-        "package://robot/..\\x",
-        "package://robot/a\x00b",
-        "package://robot//etc/passwd",
-    ],
-)
-def test_nothing_but_files_of_packages_is_fetched(uri: str) -> None:
-    client = Client()
-    client.send(fetch(uri))
-    assert not any(isinstance(each, requests.FetchAsset) for each in client.asked)
-    assert bytes(client.frames[0])[:6] == struct.pack("<BIB", 4, 5, 1)
-
-
-def test_assets_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_assets_are_bounded() -> None:
     client = Client()
     for number in range(limits.FOXGLOVE_ASSETS_MAX + 1):
         client.send(fetch("package://robot/x", number))
-    assert len(client.frames) == 1
-    monkeypatch.setattr(limits, "FOXGLOVE_ASSET_MAX", 3)
-    client.hub(requests.AssetFetched(client.last(requests.FetchAsset).handle, b"long"))
-    assert bytes(client.frames[1])[5] == 1
+    assert len(client.binary) == 1
 
 
 # --- rights, errors, the end ---
 
 
 @pytest.mark.parametrize(
-    "forbidden",
+    ("forbidden", "remedy"),
     [
-        advertise(),
-        struct.pack("<BI", 1, 3),
-        {"op": "getParameters", "parameterNames": []},
-        {"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]},
-        {"op": "subscribeParameterUpdates", "parameterNames": []},
-        fetch("package://robot/x"),
-        call(1, 1),
+        (advertise(), CONTROL_REMEDY),
+        (struct.pack("<BI", 1, 3), CONTROL_REMEDY),
+        ({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]}, CONTROL_REMEDY),
+        (call(1, 1), CONTROL_REMEDY),
     ],
     ids=str,
 )
-def test_a_client_without_the_right_is_refused_and_told(forbidden: Any) -> None:
-    client = Client(Rights())
-    client.graph(SET_BOOL)
-    before = list(client.asked)
-    client.send(forbidden)
-    assert client.asked == before
-    texts = [*client.errors, *(each["message"] for each in client.of("serviceCallFailure"))]
-    texts += [bytes(frame).decode("latin1") for frame in client.frames]
-    assert any(remedy in text for text in texts for remedy in (CONTROL_REMEDY, READ_REMEDY))
-
-
-def test_a_client_that_may_read_parameters_cannot_set_them() -> None:
+def test_a_client_without_the_right_is_refused_and_told(forbidden: Any, remedy: str) -> None:
     client = Client(Rights(view=True))
-    client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}]})
-    assert client.errors
-    assert not any(isinstance(each, requests.SetParam) for each in client.asked)
+    client.graph(SET_BOOL)
+    assert client.send(forbidden) == []
+    assert client.hub.params.changes == []
+    texts: list[str] = [*client.errors, *(each["message"] for each in client.of("serviceCallFailure"))]
+    (text,) = texts
+    assert text.endswith(remedy)
 
 
 def test_a_malformed_message_is_told_and_too_many_end_the_session() -> None:
     client = Client()
     client.send({"op": "nonsense"})
     assert "nonsense" in client.errors[0]
-    assert not client.closed
+    assert not client.connection.ended
     for _ in range(int(limits.FOXGLOVE_STATUS_BURST)):
         client.send(b"")
-    assert [each.code for each in client.closed] == [1008]
+    assert client.connection.ended == [1008]
 
 
 def test_what_a_client_may_not_do_is_refused_quietly_after_many_times_but_never_ends_the_session() -> None:
     client = Client(Rights())
     for _ in range(1000):
         client.send(struct.pack("<BI", 1, 3))
-    assert not client.closed
+    assert not client.connection.ended
     assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST
-    client.send(struct.pack("<BI", 1, 3), now=10.0)
+    client.now = 10.0
+    client.send(struct.pack("<BI", 1, 3))
     assert len(client.errors) == limits.FOXGLOVE_STATUS_BURST + 1
 
 
-def test_everything_is_released_when_the_client_is_gone() -> None:
-    client = Client(sim_time=True)
-    client.graph(CHATTER, SET_BOOL)
-    client.subscribe()
-    client.send(advertise())
-    client.send(call(1, 1))
-    client.send({"op": "subscribeParameterUpdates", "parameterNames": ["/a"]})
-    clock, graph = (
-        next(each.handle for each in client.asked if isinstance(each, kind))
-        for kind in (requests.Subscribe, requests.FollowGraph)
-    )
-    assert set(client.session.close()) == {
-        requests.Unsubscribe(client.last(requests.Subscribe).handle),
-        requests.Unsubscribe(clock),
-        requests.UnadvertiseTopic(client.last(requests.AdvertiseTopic).handle),
-        requests.CancelCall(client.last(requests.CallService).handle),
-        requests.UnfollowParams(client.last(requests.FollowParams).handle),
-        requests.UnfollowGraph(graph),
-    }
-
-
-def test_answers_that_come_too_late_are_ignored() -> None:
+def test_a_client_that_has_gone_is_told_no_more() -> None:
     client = Client()
-    late: list[requests.Answer] = [
-        message(99, "/x", b""),
-        requests.ParamsChanged(99, {"/a": 1}),
-        requests.ServiceResult(99, ok=True),
-        requests.ServiceFound(99, "std_srvs/Empty"),
-        requests.Described(99, "std_msgs/String", ""),
-        requests.AssetFetched(99, b""),
-        requests.Failed(99, "gone"),
-        requests.GraphChanged(99, (CHATTER,), ()),
-    ]
-    before = len(client.json), len(client.asked)
-    for answer in late:
-        client.hub(answer)
-    assert (len(client.json), len(client.asked)) == before
-    assert not client.frames
+    beside = Client(beside=client)
+    client.session.closing()
+    client.graph(CHATTER)
+    assert not client.of("advertise")
+    assert beside.of("advertise")
 
 
-def test_a_server_says_its_own_status() -> None:
+def test_a_server_says_its_own_warnings() -> None:
     client = Client()
-    client.do([client.session.status(protocol.StatusLevel.WARNING, "slow", "slow /scan")])
+    client.session.warn("slow", "slow /scan")
     assert client.json[-1] == {"op": "status", "level": 1, "message": "slow", "id": "slow /scan"}
-
-
-def test_handles_are_never_used_again() -> None:
-    client = Client()
-    client.graph(CHATTER, SET_BOOL)
-    for number in itertools.islice(itertools.count(), 5):
-        client.subscribe(1, number)
-        client.send({"op": "unsubscribe", "subscriptionIds": [number]})
-    opening = (requests.Subscribe, requests.FollowGraph, requests.DescribeType)
-    handles = [each.handle for each in client.asked if isinstance(each, opening)]
-    assert len(handles) == len(set(handles))

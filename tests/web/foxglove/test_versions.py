@@ -7,56 +7,62 @@ from typing import TYPE_CHECKING
 
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.hub import requests
-from tests.web.foxglove.client import CHATTER, Client, message
+from tests.web.foxglove.client import CHATTER, Client
 from tests.web.gateways.server import running_server
 from tests.web.hub.client import local_core, node
 
 if TYPE_CHECKING:
     from typing import Any
 
+OWN = MessageType("std_msgs/String").md5sum
+OTHER = MessageType("std_msgs/String", parse_definition("std_msgs/String", "int32 other"))
 
-def test_publishers_with_two_versions_of_a_type_are_two_channels_and_the_client_is_warned() -> None:
+
+def _client() -> Client:
+    """A client of a hub that has another version of the type, too."""
     client = Client()
+    client.hub.types.versions[OTHER.md5sum] = OTHER
     client.graph(CHATTER)
-    own, other = MessageType("std_msgs/String").md5sum, "5" * 32
-    handle = client.subscribe(1)
-    client.hub(message(handle, "/chatter", b"ours", md5sum=own))
-    client.hub(message(handle, "/chatter", b"other", md5sum=other))
-    client.hub(message(handle, "/chatter", b"ours again", md5sum=own))
-    client.hub(message(handle, "/chatter", b"other again", md5sum=other))
-    assert len(client.frames) == 2, "a message of the other version was sent on a channel with another schema"
+    return client
+
+
+def test_publishers_with_two_versions_of_a_type_are_two_channels_and_all_clients_are_warned() -> None:
+    client = _client()
+    beside = Client(beside=client)
+    asked = client.subscribe(1)
+    for md5sum in (OWN, OTHER.md5sum, OWN, OTHER.md5sum):
+        asked.message(b"x", md5sum=md5sum)
+    assert len(client.binary) == 2, "a message of the other version was sent on a channel with another schema"
     (second,) = client.of("advertise")[-1]["channels"]
     assert (second["topic"], second["schemaName"], second["id"]) == ("/chatter", "std_msgs/String", 2)
-    assert other in second["schema"]
+    assert "int32 other" in second["schema"]
+    assert beside.of("advertise")[-1]["channels"] == [second]
     (warned,) = client.of("status")
     assert warned["level"] == 1
-    assert own in warned["message"]
-    assert other in warned["message"]
+    assert OWN in warned["message"]
+    assert OTHER.md5sum in warned["message"]
+    assert [warned] == beside.of("status") == Client(beside=client).of("status")
     assert not client.of("unadvertise")
     further = client.subscribe(2, number=8)
-    client.hub(message(further, "/chatter", b"ours", md5sum=own))
-    client.hub(message(further, "/chatter", b"other", md5sum=other))
-    assert len(client.frames) == 3
+    further.message(b"ours", md5sum=OWN)
+    further.message(b"other", md5sum=OTHER.md5sum)
+    assert len(client.binary) == 3
     client.graph()
     assert sorted(client.of("unadvertise")[-1]["channelIds"]) == [1, 2]
     assert client.of("removeStatus")[-1]["statusIds"] == [warned["id"]]
 
 
 def test_a_channel_whose_version_no_publisher_has_is_replaced() -> None:
-    client = Client()
-    client.graph(CHATTER)
-    other = "5" * 32
-    handle = client.subscribe(1)
-    client.hub(message(handle, "/chatter", b"other", md5sum=other))
+    client = _client()
+    asked = client.subscribe(1)
+    asked.message(b"other", md5sum=OTHER.md5sum)
     assert client.of("unadvertise")[-1]["channelIds"] == [1]
-    assert client.last(requests.Unsubscribe).handle == handle
+    assert asked.closed
     (second,) = client.of("advertise")[-1]["channels"]
-    assert other in second["schema"]
+    assert "int32 other" in second["schema"]
     assert not client.of("status")
-    further = client.subscribe(second["id"])
-    client.hub(message(further, "/chatter", b"other", md5sum=other))
-    assert len(client.frames) == 1
+    client.subscribe(second["id"]).message(b"other", md5sum=OTHER.md5sum)
+    assert len(client.binary) == 1
     client.graph(CHATTER)
     assert client.of("unadvertise")[-1]["channelIds"] == [1], "the channel of the version was withdrawn again"
 

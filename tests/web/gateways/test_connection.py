@@ -5,32 +5,23 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from rmpa.web.gateways.connection import ClientConnection, OutFrame
+from rmpa.web.gateways.connection import Session
 from rmpa.web.gateways.frame_writer import FrameWriter
-from rmpa.web.hub.node_link import READ_ONLY, HubClient
+from rmpa.web.hub.node_link import READ_ONLY
 from tests.ros.node.peers import DEADLINE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     import pytest
 
-    from rmpa.web.hub.requests import Answer, ReceivedMessage
 
-
-class Silent(ClientConnection):
+class Silent(Session):
     """A protocol without messages."""
 
     def opened(self) -> None: ...
 
-    def received_frame(self, data: str | bytes) -> None: ...
+    def received_frame(self, data: str | bytes, now: float) -> None: ...
 
-    def answered(self, answer: Answer) -> None: ...
-
-    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
-        return ()
-
-    def show_drops(self, dropped: dict[str, int]) -> None: ...
+    def warn(self, text: str, subject: str) -> None: ...
 
 
 class Transport:
@@ -65,11 +56,10 @@ async def forever() -> None:
 
 async def watched(transport: Transport) -> None:
     hub: Any = None
-    connection = Silent(hub, READ_ONLY, lambda _: 0, "here")
+    connection = Silent(hub, READ_ONLY, lambda _: 0, "here").connection
     played: Any = transport
     connection._transport = played
     connection._out = FrameWriter(played, forever)
-    connection._client = HubClient(1, "test", READ_ONLY, lambda _: None)
     await asyncio.wait_for(connection._watch(), DEADLINE)
 
 

@@ -19,7 +19,7 @@ from rmpa.web.hub.node_link import FULL, READ_ONLY
 from rmpa.web.server.process import CertificateFiles, tls_context
 from tests.ros.node.peers import DEADLINE, LATCHED, STRING, until
 from tests.web.gateways.server import Client, Server, running_server
-from tests.web.hub.client import node
+from tests.web.hub.client import node, subscribed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -116,9 +116,8 @@ async def test_a_message_is_converted_once_for_all_clients(core: RosCore, monkey
         async with server.client() as one, server.client() as two:
             for client in (one, two):
                 await client.send("subscribe", topic="/t", type="std_msgs/String")
-            await until(lambda: len(server.hub.topics.names) and len(server.hub.clients) == 2)
             await publisher.wait_for_subscriber()
-            await until(lambda: all(each.subscriptions for each in server.hub.clients))
+            await subscribed(server.hub, 2)
             publisher.publish_raw(ONE)
             for client in (one, two):
                 assert (await client.next("publish"))["msg"] == {"data": "one"}
@@ -202,7 +201,7 @@ async def test_large_messages_arrive_whole_by_tls_at_a_client_that_reads_late(co
         channel = await channel_of(client, "/map")
         await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
         await publisher.wait_for_subscriber()
-        await until(lambda: all(each.subscriptions for each in server.hub.clients))
+        await subscribed(server.hub, len(server.hub.clients))
         client.socket._reader._protocol.pause_reading()
         (connection,) = server.gateways.connections
         before = connection.sent
@@ -224,7 +223,7 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             for client in (stuck, reader):
                 channel = await channel_of(client, "/image")
                 await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
-            await until(lambda: all(each.subscriptions for each in server.hub.clients))
+            await subscribed(server.hub, len(server.hub.clients))
             await publisher.wait_for_subscriber()
             stuck.socket._reader._protocol.pause_reading()
             for _ in range(45):
@@ -243,7 +242,7 @@ async def _under_way(server: Server, publisher: Publisher, client: Client, paylo
     """Have the client subscribe, stop reading, and be sent a message that the kernel does not take whole."""
     channel = await channel_of(client, "/map")
     await client.send("subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
-    await until(lambda: all(each.subscriptions for each in server.hub.clients))
+    await subscribed(server.hub, len(server.hub.clients))
     await publisher.wait_for_subscriber()
     client.socket._reader._protocol.pause_reading()
     publisher.publish_raw(payload)

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
-from rmpa.web.hub.hub import Hub
+from rmpa.web.hub.hub import Hub, HubClient
 from rmpa.web.hub.node_link import EVERYTHING, FULL, Rights
-from rmpa.web.hub.requests import Answer, Failed, GraphChanged, ReceivedMessage
 from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Coroutine
 
+    from rmpa.core.errors import RmpaError
     from rmpa.web.hub.node_link import NodeRules
-    from rmpa.web.hub.requests import HubRequest
+    from rmpa.web.hub.topics import ClientPublication, ReceivedMessage
 
-_A = TypeVar("_A", bound=Answer)
 _names = itertools.count(1)
 
 
@@ -56,43 +55,47 @@ async def running_hub(core: RosCore, rules: NodeRules = EVERYTHING) -> AsyncIter
         yield hub
 
 
-class FakeClient:
-    """One client of a hub."""
+async def subscribed(hub: Hub, count: int) -> None:
+    """Wait until the hub's clients have so many subscriptions."""
+    await until(lambda: sum(len(each.subscriptions) for each in hub.topics._topics.values()) >= count)
 
-    def __init__(self, hub: Hub, rights: Rights = FULL) -> None:
-        self.hub = hub
-        self.answers: list[Answer] = []
-        self.client = hub.connect("test", rights, self.answers.append)
-        self._handles = itertools.count(1)
 
-    def handle(self) -> int:
-        return next(self._handles)
+class Heard:
+    """A subscription of a client, and what came of it."""
 
-    def ask(self, request: HubRequest) -> None:
-        self.hub.ask(self.client, request)
+    def __init__(self, client: HubClient, topic: str, type_: str | None = None) -> None:
+        self.messages: list[ReceivedMessage] = []
+        self.errors: list[RmpaError] = []
+        self.others: list[str] = []
+        take, fail = self.messages.append, self.errors.append
+        self.subscription = client.subscribe(topic, type_, take, fail, self.others.append)
+
+    @property
+    def payloads(self) -> list[bytes]:
+        return [bytes(message.payload) for message in self.messages]
 
     def close(self) -> None:
-        self.hub.disconnect(self.client)
+        self.subscription.close()
 
-    def of(self, kind: type[_A], handle: int | None = None) -> list[_A]:
-        """All answers of a kind."""
-        return [a for a in self.answers if isinstance(a, kind) and (handle is None or a.handle == handle)]
 
-    def payloads(self, handle: int) -> list[bytes]:
-        """What a subscription has received."""
-        return [bytes(message.payload) for message in self.of(ReceivedMessage, handle)]
+class FakeClient(HubClient):
+    """One client of a hub, without a protocol."""
 
-    async def answer(self, kind: type[_A], handle: int) -> _A:
-        """Wait for the answer to a request."""
-        await until(lambda: self.of(kind, handle) or self.of(Failed, handle))
-        found = self.of(kind, handle)
-        assert found, self.of(Failed, handle)
-        return found[-1]
+    def __init__(self, hub: Hub, rights: Rights = FULL) -> None:
+        super().__init__(hub, "test", rights)
+        self.errors: list[RmpaError] = []
+        self.results: list[Any] = []
+        hub.connect(self)
 
-    async def failure(self, handle: int) -> Failed:
-        """Wait for the failure of a request."""
-        await until(lambda: self.of(Failed, handle))
-        return self.of(Failed, handle)[-1]
+    def hear(self, topic: str, type_: str | None = None) -> Heard:
+        return Heard(self, topic, type_)
 
-    def graph(self) -> GraphChanged:
-        return self.of(GraphChanged)[-1]
+    def talk(self, topic: str, type_: str = "std_msgs/String", *, latch: bool = False) -> ClientPublication:
+        return self.advertise(topic, type_, self.errors.append, latch=latch)
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Do something whose result comes later."""
+        self.run(work, self.results.append, self.errors.append)
+
+    def close(self) -> None:
+        self.hub.disconnect(self)

@@ -37,7 +37,7 @@ def _table(forgotten: list[str] | None = None) -> GraphTable:
         if forgotten is not None:
             forgotten.extend(names)
 
-    return GraphTable(lambda name: (f"pkg/{name[1:2].upper()}", f"rosrpc://{name}"), forget)
+    return GraphTable({name: (f"pkg/{name[1].upper()}", f"rosrpc://{name}") for name in _NAMES}, forget)
 
 
 def _read(tables: Registrations) -> GraphTable:

@@ -5,19 +5,19 @@ from typing import Any
 import pytest
 
 from rmpa.web.hub.node_link import NodeLink
-from rmpa.web.hub.publishers import ParamMirror
+from rmpa.web.hub.params import ParamMirror
 
 
 @pytest.fixture
 def mirror() -> ParamMirror:
-    made = ParamMirror(NodeLink(None, None, None))  # type: ignore[arg-type]
+    made = ParamMirror(NodeLink(None, None))  # type: ignore[arg-type]
     made.updated("/", {"a": {"x": 1, "y": [1, 2]}, "b": "text"})
     return made
 
 
 def followed(mirror: ParamMirror, *names: str) -> list[Any]:
     told: list[Any] = []
-    mirror.follow((1, len(names)), names, lambda values: told.append(dict(values)))
+    mirror.follow(names, lambda values: told.append(dict(values)))
     return told
 
 
@@ -52,13 +52,6 @@ def test_a_follower_of_a_name_is_told_what_is_there_now(mirror: ParamMirror) -> 
     assert (len(namespace), len(leaf)) == (1, 1)
     mirror.updated("/a", {})
     assert (namespace[-1], leaf[-1]) == ({"/a": None}, {"/a/x": None})
-
-
-def test_a_client_that_has_gone_is_told_nothing(mirror: ParamMirror) -> None:
-    told = followed(mirror)
-    mirror.forget_client(1)
-    mirror.updated("/b", "other")
-    assert told == []
 
 
 def test_values_by_name_and_by_prefix(mirror: ParamMirror) -> None:

@@ -29,8 +29,8 @@ from rmpa.core.contract import ContractRule, Contracts
 from rmpa.observe.peer_info import LaneInfo, PeerAgent
 from rmpa.observe.snapshot import Snapshot
 from rmpa.observe.why.services import diagnose_module
-from rmpa.web.hub import requests
 from rmpa.web.hub.node_link import FULL
+from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.resources import ResourceFacts
@@ -415,7 +415,7 @@ class _Client:
         self._log = False
         self.session = monitor.MonitorSession(server._details, self._decode, server.rights, time.monotonic())
 
-    def _decode(self, message: requests.ReceivedMessage) -> Any:
+    def _decode(self, message: ReceivedMessage) -> Any:
         topic = message.topic
         if "scan" in topic:
             ranges = [_room(number * math.pi / 180) for number in range(360)]
@@ -446,8 +446,8 @@ class _Client:
                     if "image" in topic
                     else "nav_msgs/Odometry"
                 )
-                received = requests.ReceivedMessage(handle, topic, kind, memoryview(b"\0" * 712), time.time_ns())
-                await self.act(self.session.receive_message(received, now))
+                received = ReceivedMessage(topic, kind, memoryview(b"\0" * 712), time.time_ns())
+                await self.act(self.session.receive_message(handle, received, now))
             if self._log and tick % 10 == 0:
                 line = {"n": tick, "at": time.time(), "level": "INFO", "node": self._server.logger}
                 await self.act(self.session.log([line | {"text": f"turn {tick}"}]))
@@ -461,10 +461,10 @@ class _Client:
                     await (
                         self._socket.send_str(output) if isinstance(output, str) else self._socket.send_bytes(output)
                     )
-            elif isinstance(output, requests.Subscribe):
-                self._watched[output.handle] = output.topic
-            elif isinstance(output, requests.Unsubscribe):
-                self._watched.pop(output.handle, None)
+            elif isinstance(output, monitor.Subscribe):
+                self._watched[output.id] = output.topic
+            elif isinstance(output, monitor.Unsubscribe):
+                self._watched.pop(output.id, None)
             elif isinstance(output, monitor.Question):
                 try:
                     await self.act(self.session.answer(output.id, self._server.answer(output)))

@@ -10,8 +10,8 @@ import pytest
 
 from rmpa.web import limits
 from rmpa.web.hub.node_link import FULL, Rights
-from rmpa.web.hub.requests import ReceivedMessage, Subscribe, Unsubscribe
-from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed
+from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.monitor.session import FollowLog, MonitorClose, MonitorSession, Question, Speed, Subscribe, Unsubscribe
 from tests.web.monitor.patches import apply
 
 if TYPE_CHECKING:
@@ -97,8 +97,8 @@ class Page:
         return self.take(self.session.handle_timer(self.now))
 
     def message(self, handle: int, value: int, topic: str = "/odom") -> list[Any]:
-        received = ReceivedMessage(handle, topic, "a/B", memoryview(bytes([value])), int(self.now * 1e9))
-        return self.take(self.session.receive_message(received, self.now))
+        received = ReceivedMessage(topic, "a/B", memoryview(bytes([value])), int(self.now * 1e9))
+        return self.take(self.session.receive_message(handle, received, self.now))
 
 
 def test_a_page_has_the_state_and_then_its_changes() -> None:

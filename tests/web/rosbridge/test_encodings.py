@@ -17,8 +17,18 @@ from rmpa.core.errors import LimitExceeded
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
+from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.rosbridge import protocol as encodings
-from rmpa.web.rosbridge.protocol import Compression, OpError, PublishFrames, decode_png, encode_cbor_raw, encode_png
+from rmpa.web.rosbridge.protocol import (
+    Compression,
+    OpError,
+    PublishFrames,
+    data_of,
+    decode_png,
+    encode_cbor_raw,
+    encode_png,
+    size_of,
+)
 
 pillow = pytest.importorskip("PIL.Image", reason="pillow, which checks pictures, comes with the extra lab")
 STRING = codec_for(MessageType("std_msgs/String"))
@@ -32,27 +42,30 @@ def _pixels(text: str) -> bytes:
         return np.asarray(picture).tobytes()
 
 
-def test_json_bytes() -> None:
-    frame = PublishFrames().encode("/chat", HELLO, Compression.NONE, STRING)
-    assert frame.data == b'{"op":"publish","topic":"/chat","msg":{"data":"hello"}}'
-    assert not frame.binary
-
-
-def test_cbor_bytes() -> None:
-    frame = PublishFrames().encode("/c", HELLO, Compression.CBOR, STRING)
-    assert frame.binary
-    assert bytes(frame.data) == bytes.fromhex(
-        "a3"  # a map of 3
-        "626f70 677075626c697368"  # op: publish
-        "65746f706963 622f63"  # topic: /c
-        "636d7367 a1 6464617461 6568656c6c6f"  # msg: {data: hello}
-    )
+@pytest.mark.parametrize(
+    ("compression", "data"),
+    [
+        (Compression.NONE, b'{"op":"publish","topic":"/c","msg":{"data":"hello"}}'),
+        (
+            Compression.CBOR,
+            bytes.fromhex(
+                "a3"  # a map of 3
+                "626f70 677075626c697368"  # op: publish
+                "65746f706963 622f63"  # topic: /c
+                "636d7367 a1 6464617461 6568656c6c6f"  # msg: {data: hello}
+            ),
+        ),
+    ],
+)
+def test_golden_bytes(compression: Compression, data: bytes) -> None:
+    frame = PublishFrames().encode("/c", HELLO, compression, STRING)
+    assert (frame[0] is Opcode.BINARY, data_of(frame)) == (compression is Compression.CBOR, data)
 
 
 def test_cbor_raw_bytes() -> None:
     frame = encode_cbor_raw("/c", HELLO, 1_700_000_000_000_000_005)
-    assert frame.binary
-    assert bytes(frame.data) == bytes.fromhex(
+    assert frame[0] is Opcode.BINARY
+    assert bytes(data_of(frame)) == bytes.fromhex(
         "a3 626f70 677075626c697368 65746f706963 622f63 636d7367"
         "a3 6473656373 1a6553f100 656e73656373 05 656279746573 49 0500000068656c6c6f"
     )
@@ -62,9 +75,9 @@ def test_cbor_raw_bytes() -> None:
 def test_cbor_raw_of_any_size_is_read_by_another_decoder_and_is_not_copied(size: int) -> None:
     payload = memoryview(bytes(size))
     frame = encode_cbor_raw("/c", payload, 3_000_000_009)
-    assert frame.parts[-1] is payload
+    assert frame[1][-1] is payload
     want = {"op": "publish", "topic": "/c", "msg": {"secs": 3, "nsecs": 9, "bytes": bytes(size)}}
-    assert cbor2.loads(bytes(frame.data)) == want
+    assert cbor2.loads(bytes(data_of(frame))) == want
 
 
 def test_each_message_is_encoded_once_for_all_clients(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +96,7 @@ def test_shared_messages_are_bounded() -> None:
     for _ in range(6):
         payload = memoryview(big.write({"data": bytes(size)}, 0).payload)
         frames.encode("/a", payload, Compression.CBOR, big)
-    assert sum(frame.size + len(payload) for payload, frame in frames._kept.values()) <= limits.SHARED_BYTES
+    assert sum(size_of(frame) + len(payload) for payload, frame in frames._kept.values()) <= limits.SHARED_BYTES
     for number in range(limits.SHARED_FRAMES * 2):
         frames.encode(f"/{number}", HELLO, Compression.NONE, STRING)
     assert len(frames._kept) <= limits.SHARED_FRAMES
@@ -92,7 +105,7 @@ def test_shared_messages_are_bounded() -> None:
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 4, 11, 12, 13, 100, 4099])
 def test_a_png_is_read_by_another_decoder(size: int) -> None:
     text = json.dumps({"op": "x", "data": "é" * size})
-    (part,) = encode_png(text.encode()).parts
+    _, (part,) = encode_png(text.encode())
     op = msgspec.json.decode(part)
     assert op["op"] == "png"
     pixels = _pixels(op["data"])

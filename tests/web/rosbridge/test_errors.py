@@ -8,18 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.core.errors import RmpaError
 from rmpa.web import limits
-from rmpa.web.hub.requests import (
-    CallService,
-    Failed,
-    FindService,
-    OtherType,
-    ServeService,
-    ServiceResult,
-    Subscribe,
-    Unsubscribe,
-)
-from tests.web.rosbridge.hub import Client
+from tests.web.rosbridge.client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,34 +29,33 @@ def _client() -> Client:
 
 
 def _failed(client: Client) -> None:
-    call = client.one(FindService, client.send("call_service", id="i", service="/none"))
-    client.answer(Failed(call.handle, "no server of the service answers"))
+    (find,) = client.send("call_service", id="i", service="/none")
+    find.failed(RmpaError("no server of the service answers"))
 
 
 def _raised(client: Client) -> None:
-    call = client.one(CallService, client.send("call_service", id="i", service="/add", args=[1, 2]))
-    client.answer(ServiceResult(call.handle, ok=False, error="the server raised"))
+    (call,) = client.send("call_service", id="i", service="/add", args=[1, 2])
+    call.failed(RmpaError("the server raised"))
 
 
 def _never_there(client: Client) -> None:
-    for topic in ("/none", "/soon", "/published"):
-        client.send("subscribe", id="i", topic=topic)
+    none, *others = (client.subscribe(topic, id="i") for topic in ("/none", "/soon", "/published"))
     client.graph.add_topic("/soon", "std_msgs/String")
-    client.graph.published["/published"] = "std_msgs/String"
+    client.hub.published["/published"] = "std_msgs/String"
     client.advance(limits.TYPE_WAIT - 0.01)
     assert client.received() == []
     client.advance(0.01)
-    assert [type(each) for each in client.session.requests_to_send()] == [Unsubscribe]
+    assert none.closed
+    assert not any(each.closed for each in others)
 
 
 def _other_type_later(client: Client) -> None:
-    made = client.one(Subscribe, client.send("subscribe", id="i", topic="/later", type="std_msgs/Int32"))
-    client.answer(OtherType(made.handle, "/later", "std_msgs/String"))
+    client.subscribe("/later", id="i", type="std_msgs/Int32").differs("std_msgs/String")
 
 
 def _offered_elsewhere(client: Client) -> None:
-    made = client.one(ServeService, client.send("advertise_service", id="i", service="/s", type=ADD))
-    client.answer(Failed(made.handle, "another client offers /s now"))
+    (made,) = client.send("advertise_service", id="i", service="/s", type=ADD)
+    made.failed(RmpaError("another client offers /s now"))
 
 
 ERRORS: dict[tuple[str, str], tuple[_Case, ...] | Callable[[Client], None]] = {

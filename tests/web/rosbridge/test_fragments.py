@@ -9,40 +9,39 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.web import limits
-from rmpa.web.rosbridge.protocol import OpError, RosbridgeFrame
-from rmpa.web.rosbridge.subscriptions import Assembler, split
+from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.rosbridge.delivery import Assembler, split
+from rmpa.web.rosbridge.protocol import OpError
 
 if TYPE_CHECKING:
     import random
 
+    from rmpa.web.gateways.frame_writer import OutFrame
 
-def _decoded(frames: list[RosbridgeFrame]) -> list[dict[str, Any]]:
-    return [msgspec.json.decode(frame.data) for frame in frames]
+
+def _text(*parts: bytes) -> OutFrame:
+    return Opcode.TEXT, parts
 
 
 def test_fragments_in_bytes() -> None:
-    first, second = split(RosbridgeFrame((b'{"op":', b'"x"}'), handle=3), 6, "i")
-    assert bytes(first.data) == b'{"op":"fragment","id":"i","data":"{\\"op\\":","num":0,"total":2}'
-    assert bytes(second.data) == b'{"op":"fragment","id":"i","data":"\\"x\\"}","num":1,"total":2}'
-    assert first.handle == second.handle == 3
+    (_, first), (_, second) = split(_text(b'{"op":', b'"x"}'), 6, "i")
+    assert first == (b'{"op":"fragment","id":"i","data":"{\\"op\\":","num":0,"total":2}',)
+    assert second == (b'{"op":"fragment","id":"i","data":"\\"x\\"}","num":1,"total":2}',)
 
 
 def test_what_fits_and_what_is_binary_stays_whole() -> None:
-    whole = RosbridgeFrame((b"12345",))
-    assert split(whole, 5, 1) == [whole]
-    binary = RosbridgeFrame((b"12345",), binary=True)
-    assert split(binary, 1, 1) == [binary]
-    characters = RosbridgeFrame(("ééé".encode(),))
-    assert split(characters, 3, 1) == [characters]
+    binary = Opcode.BINARY, (b"12345",)
+    for frame, size in ((_text(b"12345"), 5), (binary, 1), (_text("ééé".encode()), 3)):
+        assert split(frame, size, 1) == [frame]
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"]), min_size=1), st.integers(1, 20), st.randoms())
 def test_fragments_come_together_in_any_order(text: str, size: int, rng: random.Random) -> None:
-    frames = split(RosbridgeFrame((text.encode(),)), size, 7)
+    frames = split(_text(text.encode()), size, 7)
     if len(frames) == 1:
         return
     assembler = Assembler()
-    ops = _decoded(frames)
+    ops: list[Any] = [msgspec.json.decode(part) for _, (part,) in frames]
     assert all(len(op["data"]) <= size for op in ops)
     rng.shuffle(ops)
     ops.insert(1, ops[0])  # a repeated one
@@ -54,7 +53,7 @@ def test_fragments_come_together_in_any_order(text: str, size: int, rng: random.
 
 def test_more_fragments_than_allowed_are_not_made() -> None:
     with pytest.raises(OpError, match="ask for a fragment_size of 2 or more"):
-        split(RosbridgeFrame((b"x" * (limits.FRAGMENTS_MAX + 1),)), 1, 1)
+        split(_text(b"x" * (limits.FRAGMENTS_MAX + 1)), 1, 1)
 
 
 @pytest.mark.parametrize(("num", "total"), [(-1, 2), (2, 2), (0, 0), (0, -1)])

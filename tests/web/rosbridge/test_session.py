@@ -5,18 +5,13 @@ import json
 import cbor2
 import pytest
 
+from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
-from rmpa.web.hub.requests import (
-    AdvertiseTopic,
-    Failed,
-    PublishMessage,
-    ReceivedMessage,
-    Subscribe,
-    UnadvertiseTopic,
-    Unsubscribe,
-)
-from rmpa.web.rosbridge.protocol import OPS, PublishFrames, decode_png
-from tests.web.rosbridge.hub import NOW_NS, Client
+from rmpa.web.gateways.frame_writer import Opcode
+from rmpa.web.rosbridge.protocol import PublishFrames, decode_png
+from rmpa.web.rosbridge.session import OPS
+from tests.web.recorder import NOW_NS
+from tests.web.rosbridge.client import Client
 
 STRING = "std_msgs/String"
 HELLO = b"\x05\0\0\0hello"
@@ -27,29 +22,26 @@ HELLO = b"\x05\0\0\0hello"
 
 def test_a_subscriber_gets_messages_in_json() -> None:
     client = Client()
-    request = client.one(Subscribe, client.send("subscribe", topic="/t", type=STRING))
-    assert (request.topic, request.type) == ("/t", STRING)
-    client.publish(request.handle, STRING, {"data": "hello"})
-    (frame,) = client.frames()
-    assert frame.data == b'{"op":"publish","topic":"/t","msg":{"data":"hello"}}'
-    assert (frame.binary, frame.handle) == (False, request.handle)
+    asked = client.subscribe(type=STRING)
+    assert (asked.topic, asked.type) == ("/t", STRING)
+    client.publish(asked, STRING, {"data": "hello"})
+    ((opcode, parts),) = client.frames()
+    assert (opcode, b"".join(parts)) == (Opcode.TEXT, b'{"op":"publish","topic":"/t","msg":{"data":"hello"}}')
 
 
 def test_the_topic_is_called_as_the_client_wrote_it() -> None:
     client = Client()
-    request = client.one(Subscribe, client.send("subscribe", topic="t", type="std_msgs/msg/String"))
-    assert (request.topic, request.type) == ("/t", STRING)
-    client.publish(request.handle, STRING, {"data": "hello"})
+    asked = client.subscribe("t", type="std_msgs/msg/String")
+    assert (asked.topic, asked.type) == ("/t", STRING)
+    client.publish(asked, STRING, {"data": "hello"})
     assert client.received()[0]["topic"] == "t"
 
 
 def test_each_compression() -> None:
     client = Client()
     for compression in ("none", "png", "cbor", "cbor-raw"):
-        request = client.one(
-            Subscribe, client.send("subscribe", topic=f"/{compression[-3:]}", compression=compression)
-        )
-        client.publish(request.handle, STRING, {"data": "hello"})
+        asked = client.subscribe(f"/{compression[-3:]}", compression=compression)
+        client.publish(asked, STRING, {"data": "hello"})
     none, png, cbor, raw = client.received()
     assert none == {"op": "publish", "topic": "/one", "msg": {"data": "hello"}}
     assert json.loads(decode_png(png["data"])) == {"op": "publish", "topic": "/png", "msg": {"data": "hello"}}
@@ -60,43 +52,42 @@ def test_each_compression() -> None:
 
 def test_cbor_raw_needs_no_definition() -> None:
     client = Client()
-    request = client.one(Subscribe, client.send("subscribe", topic="/t", type="x/Y", compression="cbor-raw"))
-    client.answer(ReceivedMessage(request.handle, "/t", "x/Y", memoryview(b"abc"), 0))
+    client.subscribe(type="x/Y", compression="cbor-raw").message(b"abc", "x/Y")
     assert client.received()[0]["msg"]["bytes"] == b"abc"
 
 
 def test_several_subscriptions_are_one_with_the_best_of_all() -> None:
     client = Client()
-    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", throttle_rate=1000)).handle
+    asked = client.subscribe(id="a", throttle_rate=1000)
     assert not client.send("subscribe", id="b", topic="/t", throttle_rate=100, compression="cbor")
     assert not client.send("subscribe", id="c", topic="/t", throttle_rate=500, compression="png")
     for _ in range(10):
-        client.publish(handle, STRING, {"data": "hello"})
+        client.publish(asked, STRING, {"data": "hello"})
         client.now += 0.05
     frames = client.frames()
     assert len(frames) == 5
-    assert all(frame.binary for frame in frames)
-    assert not client.send("unsubscribe", id="b", topic="/t")
+    assert all(opcode is Opcode.BINARY for opcode, _ in frames)
+    client.send("unsubscribe", id="b", topic="/t")
     client.now += 0.5
-    client.publish(handle, STRING, {"data": "hello"})
+    client.publish(asked, STRING, {"data": "hello"})
     assert client.received()[0]["op"] == "png"
-    assert not client.send("unsubscribe", id="a", topic="/t")
-    assert client.send("unsubscribe", id="c", topic="/t") == [Unsubscribe(handle)]
-    client.publish(handle, STRING, {"data": "late"})
-    assert not client.received()
+    client.send("unsubscribe", id="a", topic="/t")
+    assert not asked.closed
+    client.send("unsubscribe", id="c", topic="/t")
+    assert asked.closed
 
 
 def test_unsubscribe_without_an_id_ends_all() -> None:
     client = Client()
-    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t")).handle
+    asked = client.subscribe(id="a")
     client.send("subscribe", id="b", topic="/t")
-    assert client.send("unsubscribe", topic="/t") == [Unsubscribe(handle)]
+    client.send("unsubscribe", topic="/t")
+    assert asked.closed
 
 
 def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
     client = Client()
-    op = {"topic": "/t", "type": STRING, "throttle_rate": 1000, "queue_length": 2}
-    handle = client.one(Subscribe, client.send("subscribe", **op)).handle
+    handle = client.subscribe(type=STRING, throttle_rate=1000, queue_length=2)
     for number in range(5):
         client.publish(handle, STRING, {"data": str(number)})
     assert [each["msg"]["data"] for each in client.received()] == ["0"]
@@ -110,9 +101,7 @@ def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
 
 def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> None:
     client = Client()
-    handle = client.one(
-        Subscribe, client.send("subscribe", id="a", topic="/t", type=STRING, throttle_rate=1000, queue_length=1)
-    ).handle
+    handle = client.subscribe(id="a", type=STRING, throttle_rate=1000, queue_length=1)
     client.send("subscribe", id="b", topic="/t", throttle_rate=1000, queue_length=3)
     for number in range(5):
         client.publish(handle, STRING, {"data": str(number)})
@@ -121,13 +110,13 @@ def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> Non
     client.publish(handle, STRING, {"data": "5"})
     client.publish(handle, STRING, {"data": "6"})
     client.send("unsubscribe", topic="/t")
-    assert client.session._subscriptions._queued.used == 0
+    assert client.session.queued.used == 0
     assert client.session.next_timer() is None
 
 
 def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
     client = Client()
-    handle = client.one(Subscribe, client.send("subscribe", id="a", topic="/t", fragment_size=50)).handle
+    handle = client.subscribe(id="a", fragment_size=50)
     client.send("subscribe", id="b", topic="/t", fragment_size=30)
     client.publish(handle, STRING, {"data": "x" * 100})
     client.publish(handle, STRING, {"data": "y" * 100})
@@ -144,17 +133,17 @@ def test_clients_of_one_topic_share_the_encoded_message() -> None:
     clients = [Client(frames) for _ in range(2)]
     payload = memoryview(HELLO)
     for client in clients:
-        handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
-        client.answer(ReceivedMessage(handle, "/t", STRING, payload, 0))
+        handle = client.subscribe()
+        handle.message(payload)
     (first,), (second,) = (client.frames() for client in clients)
-    assert first.parts is second.parts
+    assert first is second
 
 
 def test_a_broken_message_is_reported_once() -> None:
     client = Client()
-    handle = client.one(Subscribe, client.send("subscribe", topic="/t")).handle
+    handle = client.subscribe()
     for _ in range(3):
-        client.answer(ReceivedMessage(handle, "/t", STRING, memoryview(b"\xff\xff\xff\xff"), 0))
+        handle.message(b"\xff\xff\xff\xff")
     assert "message of /t: 4 bytes are not a std_msgs/String" in client.error()
     client.publish(handle, STRING, {"data": "ok"})
     assert client.received()[0]["msg"] == {"data": "ok"}
@@ -172,12 +161,12 @@ def test_another_type_than_the_topic_has_is_refused() -> None:
 
 def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -> None:
     client = Client()
-    handle = client.one(Subscribe, client.send("subscribe", id="i", topic="/t")).handle
-    client.answer(Failed(handle, "not allowed", "ask for the role operator"))
+    handle = client.subscribe(id="i")
+    handle.failed(PeerRefused("the core", "not allowed", "ask for the role operator"))
     (status,) = client.received()
     assert status["id"] == "i"
-    assert status["msg"] == "subscribe /t: not allowed; ask for the role operator"
-    assert client.one(Subscribe, client.send("subscribe", topic="/t")).handle != handle
+    assert status["msg"] == "subscribe /t: the core refused: not allowed; ask for the role operator"
+    assert client.subscribe() is not handle
 
 
 # --- publishing --------------------------------------------------------------------------------------------------
@@ -185,19 +174,19 @@ def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -
 
 def test_a_client_publishes() -> None:
     client = Client()
-    request = client.one(AdvertiseTopic, client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
+    request = client.one("advertise", client.send("advertise", topic="t", type=STRING, latch=True, queue_size=5))
     assert (request.topic, request.type, request.latch) == ("/t", STRING, True)
-    assert client.send("publish", topic="/t", msg={"data": "hello"}) == [PublishMessage(request.handle, HELLO)]
+    client.send("publish", topic="/t", msg={"data": "hello"})
+    assert request.published == [HELLO]
     assert not client.received()
 
 
 def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
     client = Client()
     client.send("set_level", level="warning")
-    client.send("advertise", topic="/t", type="geometry_msgs/Point")
-    (publish,) = client.send("publish", id="p", topic="/t", msg={"x": 1})
-    assert isinstance(publish, PublishMessage)
-    assert bytes(publish.payload) == bytes(6) + b"\xf0\x3f" + bytes(16)
+    (publisher,) = client.send("advertise", topic="/t", type="geometry_msgs/Point")
+    client.send("publish", id="p", topic="/t", msg={"x": 1})
+    assert publisher.published == [bytes(6) + b"\xf0\x3f" + bytes(16)]
     (status,) = client.received()
     assert (status["level"], status["id"]) == ("warning", "p")
     assert status["msg"].endswith("were not given: y, z")
@@ -206,30 +195,30 @@ def test_a_message_without_all_fields_is_published_with_a_warning() -> None:
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
 def test_what_python_clients_write_for_not_a_number_is_taken(value: str) -> None:
     client = Client()
-    client.send("advertise", topic="/t", type="std_msgs/Float64")
-    (publish,) = client.send_raw(f'{{"op": "publish", "topic": "/t", "msg": {{"data": {value}}}}}')
-    assert isinstance(publish, PublishMessage)
-    assert bytes(publish.payload)[-2] & 0xF0 == 0xF0
+    (publisher,) = client.send("advertise", topic="/t", type="std_msgs/Float64")
+    client.send_raw(f'{{"op": "publish", "topic": "/t", "msg": {{"data": {value}}}}}')
+    assert publisher.published[0][-2] & 0xF0 == 0xF0
 
 
 def test_a_publisher_ends_when_the_last_id_has_unadvertised_it() -> None:
     client = Client()
-    handle = client.one(AdvertiseTopic, client.send("advertise", id="a", topic="/t", type=STRING)).handle
+    publisher = client.one("advertise", client.send("advertise", id="a", topic="/t", type=STRING))
     assert not client.send("advertise", id="b", topic="/t", type=STRING)
-    assert not client.send("unadvertise", id="a", topic="/t")
-    assert client.send("unadvertise", id="b", topic="/t") == [UnadvertiseTopic(handle)]
-    handle = client.one(AdvertiseTopic, client.send("advertise", id="c", topic="/t", type=STRING)).handle
+    client.send("unadvertise", id="a", topic="/t")
+    assert not publisher.closed
+    client.send("unadvertise", id="b", topic="/t")
+    assert publisher.closed
+    publisher = client.one("advertise", client.send("advertise", id="c", topic="/t", type=STRING))
     client.send("advertise", id="d", topic="/t", type=STRING)
-    assert client.send("unadvertise", topic="/t") == [UnadvertiseTopic(handle)]
+    client.send("unadvertise", topic="/t")
+    assert publisher.closed
 
 
 def test_a_topic_of_the_graph_may_be_published_without_advertising() -> None:
     client = Client()
     client.graph.add_topic("/t", STRING)
-    advertise, publish = client.send("publish", topic="/t", msg={"data": "hello"})
-    assert isinstance(advertise, AdvertiseTopic)
-    assert advertise.type == STRING
-    assert publish == PublishMessage(advertise.handle, HELLO)
+    publisher = client.one("advertise", client.send("publish", topic="/t", msg={"data": "hello"}))
+    assert (publisher.type, publisher.published) == (STRING, [HELLO])
     assert not client.send("publish", topic="/unknown", msg={})
     assert "advertise it first" in client.error()
 
@@ -248,11 +237,10 @@ def test_a_topic_has_one_type() -> None:
 
 def test_binary_frames_are_ops_in_cbor() -> None:
     client = Client()
-    client.send("advertise", topic="/t", type="std_msgs/UInt8MultiArray")
+    (publisher,) = client.send("advertise", topic="/t", type="std_msgs/UInt8MultiArray")
     message = {"layout": {"dim": [], "data_offset": 0}, "data": b"\x01\x02"}
-    (publish,) = client.send_raw(cbor2.dumps({"op": "publish", "topic": "/t", "msg": message}))
-    assert isinstance(publish, PublishMessage)
-    assert bytes(publish.payload).endswith(b"\x02\0\0\0\x01\x02")
+    client.send_raw(cbor2.dumps({"op": "publish", "topic": "/t", "msg": message}))
+    assert publisher.published[0].endswith(b"\x02\0\0\0\x01\x02")
 
 
 # --- fragments, status, authentication ---------------------------------------------------------------------------
@@ -264,7 +252,7 @@ def test_ops_in_fragments_and_pictures_are_done() -> None:
     assert not client.send("fragment", id=1, data=text[20:], num=1, total=2)
     assert client.send("fragment", id=1, data=text[:20], num=0, total=2)
     other = Client()
-    handle = other.one(Subscribe, other.send("subscribe", topic="/p", compression="png")).handle
+    handle = other.subscribe("/p", compression="png")
     other.publish(handle, STRING, {"data": "hello"})
     (op,) = other.received()
     # The picture holds the op publish, of a topic that is known nowhere.
@@ -305,15 +293,6 @@ def test_levels_of_status_messages() -> None:
         assert len(client.received()) == count
     client.send("set_level", level="loud")
     assert "none, error, warning, info" in client.error()
-
-
-def test_all_that_a_client_had_ends_with_it() -> None:
-    client = Client()
-    (subscribe,) = client.send("subscribe", topic="/t", throttle_rate=1000, queue_length=5)
-    (advertise,) = client.send("advertise", topic="/u", type=STRING)
-    client.session.close()
-    assert client.session.requests_to_send() == [Unsubscribe(subscribe.handle), UnadvertiseTopic(advertise.handle)]
-    assert client.session.next_timer() is None
 
 
 # --- malformed and hostile ---------------------------------------------------------------------------------------

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 from rmpa.web import limits
-from rmpa.web.hub.requests import ReceivedMessage
-from rmpa.web.rosbridge.subscriptions import QueuedBytes, Throttle
+from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.rosbridge.delivery import QueuedBytes, Throttle
 
 
 def _message(number: int, size: int = 1) -> ReceivedMessage:
-    return ReceivedMessage(1, "/t", "t/T", memoryview(bytes(size)), number)
+    return ReceivedMessage("/t", "t/T", memoryview(bytes(size)), number)
 
 
 def _numbers(messages: list[ReceivedMessage]) -> list[int]:

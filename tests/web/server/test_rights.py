@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule
 from rmpa.config.settings import Settings, TrustSettings, WebSettings
 from rmpa.core.errors import PeerRefused
 from rmpa.resource import Resource
-from rmpa.resource.run.descriptor import describe
+from rmpa.resource.descriptor import describe
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
@@ -25,7 +25,6 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
-from rmpa.web.hub.requests import DeleteParam, ParamsChanged, SetParam
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
@@ -41,7 +40,7 @@ from tests.web.snapshots import FULL as SNAPSHOT
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.node_link import ParamValue
 
 RULES = (
     PermissionRule(("*",), effect=Effect.DENY, names={"call": ("/motors/**",), "param": ("/motors/**",)}),
@@ -304,14 +303,14 @@ async def test_a_change_is_judged_by_the_cores_parameters_that_are_still_being_r
         boss = FakeClient(hub)
         answers = Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
         page = asyncio.ensure_future(answers.answer("delete_param", {"name": "/motors"}))
-        for request in (SetParam(1, "/motors", 5), DeleteParam(2, "/motors"), SetParam(3, "/speed", 1)):
-            boss.ask(request)
+        for work in (boss.set_param("/motors", 5), boss.delete_param("/motors"), boss.set_param("/speed", 1)):
+            boss.start(work)
         go_on.set()
-        for handle in (1, 2):
-            assert "web may not param /motors/limit" in (await boss.failure(handle)).error
+        await until(lambda: len(boss.errors) == 2)
+        assert all("web may not param /motors/limit" in str(error) for error in boss.errors)
         with pytest.raises(PeerRefused, match="web may not param /motors/limit"):
             await page
-        await boss.answer(ParamsChanged, 3)
+        await until(lambda: boss.results == [None])
         assert await setter.get_param("/motors") == {"limit": 3}
         boss.close()
         answers.close()

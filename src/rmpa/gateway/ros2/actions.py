@@ -17,12 +17,11 @@ from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, acti
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
 from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
-from rmpa.gateway.ros2.shown_action import JoinedAction, ShownAction, find_headers, find_parts
+from rmpa.gateway.ros2.shown_action import KINDS, Goals, JoinedAction, ShownAction, find_types
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.gateway.foreign import TopicTap
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.services import Ros2Context
@@ -31,17 +30,27 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.loop import SystemClock
 
-
-# An actionlib server of a module, as an action server in ROS 2's graph.
-
-
 _NODE: Final = "/action_clients"
 """The node that publishes goals and cancellations for all clients of ROS 2, below ``/rmpa/ros2``."""
 _LATCHED: Final = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
+_SEND: Final = f"{PART}send_goal"
+_OF_SERVER: Final = ("status", "feedback", "result")
+_OF_CLIENTS: Final = ("goal", "cancel")
+_TYPES: Final = {
+    "goal": "ActionGoal",
+    "cancel": "actionlib_msgs/GoalID",
+    "status": "actionlib_msgs/GoalStatusArray",
+    "feedback": "ActionFeedback",
+    "result": "ActionResult",
+}
+"""The topics of an action of ROS 1, and their types or the ends of their types."""
+
+
+# Clients of ROS 2, and an actionlib server of ROS 1.
 
 
 @dataclass(slots=True)
-class _Goal:
+class _SentToRos1:
     id: GoalId
     uuid: bytes
     deadline: float
@@ -61,11 +70,8 @@ class _Goal:
         return self.result is not None
 
 
-class GoalsToRos1:
+class GoalsToRos1(Goals):
     """The goals of one action.
-
-    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
-    that does not fit the other side's type.
 
     Args:
         pair: The action's types.
@@ -74,10 +80,9 @@ class GoalsToRos1:
     """
 
     def __init__(self, pair: ActionPair, out: OfferedAction, clock: SystemClock) -> None:
-        self.pair = pair
+        super().__init__(pair, clock)
         self._out = out
-        self._clock = clock
-        self._goals: dict[str, _Goal] = {}
+        self._goals: dict[str, _SentToRos1] = {}
         """By the id in ROS 1, which is the text of the UUID."""
 
     # --- from the clients of ROS 2 --------------------------------------------------------------------------------
@@ -90,7 +95,7 @@ class GoalsToRos1:
             self._out.answer(query, messages.send_goal_response(stamp, accepted=False))
             return
         goal_id = GoalId(name, *divmod(stamp, 10**9))
-        self._goals[name] = _Goal(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
+        self._goals[name] = _SentToRos1(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
         self._out.tell_ros1("goal", messages.ros1_message(stamp, goal_id.serialize(), body))
 
     def get_result(self, query: ArrivedQuery) -> None:
@@ -192,18 +197,18 @@ class GoalsToRos1:
         goal.status = state.status
         return True
 
-    def _accept(self, goal: _Goal, *, accepted: bool) -> None:
+    def _accept(self, goal: _SentToRos1, *, accepted: bool) -> None:
         query, goal.asked = goal.asked, None
         if query is not None:
             self._out.answer(query, messages.send_goal_response(self._clock.wall_ns(), accepted=accepted))
 
-    def _end(self, goal: _Goal, status: Ros1Status, body: bytes) -> None:
+    def _end(self, goal: _SentToRos1, status: Ros1Status, body: bytes) -> None:
         self._accept(goal, accepted=status is not Ros1Status.REJECTED)
         goal.status, goal.result, goal.deadline = status, body, self._clock.now() + limits.ROS2_RESULT_KEPT
         self._tell_states()
         self._give_result(goal)
 
-    def _give_result(self, goal: _Goal) -> None:
+    def _give_result(self, goal: _SentToRos1) -> None:
         waiting, goal.waiting = goal.waiting, []
         for query in waiting:
             try:
@@ -222,7 +227,7 @@ def _name(uuid: bytes) -> str:
     return str(uuids.UUID(bytes=uuid))
 
 
-class OfferedAction(JoinedAction[GoalsToRos1]):
+class OfferedAction(JoinedAction):
     """Offers one actionlib server to ROS 2.
 
     Args:
@@ -232,24 +237,20 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         server: The server's topics by *status*, *feedback* and *result*.
     """
 
+    _goals: GoalsToRos1 | None
+
     def __init__(self, context: Ros2Context, name: str, ros1: str, server: Mapping[str, MeshSource]) -> None:
-        super().__init__(context, name, name, server["result"].proxy, _NODE)
         self.ros1 = ros1
         self.server = dict(server)
         self._connected: set[str] = set()
-        self._taps: dict[str, TopicTap] = {}
         self._ready = asyncio.Event()
         self._publishers: dict[str, tuple[QueuedPublisher, bytes]] = {}
+        super().__init__(context, name, name, server["result"].proxy, _NODE)
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back."""
         super().close()
-        for publisher, _ in self._publishers.values():
-            publisher.close()
-        for tap in self._taps.values():
-            tap.close()
-        for topic in self._topics.values():
-            topic.close()
+        self.finish()
 
     def tell_ros2(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 2."""
@@ -275,18 +276,19 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
             context.say(self.here, "ROS 2 does not allow the name of this action")
             return
         try:
-            pair = ActionPair(await find_parts(self.ros1), context.mapping.action(self.ros1), context.types)
-            headers = await find_headers(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
+            kinds = await find_types(*(f"{self.ros1}{kind}" for kind in KINDS))
+            pair = ActionPair(kinds, context.mapping.action(self.ros1), context.types)
+            topics = await find_types(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
         except RmpaError as error:
             context.say(self.here, f"ROS 2 does not see this action: {error}")
             return
         if self._closed:
             return
         self._begin(GoalsToRos1(pair, self, self._clock))
-        for part, header in zip(("goal", "cancel"), headers, strict=True):
-            self._show(header, part, partial(self._demand, part))
+        for part, kind in zip(_OF_CLIENTS, topics, strict=True):
+            self._show(part, kind.describe(), partial(self._demand, part))
         for part in ("send_goal", "get_result", "cancel_goal"):
-            key = data_key(context.settings.ros2.domain, f"{self._name}/_action/{part}", *pair.types[part])
+            key = data_key(context.settings.ros2.domain, f"{self._name}{PART}{part}", *pair.types[part])
             # Before its token, which clients wait for.
             take = self._send_goal if part == "send_goal" else partial(self._request, part)
             self._declared.append(context.session.queryable(key, take, SERVICE_NEEDS))
@@ -294,6 +296,7 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         for part, qos, cache in (("feedback", Ros2Qos(), 0), ("status", _LATCHED, 1)):
             endpoint = self._declare(self._server, EntityKind.PUBLISHER, part, qos)
             publisher = context.session.publisher(endpoint.endpoint.key(), ZenohQos(cache=cache), lambda _: None)
+            self._declared.append(publisher)
             self._publishers[part] = publisher, endpoint.gid
 
     def _demand(self, part: str, wanted: bool) -> None:
@@ -301,11 +304,10 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         self._judge_ready()
 
     def _judge_ready(self) -> None:
-        listening = all(tap.description is not None for tap in self._taps.values()) and len(self._taps) == 3
-        if listening and len(self._connected) == 2:
-            self._ready.set()
-        else:
-            self._ready.clear()
+        """Whether the server hears goals: its topics are listened to, and it listens to ours."""
+        heard = [tap for tap in self._taps.values() if tap.description is not None]
+        whole = len(heard) == len(_OF_SERVER) and len(self._connected) == len(_OF_CLIENTS)
+        (self._ready.set if whole else self._ready.clear)()
 
     def _changed(self, _value: object) -> None:
         asyncio.get_running_loop().call_soon(self._judge_ready)
@@ -313,8 +315,8 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
     def _send_goal(self, query: ArrivedQuery) -> None:
         """Listen to the server from the first goal on, and pass the goal on once the server listens too."""
         for part, source in self.server.items():
-            if part not in self._taps:
-                self._taps[part] = self._tap(source, part, self._changed)
+            if source not in self._taps:
+                self._tap(source, part, self._changed)
         self._judge_ready()
         self._context.spawn(self._send_when_ready(query))
 
@@ -338,27 +340,13 @@ class OfferedAction(JoinedAction[GoalsToRos1]):
         self._arm()
 
 
-_SEND: Final = f"{PART}send_goal"
-_PARTS: Final = {
-    "goal": "ActionGoal",
-    "cancel": "actionlib_msgs/GoalID",
-    "status": "actionlib_msgs/GoalStatusArray",
-    "feedback": "ActionFeedback",
-    "result": "ActionResult",
-}
-"""The topics of an action of ROS 1, and their types or the ends of their types."""
-_OF_SERVER: Final = ("status", "feedback", "result")
-
-
 class Ros2Actions:
     """Joins actions both ways. It takes all topics and services of actions, so that no other part carries them."""
 
     def __init__(self, context: Ros2Context) -> None:
         self._context = context
-        self._servers: dict[str, dict[str, dict[str, MeshSource]]] = {}
-        """The topics of servers of ROS 1 by action, node and part."""
-        self._clients: dict[str, list[MeshSource]] = {}
-        """The topics of clients of ROS 1 by action."""
+        self._topics: dict[str, dict[MeshSource, str]] = {}
+        """The topics of servers and clients of ROS 1 by action, and what part each is."""
         self._offered: dict[str, OfferedAction] = {}
         self._shown: dict[str, ShownAction] = {}
         self._leaving: dict[str, ShownAction] = {}
@@ -367,12 +355,20 @@ class Ros2Actions:
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Take a topic of an action."""
         name, _, part = source.here.rpartition("/")
-        if source.kind is not SourceKind.TOPIC or not name or not source.type.endswith(_PARTS.get(part, "\0")):
+        if source.kind is not SourceKind.TOPIC or not name or not source.type.endswith(_TYPES.get(part, "\0")):
             return False
-        if part in _OF_SERVER:
-            self._server_changed(name, part, source, there=there)
+        topics = self._topics.setdefault(name, {})
+        if there:
+            topics[source] = part
         else:
-            self._client_changed(name, source, there=there)
+            topics.pop(source, None)
+        if part in _OF_SERVER:
+            self._offer(name)
+        for shown in self._shown.values():
+            if shown.here == name and part in _OF_CLIENTS:
+                shown.follow(self._clients(name))
+        if not topics:
+            del self._topics[name]
         return True
 
     def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
@@ -387,15 +383,15 @@ class Ros2Actions:
             elif not there and shown is not None and shown.server == endpoint:
                 shown.close()
                 self._leaving[name] = self._shown.pop(name)
-                self._show_other(name)
+                # The next server of this name takes its place.
+                if (other := next(self._context.ros2.at(endpoint.name, EntityKind.SERVICE), None)) is not None:
+                    self._show(name, other)
         return True
 
     def close(self) -> None:
         """Take back all actions of both sides."""
-        for offered in self._offered.values():
-            offered.close()
-        for shown in self._shown.values():
-            shown.close()
+        for action in (*self._offered.values(), *self._shown.values()):
+            action.close()
         for shown in (*self._shown.values(), *self._leaving.values()):
             shown.finish()
         self._offered.clear()
@@ -403,43 +399,24 @@ class Ros2Actions:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _server_changed(self, name: str, part: str, source: MeshSource, *, there: bool) -> None:
-        nodes = self._servers.setdefault(name, {})
-        parts = nodes.setdefault(source.proxy, {})
-        if there:
-            parts[part] = source
-        elif parts.get(part) == source:
-            del parts[part]
-        offered = self._offered.get(name)
-        if offered is not None and offered.server["result"].proxy == source.proxy and len(parts) < len(_OF_SERVER):
-            self._offered.pop(name).close()
-        if not parts:
-            del nodes[source.proxy]
-        if not nodes:
-            del self._servers[name]
-        self._offer(name)
+    def _clients(self, name: str) -> set[MeshSource]:
+        return {source for source, part in self._topics.get(name, {}).items() if part in _OF_CLIENTS}
 
     def _offer(self, name: str) -> None:
-        whole = [parts for parts in self._servers.get(name, {}).values() if len(parts) == len(_OF_SERVER)]
+        """Offer the first server of a name that has all its topics."""
+        servers: dict[str, dict[str, MeshSource]] = {}
+        for source, part in self._topics[name].items():
+            if part in _OF_SERVER:
+                servers.setdefault(source.proxy, {})[part] = source
+        whole = [parts for parts in servers.values() if len(parts) == len(_OF_SERVER)]
+        if name in self._offered and self._offered[name].server not in whole:
+            self._offered.pop(name).close()
         if name in self._offered or not whole or len(self._offered) >= limits.ROS2_ACTIONS_MAX:
             return
         result = whole[0]["result"]
         ros1 = action_name(result.type, "ActionResult")
         if self._context.rules.outgoing_to(SITE, result.module, result.name).allowed and ros1:
             self._offered[name] = OfferedAction(self._context, name, ros1, whole[0])
-            self._offered[name].start()
-
-    def _client_changed(self, name: str, source: MeshSource, *, there: bool) -> None:
-        clients = self._clients.setdefault(name, [])
-        if there:
-            clients.append(source)
-        elif source in clients:
-            clients.remove(source)
-        if not clients:
-            del self._clients[name]
-        for shown in self._shown.values():
-            if shown.here == name:
-                shown.client(source, there=there)
 
     def _show(self, name: str, endpoint: Ros2Endpoint) -> None:
         if len(self._shown) >= limits.ROS2_ACTIONS_MAX:
@@ -449,12 +426,5 @@ class Ros2Actions:
         source = ForeignSource(SourceKind.SERVICE, SITE, "", endpoint.node.name, name, "*")
         decision = self._context.rules.incoming(source)
         if decision.allowed:
-            self._shown[name] = shown = ShownAction(self._context, endpoint, name, decision.name)
-            shown.start()
-            for client in self._clients.get(decision.name, ()):
-                shown.client(client, there=True)
-
-    def _show_other(self, name: str) -> None:
-        """The server is gone: the next of this name takes its place."""
-        if (other := next(self._context.ros2.at(name + _SEND, EntityKind.SERVICE), None)) is not None:
-            self._show(name, other)
+            self._shown[name] = ShownAction(self._context, endpoint, name, decision.name)
+            self._shown[name].follow(self._clients(decision.name))

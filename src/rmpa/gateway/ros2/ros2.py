@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.config.peer_rules import Access
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
+from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
+from rmpa.gateway.rules import CrossingRules
 from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
@@ -24,10 +26,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import TypeAlias
 
+    from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
+    from rmpa.gateway.topics import Export
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.observe.operations import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
@@ -36,13 +41,15 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
-_LOST: Final = {
-    "lost": "were lost on the way, by their numbers",
-    "dropped": "were dropped by a full queue",
-    "limited": "were left out for the rule's rate or size",
-    "unconverted": "could not be converted",
-    "unheard": "came before a node subscribed",
-}
+_DROPPED: Final = "were dropped by a full queue"
+_UNCONVERTED: Final = "could not be converted"
+_SENT_LOSSES: Final = (_DROPPED, "were left out for the rule's rate or size", _UNCONVERTED)
+_ARRIVED_LOSSES: Final = (
+    "were lost on the way, by their numbers",
+    _DROPPED,
+    _UNCONVERTED,
+    "came before a node subscribed",
+)
 
 
 class Ros2Neighbour:
@@ -159,14 +166,18 @@ class Ros2Neighbour:
         """
         if site not in ("", SITE):
             return []
-        gateway, ways = self.context.graph.name, []
-        for row in self.topics.rows():
-            coming = row["direction"] == "in"
-            if (site and not coming) or name not in (row["here"], row["topic"] if site else ""):
-                continue
-            stages = until_failure(_in_stages(row) if coming else _out_stages(row, self.context.problems))
-            ends = (SITE, gateway) if coming else (str(row["module"]), SITE)
-            ways.append(_way(stages, str(row["here"]), str(row["node"]), *ends))
+        gateway = self.context.graph.name
+        ways = []
+        for imported in self.topics.imports.values():
+            if name in (imported.decision.name, imported.first.name if site else ""):
+                for each in imported.publishers.values():
+                    stages = until_failure(_in_stages(imported, each))
+                    ways.append(_way(stages, imported.decision.name, each.node, SITE, gateway))
+        for export, dialect in self.topics.exports() if not site else ():
+            source = export.source
+            if source.here == name:
+                stages = until_failure(_out_stages(export, dialect, self.context.problems))
+                ways.append(_way(stages, name, source.node, source.module, SITE))
         for what, why in self.topics.refused.items():
             topic, _, node = what.partition(" of ")
             coming = not node.startswith("/rmpa/")
@@ -180,48 +191,53 @@ def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) ->
     return Diagnosis.of(stages, name=name, peer=peer, to=to, node=node)
 
 
-def _out_stages(row: Mapping[str, Any], problems: Mapping[str, str]) -> Iterator[Check]:
-    yield Check("rule", OK, row["rule"])
-    if row["problem"]:
-        yield Check("type", FAIL, row["problem"])
-    if not row["ros2_type"]:
-        yield Check("type", WARN, f"ROS 2 has no {row['type']}; its publisher is being asked for the definition")
+def _out_stages(export: Export, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
+    yield Check("rule", OK, dialect.why)
+    if export.problem:
+        yield Check("type", FAIL, export.problem)
+    if dialect.endpoint is None:
+        text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
+        yield Check("type", WARN, text)
         return
-    kept = ", transient local" if row["latched"] else ""
-    yield Check("type", OK, f"it is {row['ros2_type']} in ROS 2{kept}")
+    kept = ", transient local" if dialect.latched else ""
+    yield Check("type", OK, f"it is {dialect.endpoint.endpoint.type} in ROS 2{kept}")
     ends = ((what.partition(" of "), text) for what, text in problems.items())
     deaf = [
         f"{node}: {text}"
         for (topic, _, node), text in ends
-        if topic == row["here"] and node.startswith("/") and not node.startswith("/rmpa/")
+        if topic == export.source.here and node.startswith("/") and not node.startswith("/rmpa/")
     ]
     if deaf:
-        yield Check("heard", WARN if row["wanted"] else FAIL, "; ".join(deaf))
-    if not row["wanted"]:
+        yield Check("heard", WARN if export.wanted else FAIL, "; ".join(deaf))
+    if not export.wanted:
         yield Check("demand", WARN, "no node of ROS 2 subscribes: nothing is sent")
         return
     yield Check("demand", OK, "a node of ROS 2 subscribes")
-    waiting = f", {row['waiting']} wait" if row["waiting"] else ""
-    yield _flow("sent", f"{row['sent']} messages were sent{waiting}", row, row["sent"])
+    waiting = f", {export.waiting} wait" if export.waiting else ""
+    losses = export.dropped, export.limited, dialect.unconverted
+    yield _flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses, _SENT_LOSSES)
 
 
-def _in_stages(row: Mapping[str, Any]) -> Iterator[Check]:
-    yield Check("rule", OK, row["rule"])
-    if row["problem"]:
-        yield Check("type", FAIL, row["problem"])
-    kept = ", transient local" if row["latched"] else ""
-    yield Check("type", OK, f"{row['ros2_type']} of ROS 2 is {row['type']} here{kept}")
-    was = f" (ROS 2's {row['topic']})" if row["topic"] != row["here"] else ""
-    yield Check("shown", OK, f"it is {row['here']} here{was}, at /rmpa/{SITE}{row['node']}")
-    if not row["wanted"]:
+def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check]:
+    here, there = imported.decision.name, imported.first
+    yield Check("rule", OK, imported.decision.why)
+    if problem := imported.problem or publisher.topic.problem:
+        yield Check("type", FAIL, problem)
+    kept = ", transient local" if publisher.latched else ""
+    yield Check("type", OK, f"{there.type} of ROS 2 is {imported.ros1_type} here{kept}")
+    was = f" (ROS 2's {there.name})" if there.name != here else ""
+    yield Check("shown", OK, f"it is {here} here{was}, at /rmpa/{SITE}{publisher.node}")
+    if not publisher.wanted:
         yield Check("demand", WARN, "no node of a module subscribes: it crosses once one does")
         return
     yield Check("demand", OK, "a node of a module subscribes")
-    yield _flow("arrived", f"{row['received']} messages have come", row, row["received"])
+    losses = imported.sequences.lost, publisher.dropped, imported.unconverted, imported.unheard
+    messages = publisher.received
+    yield _flow("arrived", f"{messages} messages have come", messages, losses, _ARRIVED_LOSSES)
 
 
-def _flow(stage: str, text: str, row: Mapping[str, Any], messages: int) -> Check:
-    lost = [f"{row[key]} {words}" for key, words in _LOST.items() if row.get(key)]
+def _flow(stage: str, text: str, messages: int, losses: tuple[int, ...], words: tuple[str, ...]) -> Check:
+    lost = [f"{count} {what}" for count, what in zip(losses, words, strict=True) if count]
     return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)))
 
 
@@ -231,24 +247,21 @@ class Ros2Answers:
     Args:
         neighbour: ROS 2.
         sites: Answers for the other sites; ``None``: the gateway joins none.
-        may: ``(asker, access, name)``: whether a linked module may have a topic or service, by its name here.
+        gate: Decides which linked module may have a topic or service, by its name here.
     """
 
     def __init__(
-        self,
-        neighbour: Ros2Neighbour,
-        sites: SiteAnswerer | None = None,
-        may: Callable[[str, Access, str], bool] = lambda _asker, _access, _name: True,
+        self, neighbour: Ros2Neighbour, sites: SiteAnswerer | None = None, gate: PermissionGate = OPEN_GATE
     ) -> None:
         self._neighbour = neighbour
         self._sites = sites
-        self._may = may
+        self._rules = CrossingRules(gate=gate)
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
         name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
         if what == WHY:
-            told = self._tells(asker, "topic", name) or self._tells(asker, "service", name)
+            told = any(self._rules.tells(asker, kind, name) for kind in SourceKind)
             ways = self._neighbour.ways(name, site, module) if told and args.get("service") is not True else []
             return [*ways, *(await self._sites.answer(what, args, asker) if self._sites is not None else ())]
         if what == REPORT or (what == INFO and site == SITE):
@@ -260,10 +273,6 @@ class Ros2Answers:
             raise UnreachableError(f"site {site!r}", "this gateway", f"it joins {SITE} alone")
         return await self._sites.answer(what, args, asker)
 
-    def _tells(self, asker: str, kind: str, name: str) -> bool:
-        """Whether a module is told of a topic or service that has this name here."""
-        return self._may(asker, Access.CALL if kind == "service" else Access.SUBSCRIBE, name)
-
     async def _report(self, asker: str) -> SitesReport:
         if self._sites is not None:
             found: SitesReport = await self._sites.answer(REPORT, {}, asker)
@@ -274,8 +283,7 @@ class Ros2Answers:
         return SitesReport(gateway=context.graph.name, site="", leads=True, problem=problem, endpoints=endpoints)
 
     def _site(self, asker: str, *, sources: bool) -> SiteInfo:
-        every = list(self._sources()) if sources else []
-        listed = [source for source in every if self._tells(asker, source.kind, source.here or source.name)]
+        listed = list(self._sources(asker)) if sources else []
         return SiteInfo(
             name=SITE,
             state="joined",
@@ -285,17 +293,28 @@ class Ros2Answers:
             beyond=max(0, len(listed) - limits.SITE_REPORT_SOURCES_MAX),
         )
 
-    def _sources(self) -> Iterator[SiteSourceInfo]:
+    def _sources(self, asker: str) -> Iterator[SiteSourceInfo]:
         """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
-        for row in self._neighbour.topics.rows():
-            if row["direction"] == "in":
-                shown: dict[str, Any] = {key: row[key] for key in ("node", "type", "here", "problem")}
-                yield SiteSourceInfo(kind="topic", module="", name=str(row["topic"]), **shown)
-        for name, each in self._neighbour.services.shown.items():
-            yield SiteSourceInfo(kind="service", module="", node="", name=name, type=each.server.type, here=name)
+
+        def row(
+            kind: SourceKind, name: str, node: str, type_name: str = "*", here: str = "", problem: str = ""
+        ) -> Iterator[SiteSourceInfo]:
+            if self._rules.tells(asker, kind, here or name):
+                word = kind.name.lower()
+                yield SiteSourceInfo(
+                    kind=word, module="", node=node, name=name, type=type_name, here=here, problem=problem
+                )
+
+        for each in self._neighbour.topics.imports.values():
+            for publisher in each.publishers.values():
+                problem = each.problem or publisher.topic.problem
+                terms = each.ros1_type, each.decision.name, problem
+                yield from row(SourceKind.TOPIC, each.first.name, publisher.node, *terms)
+        for name, shown in self._neighbour.services.shown.items():
+            yield from row(SourceKind.SERVICE, name, "", shown.server.type, name)
         for what, text in self._neighbour.context.problems.items():
             name, _, node = what.partition(" of ")
-            yield SiteSourceInfo(kind="topic", module="", node=node, name=name, problem=text)
+            yield from row(SourceKind.TOPIC, name, node, problem=text)
 
 
 def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:
@@ -307,10 +326,5 @@ def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
     agent = graph.agent
     neighbour = Ros2Neighbour(graph, session, settings.gateway, settings.make_contracts())
     sites = agent.sites.answerer if settings.gateway.site else None
-    gate = agent.bridge.gate
-
-    def may(asker: str, access: Access, name: str) -> bool:
-        return not asker or gate.judge(access, asker, name).allowed
-
-    agent.sites.serve(Ros2Answers(neighbour, sites, may))
+    agent.sites.serve(Ros2Answers(neighbour, sites, agent.bridge.gate))
     return neighbour

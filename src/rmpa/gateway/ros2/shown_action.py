@@ -1,14 +1,12 @@
-"""Actions of ROS 2 in the gateway's graph, and what both directions of actions share.
-
-What both directions of actions share: finding the types, and the way of messages to the goals.
-"""
+"""Actions of ROS 2 in the gateway's graph, and what both directions of actions share."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
@@ -26,38 +24,50 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import MachineTimer, SystemClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from rmpa.gateway.foreign import ProxiedTopic, TopicTap
-    from rmpa.gateway.neighbour import MeshSource, ZenohSample
+    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.zenoh.session import Declaration
+    from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 
-_PARTS: Final = ("Goal", "Result", "Feedback")
+KINDS: Final = ("Goal", "Result", "Feedback")
+"""What the definition of an action is made of."""
 
 
-class ActionGoals(Protocol):
-    """The goals of one action, in one direction."""
+class Goals:
+    """The goals of one action, in one direction: a machine without I/O.
 
-    pair: ActionPair
+    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
+    that does not fit the other side's type.
+
+    Args:
+        pair: The action's types.
+        clock: Both clocks.
+    """
+
+    def __init__(self, pair: ActionPair, clock: SystemClock) -> None:
+        self.pair = pair
+        self._clock = clock
 
     def server_gone(self) -> None:
         """The server is gone: all goals end as aborted."""
+        raise NotImplementedError
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None``: not."""
+        raise NotImplementedError
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
+        raise NotImplementedError
 
 
-_Goals = TypeVar("_Goals", bound=ActionGoals)
-
-
-class JoinedAction(Generic[_Goals]):
+class JoinedAction:
     """An action of one side, as that of a server at the other one.
 
     Args:
@@ -68,6 +78,8 @@ class JoinedAction(Generic[_Goals]):
         shown: The node that publishes its topics for ROS 1, below ``/rmpa/ros2``.
     """
 
+    # More than twelve fields: the action's names, what was declared at either side, and its goals with their timer.
+
     def __init__(self, context: Ros2Context, name: str, here: str, server: str, shown: str) -> None:
         self.here = here
         self._context = context
@@ -75,27 +87,31 @@ class JoinedAction(Generic[_Goals]):
         self._server = server
         self._shown = shown
         self._clock = SystemClock()
-        self._goals: _Goals | None = None
+        self._goals: Goals | None = None
         self._timer: MachineTimer | None = None
         self._topics: dict[str, ProxiedTopic] = {}
-        self._declared: list[Declaration | OwnEndpoint] = []
+        self._taps: dict[MeshSource, TopicTap] = {}
+        self._declared: list[Declaration | OwnEndpoint | QueuedPublisher] = []
         self._sequence = 0
         self._closed = False
-
-    def start(self) -> None:
-        """Find the types, and join it if they are a pair."""
-        self._context.spawn(self._join())
+        context.spawn(self._join())
 
     def close(self) -> None:
-        """The server is gone: goals under way end as aborted."""
+        """The server is gone: goals under way end as aborted, and all is taken back but the topics for ROS 1."""
         self._closed = True
         self._context.say(self.here, "")
         if self._goals is not None:
             self._goals.server_gone()
         if self._timer is not None:
             self._timer.close()
-        for each in self._declared:
+        for each in (*self._declared, *self._taps.values()):
             each.close()
+
+    def finish(self) -> None:
+        """Take its topics out of ROS 1's graph."""
+        for topic in self._topics.values():
+            topic.close()
+        self._topics.clear()
 
     def tell_ros1(self, topic: str, message: bytes) -> None:
         """Publish a message for ROS 1."""
@@ -103,13 +119,14 @@ class JoinedAction(Generic[_Goals]):
             self._topics[topic].publish(message)
 
     async def _join(self) -> None:
+        """Find the types, and join the action if they are a pair."""
         raise NotImplementedError
 
-    def _begin(self, goals: _Goals) -> None:
+    def _begin(self, goals: Goals) -> None:
         self._goals = goals
         self._timer = MachineTimer(goals.next_timer, goals.handle_timer)
 
-    def _show(self, header: TopicDescription, part: str, on_demand: Callable[[bool], None]) -> None:
+    def _show(self, part: str, header: TopicDescription, on_demand: Callable[[bool], None]) -> None:
         source = ForeignSource(SourceKind.TOPIC, SITE, "", self._shown, f"{self.here}/{part}", header.type)
         self._topics[part] = self._context.graph.show_topic(source, on_demand)
         self._topics[part].describe(header)
@@ -121,24 +138,22 @@ class JoinedAction(Generic[_Goals]):
         self._declared.append(made)
         return made
 
-    def _tap(self, source: Any, part: str, changed: Callable[[object], None]) -> TopicTap:
+    def _tap(self, source: MeshSource, part: str, changed: Callable[[object], None]) -> None:
         """Listen to a topic of ROS 1, as the node that publishes the others."""
         listener = f"/rmpa/{SITE}{self._shown}"
-        return self._context.graph.tap(source, self._take(part), changed, changed, listener=listener)
+        self._taps[source] = self._context.graph.tap(
+            source, partial(self._take, part), changed, changed, listener=listener
+        )
 
-    def _take(self, part: str) -> Callable[[Any], None]:
-        """What takes the messages of a topic: the method of the goals with its name."""
-
-        def take(message: Any) -> None:
-            if self._goals is None or self._closed:
-                return
-            try:
-                getattr(self._goals, part)(message)
-            except RmpaError as error:
-                self._context.say(f"{self.here} (messages)", str(error))
-            self._arm()
-
-        return take
+    def _take(self, part: str, message: Any) -> None:
+        """Take a message of a topic, by the method of the goals with its name."""
+        if self._goals is None or self._closed:
+            return
+        try:
+            getattr(self._goals, part)(message)
+        except RmpaError as error:
+            self._context.say(f"{self.here} (messages)", str(error))
+        self._arm()
 
     def _arm(self) -> None:
         if self._timer is not None and not self._closed:
@@ -149,78 +164,16 @@ class JoinedAction(Generic[_Goals]):
         return Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize()
 
 
-async def find_parts(name: str) -> list[MessageType]:
-    """Find goal, result and feedback of ``package/Name``.
-
-    Raises:
-        RmpaError: A definition is missing.
-    """
-    return [await asyncio.to_thread(find_message_type, f"{name}{part}") for part in _PARTS]
+async def find_types(*names: str) -> list[MessageType]:
+    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
+    return [await asyncio.to_thread(find_message_type, name) for name in names]
 
 
-async def learn_action(
-    context: Ros2Context, server: Ros2Endpoint, ros1: str, rule: TypePair, known: Sequence[MessageType] = ()
-) -> ActionPair:
-    """Make the pair of an action from what the node of its server in ROS 2 says of its types.
-
-    Args:
-        context: What the parts share.
-        server: The server's endpoint *send_goal*.
-        ros1: ``package/Name`` of ROS 1.
-        rule: ``package/action/Name`` of ROS 2, and fields if a mapping file lists them.
-        known: Goal, result and feedback of ROS 1 if this machine has them; else they are derived.
-
-    Raises:
-        RmpaError: The node does not describe them, or the types are no pair.
-    """
-    name = server.name.removesuffix(f"{PART}send_goal")
-    fields = await context.asker.learn(
-        (server.name, EntityKind.SERVICE),
-        (f"{name}{PART}get_result", EntityKind.SERVICE),
-        (f"{name}{PART}feedback", EntityKind.PUBLISHER),
-        of=server,
-    )
-    types = context.types.variant(fields)
-    own = {f"{rule.name}_{part}": f"{ros1}{part}" for part in _PARTS}
-    try:
-        kinds = known or [
-            derive_ros1(types.store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own
-        ]
-        return ActionPair(kinds, rule, types)
-    except KeyError as error:
-        raise NoConversion(f"{rule.name} has no form in ROS 1: {error}") from error
-
-
-async def find_headers(*kinds: str) -> list[TopicDescription]:
-    """The headers of topics of types that this machine knows.
-
-    Raises:
-        RmpaError: A definition is missing.
-    """
-    return [(await asyncio.to_thread(find_message_type, kind)).describe() for kind in kinds]
-
-
-async def outcome_headers(pair: ActionPair) -> list[TopicDescription]:
-    """The headers of an action's feedback and result; made where this machine has no definition."""
-    try:
-        return await find_headers(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
-    except RmpaError:
-        return [_wrapped(pair, "Feedback", pair.feedback.ros1), _wrapped(pair, "Result", pair.result)]
-
-
-def _wrapped(pair: ActionPair, part: str, kind: MessageType) -> TopicDescription:
-    """The message of actionlib around a feedback or result, as its genaction.py makes it."""
-    name = f"{pair.ros1}Action{part}"
-    text = f"Header header\nactionlib_msgs/GoalStatus status\n{kind.name} {part.lower()}\n"
-    known = {**known_specifications("std_msgs/Header"), **known_specifications("actionlib_msgs/GoalStatus")}
-    return MessageType(name, {**known, **kind.specifications, name: Specification.parse(name, text)}).describe()
-
-
-# An action server of ROS 2, as one of actionlib in the gateway's graph.
+# Clients of ROS 1, and a server of ROS 2.
 
 
 @dataclass(slots=True)
-class _Goal:
+class _SentToRos2:
     id: GoalId
     uuid: bytes
     status: Ros1Status = Ros1Status.PENDING
@@ -233,11 +186,8 @@ class _Goal:
         return GoalState(self.id, self.status, self.text)
 
 
-class GoalsToRos2:
+class GoalsToRos2(Goals):
     """The goals of one action.
-
-    What takes a message raises ``RemoteProtocolError`` for one that is malformed, and ``ConversionError`` for one
-    that does not fit the other side's type.
 
     Args:
         pair: The action's types.
@@ -246,10 +196,9 @@ class GoalsToRos2:
     """
 
     def __init__(self, pair: ActionPair, out: ShownAction, clock: SystemClock) -> None:
-        self.pair = pair
+        super().__init__(pair, clock)
         self._out = out
-        self._clock = clock
-        self._goals: dict[bytes, _Goal] = {}
+        self._goals: dict[bytes, _SentToRos2] = {}
         self._next_status: float | None = None
 
     # --- from the clients of ROS 1 -------------------------------------------------------------------------------
@@ -264,7 +213,7 @@ class GoalsToRos2:
         uuid = hashlib.sha256(name.encode()).digest()[: messages.UUID_BYTES]
         if uuid in self._goals:
             return
-        goal = _Goal(asked, uuid)
+        goal = _SentToRos2(asked, uuid)
         if len(self._goals) >= limits.ROS2_GOALS_MAX:
             self._end(goal, Ros1Status.REJECTED, f"{len(self._goals)} goals are known")
             return
@@ -352,7 +301,7 @@ class GoalsToRos2:
 
     # --- inside ---------------------------------------------------------------------------------------------------
 
-    def _accepted(self, goal: _Goal, *, accepted: bool) -> None:
+    def _accepted(self, goal: _SentToRos2, *, accepted: bool) -> None:
         if not accepted:
             self._end(goal, Ros1Status.REJECTED, "the server rejects the goal")
             return
@@ -362,7 +311,7 @@ class GoalsToRos2:
         if goal.cancelled:
             self._out.ask("cancel_goal", goal.uuid, messages.cancel_request(goal.uuid))
 
-    def _result(self, goal: _Goal, response: bytes) -> None:
+    def _result(self, goal: _SentToRos2, response: bytes) -> None:
         try:
             number, body = self.pair.result_to_ros1(response)
             status = messages.TO_ROS1[Ros2Status(number)]
@@ -375,16 +324,16 @@ class GoalsToRos2:
         states = (goal.state for goal in self._goals.values())
         self._out.tell_ros1("status", messages.ros1_states(self._clock.wall_ns(), states))
 
-    def _end(self, goal: _Goal, status: Ros1Status, text: str, body: bytes | None = None) -> None:
+    def _end(self, goal: _SentToRos2, status: Ros1Status, text: str, body: bytes | None = None) -> None:
         goal.status, goal.text, goal.ended = status, text, self._clock.now()
         self._tell_states()
         self._tell("result", goal, self.pair.no_result if body is None else body)
 
-    def _tell(self, topic: str, goal: _Goal, body: bytes) -> None:
+    def _tell(self, topic: str, goal: _SentToRos2, body: bytes) -> None:
         self._out.tell_ros1(topic, messages.ros1_message(self._clock.wall_ns(), goal.state.serialize(), body))
 
 
-class ShownAction(JoinedAction[GoalsToRos2]):
+class ShownAction(JoinedAction):
     """Shows one action server of ROS 2 to actionlib's clients.
 
     Args:
@@ -394,61 +343,82 @@ class ShownAction(JoinedAction[GoalsToRos2]):
         here: Its name in the gateway's graph.
     """
 
+    _goals: GoalsToRos2 | None
+
     def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
-        super().__init__(context, name, here, server.node.name, server.node.name)
         self.server = server
-        self._clients: dict[MeshSource, TopicTap | None] = {}
-        self._subscribed = False
+        self._clients: set[MeshSource] = set()
         self._callers: dict[str, OwnEndpoint] = {}
         self._leaving: asyncio.TimerHandle | None = None
+        super().__init__(context, name, here, server.node.name, server.node.name)
 
-    def client(self, source: MeshSource, *, there: bool) -> None:
-        """A client's topic *goal* or *cancel* appeared or is gone."""
-        if there:
-            self._clients.setdefault(source, None)
-            self._listen()
-        elif (tap := self._clients.pop(source, None)) is not None:
-            tap.close()
+    def follow(self, clients: set[MeshSource]) -> None:
+        """The topics *goal* and *cancel* of its clients are these now."""
+        self._clients = clients
+        if self._goals is None or self._closed:
+            return
+        for source in self._taps.keys() - clients:
+            self._taps.pop(source).close()
+        for source in clients - self._taps.keys():
+            self._tap(source, source.here.rpartition("/")[2], _ignore)
+        if clients and "feedback" not in self._callers:  # from the first client on
+            for part in ("feedback", "status"):
+                self._callers[part] = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
+                key, take = self._callers[part].endpoint.key(), partial(self._take, part)
+                self._declared.append(
+                    self._context.session.subscribe(key, lambda sample, take=take: take(sample.payload))  # type: ignore[misc]
+                )
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, then the topics go."""
         super().close()
-        for tap in self._clients.values():
-            if tap is not None:
-                tap.close()
-        self._clients.clear()
         # The last results have to leave before their publishers.
         self._leaving = asyncio.get_running_loop().call_later(limits.ROS2_LAST_RESULTS, self.finish)
 
     def finish(self) -> None:
-        """Take its topics out of the graph, once it is closed; once."""
+        """Take its topics out of the graph, once it is closed."""
         if self._leaving is not None:
             self._leaving.cancel()
-        for topic in self._topics.values():
-            topic.close()
-        self._topics.clear()
+        super().finish()
 
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         """Call a service of the server, and tell the goals what comes of it."""
-        if not self._closed:
-            self._context.spawn(self._ask(service, uuid, request))
+        if self._goals is not None and not self._closed:
+            self._context.spawn(self._ask(self._goals, service, uuid, request))
 
     # --- inside ----------------------------------------------------------------------------------------------------
 
     async def _join(self) -> None:
         try:
             pair = await self._find_pair()
-            headers = [*await find_headers("actionlib_msgs/GoalStatusArray"), *await outcome_headers(pair)]
+            headers = [kind.describe() for kind in await find_types("actionlib_msgs/GoalStatusArray")]
+            headers += await self._outcome_headers(pair)
         except RmpaError as error:
-            text = f"the action of ROS 2's node {self._server} is not shown: {error}"
-            self._context.say(self.here, text)
+            self._context.say(self.here, f"the action of ROS 2's node {self._server} is not shown: {error}")
             return
         if self._closed:
             return
-        self._begin(GoalsToRos2(pair, self, self._clock))
+        goals = GoalsToRos2(pair, self, self._clock)
+        self._begin(goals)
+
+        def wanted(there: bool) -> None:
+            if not self._closed:
+                goals.show_status(wanted=there)
+                self._arm()
+
         for part, header in zip(("status", "feedback", "result"), headers, strict=True):
-            self._show(header, part, self._wanted if part == "status" else _ignore)
-        self._listen()
+            self._show(part, header, wanted if part == "status" else _ignore)
+        self.follow(self._clients)
+
+    @staticmethod
+    async def _outcome_headers(pair: ActionPair) -> list[TopicDescription]:
+        """The headers of an action's feedback and result; made where this machine has no definition."""
+        try:
+            return [
+                kind.describe() for kind in await find_types(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
+            ]
+        except RmpaError:
+            return [_wrapped(pair.ros1, "Feedback", pair.feedback.ros1), _wrapped(pair.ros1, "Result", pair.result)]
 
     async def _find_pair(self) -> ActionPair:
         """The types; the server's node is asked for what is not known here.
@@ -464,67 +434,59 @@ class ShownAction(JoinedAction[GoalsToRos2]):
             rule = TypePair(ros2)
         known: list[MessageType] = []
         try:
-            known = await find_parts(ros1)
+            known = await find_types(*(f"{ros1}{kind}" for kind in KINDS))
             pair = ActionPair(known, rule, context.types)
             if pair.types["send_goal"][1] == server.type_hash:
                 return pair
             problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
         except RmpaError as error:
             problem = str(error)
+        own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
         try:
-            return await learn_action(context, server, ros1, rule, known)
+            fields = await context.asker.learn(
+                (server.name, EntityKind.SERVICE),
+                (f"{self._name}{PART}get_result", EntityKind.SERVICE),
+                (f"{self._name}{PART}feedback", EntityKind.PUBLISHER),
+                of=server,
+            )
+            types = context.types.variant(fields)
+            kinds = known or [
+                derive_ros1(types.store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own
+            ]
+            return ActionPair(kinds, rule, types)
         except RmpaError as error:
             raise NoConversion(f"{problem}; {error}") from error
+        except KeyError as error:
+            raise NoConversion(f"{problem}; {ros2} has no form in ROS 1: {error}") from error
 
-    def _wanted(self, wanted: bool) -> None:
-        if self._goals is not None and not self._closed:
-            self._goals.show_status(wanted=wanted)
-            self._arm()
-
-    def _listen(self) -> None:
-        """Listen to clients that are not listened to yet, and to the server from the first client on."""
-        if self._goals is None or self._closed:
-            return
-        for source, tap in self._clients.items():
-            if tap is None:
-                self._clients[source] = self._tap(source, source.here.rpartition("/")[2], _ignore)
-        if self._clients and not self._subscribed:
-            self._subscribed = True
-            for part in ("feedback", "status"):
-                endpoint = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
-                take = _payload_to(self._take(part))
-                self._declared.append(self._context.session.subscribe(endpoint.endpoint.key(), take))
-
-    async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
-        goals = self._goals
-        assert goals is not None  # noqa: S101 - they ask
+    async def _ask(self, goals: GoalsToRos2, service: str, uuid: bytes, request: bytes) -> None:
+        if service not in self._callers:
+            self._callers[service] = self._declare(self._context.nodes.own_name, EntityKind.CLIENT, service)
+        caller = self._callers[service]
         try:
-            goals.answered(service, uuid, await self._call(service, request))
+            answers = await self._context.session.get(
+                caller.endpoint.key(),
+                request,
+                self._attachment(caller.gid),
+                timeout=limits.ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
+                all_complete=True,
+            )
+            answer = next((answer for answer in answers if answer.ok), None)
+            if answer is None:
+                text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
+                raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
+            goals.answered(service, uuid, answer.payload)
         except RmpaError as error:
             goals.failed(service, uuid, str(error))
         self._arm()
 
-    async def _call(self, service: str, request: bytes) -> bytes:
-        if service not in self._callers:
-            nodes = self._context.nodes
-            self._callers[service] = self._declare(nodes.own_name, EntityKind.CLIENT, service)
-        caller = self._callers[service]
-        answers = await self._context.session.get(
-            caller.endpoint.key(),
-            request,
-            self._attachment(caller.gid),
-            timeout=limits.ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
-            all_complete=True,
-        )
-        for answer in answers:
-            if answer.ok:
-                return answer.payload
-        text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
-        raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
 
-
-def _payload_to(take: Callable[[bytes], None]) -> Callable[[ZenohSample], None]:
-    return lambda sample: take(sample.payload)
+def _wrapped(ros1: str, part: str, kind: MessageType) -> TopicDescription:
+    """The message of actionlib around a feedback or result, as its genaction.py makes it."""
+    name = f"{ros1}Action{part}"
+    text = f"Header header\nactionlib_msgs/GoalStatus status\n{kind.name} {part.lower()}\n"
+    known = {**known_specifications("std_msgs/Header"), **known_specifications("actionlib_msgs/GoalStatus")}
+    return MessageType(name, {**known, **kind.specifications, name: Specification.parse(name, text)}).describe()
 
 
 def _ignore(_value: object) -> None:

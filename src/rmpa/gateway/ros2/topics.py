@@ -29,7 +29,7 @@ from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.neighbour import MeshSource, ZenohQos, ZenohSample
@@ -149,7 +149,7 @@ class Ros2Dialect:
         return found
 
 
-class _Publisher:
+class Ros2Publisher:
     """What one node of ROS 2 publishes of a topic; it may have several publishers of it."""
 
     def __init__(self, node: str, topic: Ros2Import) -> None:
@@ -166,6 +166,7 @@ class _Publisher:
 
     @property
     def latched(self) -> bool:
+        """Whether one of them is transient local."""
         return any(each.qos.latched for each in self.endpoints)
 
 
@@ -193,16 +194,16 @@ class Ros2Import:
         self.conversion: Conversion | None = None
         self.problem = ""
         """Why its messages do not come; empty for nothing."""
-        self.publishers: dict[str, _Publisher] = {}
+        self.publishers: dict[str, Ros2Publisher] = {}
         """By node."""
-        self._by_gid: dict[bytes, _Publisher] = {}
-        self._adopted: dict[bytes, _Publisher] = {}
+        self._by_gid: dict[bytes, Ros2Publisher] = {}
+        self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
         self._subscribed: tuple[Declaration, OwnEndpoint] | None = None
         self._history = False
-        self._sequences = Ros2Sequences()
+        self.sequences = Ros2Sequences()
         self._early: deque[tuple[bytes, int, bytes]] = deque()
-        self._early_bytes = self._unheard = self._unconverted = 0
+        self._early_bytes = self.unheard = self.unconverted = 0
         self._lingering: asyncio.TimerHandle | None = None
 
     @property
@@ -214,7 +215,7 @@ class Ros2Import:
         """A publisher appeared."""
         node = endpoint.node.name
         if node not in self.publishers:
-            self.publishers[node] = _Publisher(node, self)
+            self.publishers[node] = Ros2Publisher(node, self)
         publisher = self.publishers[node]
         publisher.endpoints.append(endpoint)
         self._by_gid[gid_of(endpoint.token())] = publisher
@@ -255,30 +256,9 @@ class Ros2Import:
         self.publishers.clear()
         self._say("")
 
-    def report(self) -> Iterator[dict[str, object]]:
-        """Its state, as JSON values: one row for each node."""
-        for each in self.publishers.values():
-            yield {
-                "direction": "in",
-                "topic": self.first.name,
-                "here": self.decision.name,
-                "type": self.ros1_type,
-                "ros2_type": self.first.type,
-                "rule": self.decision.why,
-                "lost": self._sequences.lost,
-                "unheard": self._unheard,
-                "unconverted": self._unconverted,
-                "node": each.node,
-                "latched": each.latched,
-                "wanted": each.wanted,
-                "received": each.received,
-                "dropped": each.dropped,
-                "problem": self.problem or each.topic.problem,
-            }
-
     # --- demand --------------------------------------------------------------------------------------------------
 
-    def demand(self, publisher: _Publisher, wanted: bool) -> None:
+    def demand(self, publisher: Ros2Publisher, wanted: bool) -> None:
         """A node or module wants a publisher, or none does any more."""
         publisher.wanted = wanted
         kept, publisher.kept = publisher.kept, None
@@ -296,7 +276,7 @@ class Ros2Import:
             else:
                 self._hold(gid, sequence, payload)
 
-    def _describe(self, publisher: _Publisher) -> None:
+    def _describe(self, publisher: Ros2Publisher) -> None:
         if self.conversion is not None:
             kind = self.conversion.ros1
             described = TopicDescription(kind.name, kind.md5sum, kind.definition, latching=publisher.latched)
@@ -322,7 +302,7 @@ class Ros2Import:
         self._early_bytes += len(payload)
         while len(self._early) > limits.ROS2_EARLY_MESSAGES or self._early_bytes > limits.ROS2_EARLY_BYTES:
             self._early_bytes -= len(self._early.popleft()[2])
-            self._unheard += 1
+            self.unheard += 1
 
     def _follow_demand(self) -> None:
         wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
@@ -342,7 +322,7 @@ class Ros2Import:
         for each in self._subscribed or ():
             each.close()
         self._subscribed = None
-        self._sequences.forget()
+        self.sequences.forget()
         self._adopted.clear()
         for publisher in self.publishers.values():
             publisher.kept = None
@@ -359,7 +339,7 @@ class Ros2Import:
                 return
             gid, sequence = attachment.gid, attachment.sequence
             own = gid in self.part.context.nodes.gids
-            if own or not self._sequences.accept(attachment, history=self._history):
+            if own or not self.sequences.accept(attachment, history=self._history):
                 return
         publisher = self._publisher_of(gid)
         if publisher is not None and publisher.wanted:
@@ -369,10 +349,10 @@ class Ros2Import:
         elif self._lingering is not None:
             self._hold(gid, sequence, sample.payload)
 
-    def _publisher_of(self, gid: bytes) -> _Publisher | None:
+    def _publisher_of(self, gid: bytes) -> Ros2Publisher | None:
         return self._by_gid.get(gid[:GID_BYTES]) or self._adopted.get(gid) or self._adopt(gid)
 
-    def _adopt(self, gid: bytes) -> _Publisher | None:
+    def _adopt(self, gid: bytes) -> Ros2Publisher | None:
         """The publisher of a GID that is of no token: one that has none yet, else the first."""
         taken, every = list(self._adopted.values()), list(self.publishers.values())
         found = next((each for each in every if each not in taken), every[0] if every else None)
@@ -380,7 +360,7 @@ class Ros2Import:
             self._adopted[gid] = found
         return found
 
-    def _deliver(self, publisher: _Publisher, payload: bytes, sequence: int) -> None:
+    def _deliver(self, publisher: Ros2Publisher, payload: bytes, sequence: int) -> None:
         if self.conversion is None:
             return
         try:
@@ -395,8 +375,8 @@ class Ros2Import:
         publisher.dropped += publisher.topic.publish(body)
 
     def _fail(self, text: str) -> None:
-        self._unconverted += 1
-        if self._unconverted == 1:
+        self.unconverted += 1
+        if self.unconverted == 1:
             self._say(text)
 
     def _say(self, text: str) -> None:
@@ -423,42 +403,19 @@ class Ros2Topics:
         """Why topics do not cross, by ``<topic> of <node>``."""
         self._exports: dict[str, dict[str, tuple[Export, Ros2Dialect]]] = {}
         """By name here, then by proxy."""
-        self._imports: dict[str, Ros2Import] = {}
-        """By key."""
+        self.imports: dict[str, Ros2Import] = {}
+        """ROS 2's topics in the gateway's graph, by key."""
         self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
-        for export, _ in self._every_export():
+        for export, _ in self.exports():
             export.close()
-        for imported in self._imports.values():
+        for imported in self.imports.values():
             imported.close()
 
-    def rows(self) -> Iterator[dict[str, object]]:
-        """The topics that cross, one row for each source."""
-        for export, dialect in self._every_export():
-            source = export.source
-            yield {
-                "direction": "out",
-                "here": source.here,
-                "module": source.module,
-                "node": source.node,
-                "type": source.type,
-                "ros2_type": "" if dialect.endpoint is None else dialect.endpoint.endpoint.type,
-                "latched": dialect.latched,
-                "wanted": export.wanted,
-                "rule": dialect.why,
-                "sent": export.messages,
-                "dropped": export.dropped,
-                "limited": export.limited,
-                "waiting": export.waiting,
-                "unconverted": dialect.unconverted,
-                "problem": export.problem,
-            }
-        for imported in self._imports.values():
-            yield from imported.report()
-
-    def _every_export(self) -> list[tuple[Export, Ros2Dialect]]:
+    def exports(self) -> list[tuple[Export, Ros2Dialect]]:
+        """The topics of modules in ROS 2's graph, each with its dialect."""
         return [each for exports in self._exports.values() for each in exports.values()]
 
     def _refuse(self, what: str, why: str) -> None:
@@ -505,7 +462,7 @@ class Ros2Topics:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""
         for other in list(self.context.ros2.at(dialect.source.here, *_TOPIC_ENDS)):
             self._compare(dialect, other)
-        for imported in self._imports.values():  # a type was learnt: topics whose fields were not known may have it
+        for imported in self.imports.values():  # a type was learnt: topics whose fields were not known may have it
             if imported.conversion is None:
                 with contextlib.suppress(NoConversion):
                     found = self.pairs.incoming(imported.first.type, imported.first.type_hash)
@@ -532,7 +489,7 @@ class Ros2Topics:
             self.context.say(what, "")
         if endpoint.kind is not EntityKind.PUBLISHER or "/_" in endpoint.name:
             return True  # ROS 2's tools hide what has such a name, as the topics of actions
-        imported = self._imports.get(endpoint.key())
+        imported = self.imports.get(endpoint.key())
         if there:
             self._add(endpoint, imported, what)
         else:
@@ -544,7 +501,7 @@ class Ros2Topics:
 
     def drop_idle(self, imported: Ros2Import) -> None:
         """A topic without publishers goes; one that was wanted stays for a while, as its publisher may restart."""
-        if imported.idle and self._imports.pop(imported.first.key(), None) is not None:
+        if imported.idle and self.imports.pop(imported.first.key(), None) is not None:
             imported.close()
 
     def _add(self, endpoint: Ros2Endpoint, imported: Ros2Import | None, what: str) -> None:
@@ -555,7 +512,7 @@ class Ros2Topics:
             if not decision.allowed:
                 self._refuse(what, decision.why)
                 return
-            imported = self._imports[endpoint.key()] = Ros2Import(self, endpoint, kind, decision)
+            imported = self.imports[endpoint.key()] = Ros2Import(self, endpoint, kind, decision)
             imported.add(endpoint)
         else:
             imported.add(endpoint)
@@ -581,5 +538,5 @@ class Ros2Topics:
             if imported.conversion is None:
                 imported.converted(None, str(error))
             return
-        for export, _ in self._every_export():
+        for export, _ in self.exports():
             export.start()

@@ -6,11 +6,10 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.context import BridgeContext
-from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
-from rmpa.gateway.rules import ACCESS, CrossingRules
+from rmpa.gateway.rules import CrossingRules
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.site import SiteNeighbour
@@ -18,13 +17,11 @@ from rmpa.gateway.sites.topics import SiteContext
 from rmpa.gateway.sites.why import KINDS, SiteWhy
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
-from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import SourceKind
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.sites.keys import SiteModule, SiteSource
     from rmpa.gateway.zenoh.session import OpenSession
@@ -35,24 +32,14 @@ class SiteAnswers:
 
     Args:
         sites: The neighbour "other sites".
-        gateway: This gateway's name.
         params: Asks modules of other sites about parameters.
-        may: ``(asker, access, name)``: whether a module of this site may have a topic or service, by its name here.
-            ``None``: trust is off, and each may have all.
     """
 
-    def __init__(
-        self,
-        sites: SiteNeighbour,
-        gateway: str,
-        params: SiteParams,
-        may: Callable[[str, Access, str], bool] | None = None,
-    ) -> None:
+    def __init__(self, sites: SiteNeighbour, params: SiteParams) -> None:
         self._sites = sites
-        self._gateway = gateway
+        self._rules = sites.context.rules
         self._params = params
-        self._may = may
-        self._why = SiteWhy(sites, gateway, may or (lambda _asker, _access, _name: True))
+        self._why = SiteWhy(sites)
 
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
@@ -74,13 +61,9 @@ class SiteAnswers:
             return await self._params.ask(asker, site, module, args)
         raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
 
-    def _tells(self, asker: str, kind: SourceKind, name: str) -> bool:
-        """Whether a module of this site is told of a topic or service that has this name here."""
-        return self._may is None or self._may(asker, ACCESS[kind], name)
-
     def _owns(self, asker: str, module: str) -> bool:
         """Whether what a module of this site has is told by this gateway: the others it asks itself."""
-        return self._may is None or asker in ("", module)
+        return not self._rules.secured or asker in ("", module)
 
     def _require(self, site: str) -> None:
         sites = self._sites.catalogue.sites
@@ -97,7 +80,7 @@ class SiteAnswers:
     def _report(self, names: list[str], asker: str, *, sources: bool) -> SitesReport:
         own, endpoints = self._sites.own, self._sites.context.session.endpoints
         return SitesReport(
-            gateway=self._gateway,
+            gateway=self._sites.context.graph.name,
             site=own.site,
             leads=self._sites.leads,
             rank=own.rank,
@@ -144,7 +127,7 @@ class SiteAnswers:
         refused = {
             source: why
             for source, why in self._sites.imports.refusals()
-            if source.site == name and self._tells(asker, source.kind, source.name)
+            if source.site == name and self._rules.tells(asker, source.kind, source.name)
         }
         rows: list[SiteSourceInfo] = []
         modules = []
@@ -167,7 +150,7 @@ class SiteAnswers:
     def _rows(self, module: SiteModule, asker: str, refused: Mapping[SiteSource, str]) -> Iterator[SiteSourceInfo]:
         for source in self._sites.catalogue.sources(module):
             entry = self._sites.imports.entry(source)
-            if self._tells(asker, source.kind, entry.source.name if entry is not None else source.name):
+            if self._rules.tells(asker, source.kind, entry.source.name if entry is not None else source.name):
                 yield SiteSourceInfo(
                     kind=KINDS[source.kind],
                     module=module.name,
@@ -193,8 +176,8 @@ def _counted(name: str, instance: str, sources: list[SiteSourceInfo]) -> SiteMod
 def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> SiteNeighbour:
     """Make the neighbour "other sites"; it is not started. ``settings.gateway.site`` is not empty."""
     gateway, agent = settings.gateway, graph.agent
-    gate, bridge = agent.bridge.gate, BridgeContext.of(settings)
-    rules = CrossingRules(gateway.rules, bridge, gate)
+    bridge = BridgeContext.of(settings)
+    rules = CrossingRules(gateway.rules, bridge, agent.bridge.gate)
     context = SiteContext(
         gateway.site, graph, session, rules, bridge, settings.make_contracts(), agent.bridge.counters
     )
@@ -207,14 +190,8 @@ def make_site_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
         where = f"site {gateway.site} as {module!r}"
         raise UnreachableError("module", where, "`rmpa peer list` there shows which are linked to its gateway")
 
-    def may_not(asker: str, parameter: str, told: str) -> str:
-        return "" if gate.admits(Access.PARAM, asker, parameter) else refusal(Access.PARAM, asker, told)
-
-    def may(asker: str, access: Access, source: str) -> bool:
-        return not asker or gate.judge(access, asker, source).allowed
-
-    params = SiteParams(context, ask_module, may_not if gate.on else None)
+    params = SiteParams(context, ask_module)
     neighbour.on_leads = lambda leads: params.lead(leads=leads)
     neighbour.closing.append(params.close)
-    agent.sites.serve(SiteAnswers(neighbour, settings.name, params, may if gate.on else None))
+    agent.sites.serve(SiteAnswers(neighbour, params))
     return neighbour

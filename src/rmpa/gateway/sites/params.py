@@ -275,19 +275,11 @@ class SiteParams:
     Args:
         context: What is shared with topics and services.
         ask: Asks a module of this site over the mesh: module, question, arguments; raises ``RmpaError``.
-        why_not: ``(asker, parameter, told)``: why a module of this site, which asks, may not have a parameter, by its
-            name at the other site; empty if it may. ``told`` is the name that it asked for. ``None``: trust is off.
     """
 
-    def __init__(
-        self,
-        context: SiteContext,
-        ask: Callable[[str, str, dict[str, Any]], Awaitable[object]],
-        why_not: Callable[[str, str, str], str] | None = None,
-    ) -> None:
+    def __init__(self, context: SiteContext, ask: Callable[[str, str, dict[str, Any]], Awaitable[object]]) -> None:
         self._context = context
         self._ask = ask
-        self._why_not = why_not
         self._queryable: Declaration | None = None
         self._answering = Answering(
             "parameters", f"the gateway of site {context.name} ends", limits.SITE_PARAMS_AT_ONCE
@@ -358,8 +350,13 @@ class SiteParams:
             raise PeerRefused(site, f"{module} is a module of this very site: ask it itself, by --peer {module}")
         what, key = str(args.get("what", "")), plain_key(str(args.get("key", "")))
         text = transfer.text_of(args) if what == transfer.SET else ""
-        why_not = partial(self._why_not, asker) if self._why_not is not None and asker else None
-        return await ask_judged(partial(self._other_site, asker, site, module), what, key, text, why_not)
+        rules = self._context.rules
+
+        def why_not(name: str, told: str) -> str:
+            return rules.denial(asker, name, Access.PARAM, told=told)
+
+        judge = why_not if asker and rules.secured else None
+        return await ask_judged(partial(self._other_site, asker, site, module), what, key, text, judge)
 
     async def _other_site(self, asker: str, site: str, module: str, what: str, args: dict[str, Any]) -> object:
         question = ParamQuestion(op=what.removeprefix("param."), askers=(asker,) if asker else (), **args)

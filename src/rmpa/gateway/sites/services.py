@@ -147,7 +147,7 @@ class ExportedService:
         if not why and self._part.is_full(size):
             why = f"{len(self.answering)} calls of service {source.name} wait already; try again later"
         if why:
-            self.answering.refuse(query, why)
+            query.reply_error(why)
         elif self.answering.take(query, partial(self._respond, md5)):
             self._part.waiting += size
 
@@ -164,22 +164,20 @@ class ExportedService:
         timeout = self._part.context.bridge.services.timeout(source.here)
         try:
             async with asyncio.timeout(timeout), self._slots:
-                known = self._description is not None and self._description.md5sum == md5
-                if md5 != NO_MD5 and not known:
-                    self._check(md5, await self._describe())  # a server that was replaced is asked once more
+                known = self._description
+                if md5 != NO_MD5 and (known is None or known.md5sum != md5):
+                    known = await self._describe()  # a server that was replaced is asked once more
+                    if md5 != known.md5sum:
+                        raise PeerRefused(
+                            source.module,
+                            f"the md5 sum of service {source.name} is {known.md5sum} ({known.type}) at its site, and "
+                            f"the client takes it for {md5}: another definition, or the server was replaced; build "
+                            "both from the same package",
+                        )
                 return bytes(await graph.call(source, request, timeout))
         except TimeoutError:
             text = f"service {source.name} of {source.module} has not answered in {timeout:g} s"
             raise PeerRefused(source.module, text) from None
-
-    def _check(self, md5: str, description: ServiceDescription) -> None:
-        if md5 != description.md5sum:
-            raise PeerRefused(
-                self._source.module,
-                f"the md5 sum of service {self._source.name} is {description.md5sum} ({description.type}) at its "
-                f"site, and the client takes it for {md5}: another definition, or the server was replaced; build "
-                "both from the same package",
-            )
 
     async def _describe(self) -> ServiceDescription:
         try:
@@ -206,8 +204,8 @@ class ImportedService:
         self._description: ServiceDescription | None = None
         self._numbers = itertools.count(1)
         self._asking: set[asyncio.Task[list[ZenohReply]]] = set()
-        self._calls = self._failed = 0
         self._problem = ""
+        self.calls = self.failed = 0
         self._shown = context.graph.show_service(entry.source, self._serve, self._describe)
 
     def renew(self, source: SiteSource) -> None:
@@ -220,10 +218,10 @@ class ImportedService:
         self._end_calls()
         self._shown.close()
 
-    def report(self) -> dict[str, object]:
-        """What ``rmpa why`` is answered from, as JSON values."""
-        problem = self._shown.problem or self._problem
-        return {"calls": self._calls, "failed": self._failed, "problem": problem}
+    @property
+    def problem(self) -> str:
+        """Why it cannot be called, or why the last call failed; empty for nothing."""
+        return self._shown.problem or self._problem
 
     def _end_calls(self) -> None:
         for task in self._asking:
@@ -235,12 +233,12 @@ class ImportedService:
         Raises:
             PeerRefused: Its server, or its site's gateway, answered with an error; the reason is its text.
         """
-        self._calls += 1
+        self.calls += 1
         md5 = self._description.md5sum if self._description is not None else NO_MD5
         try:
             return await self._ask("", request, md5, self._context.bridge.services.timeout(self._here))
         except PeerRefused as error:
-            self._failed += 1
+            self.failed += 1
             self._problem = error.reason
             raise
 
@@ -294,7 +292,7 @@ class SiteServices:
         """Bytes of the requests of other sites that are under way here."""
         self._exported: dict[tuple[str, str, str], ExportedService] = {}
         """By module, service and the site that it is for."""
-        self._imported: dict[ForeignSource, ImportedService] = {}
+        self.imported: dict[ForeignSource, ImportedService] = {}
         self._ending: list[Answering] = []
 
     def is_full(self, size: int) -> bool:
@@ -313,20 +311,15 @@ class SiteServices:
 
     def show(self, entry: SiteImport) -> None:
         """Show a service of another site."""
-        self._imported[entry.source] = ImportedService(entry, self.context)
+        self.imported[entry.source] = ImportedService(entry, self.context)
 
     def renew(self, entry: SiteImport) -> None:
         """It is of another run of its module, or its way was interrupted."""
-        self._imported[entry.source].renew(entry.announced)
+        self.imported[entry.source].renew(entry.announced)
 
     def hide(self, entry: SiteImport) -> None:
         """Take a service back."""
-        self._imported.pop(entry.source).close()
-
-    def imported(self, entry: SiteImport) -> dict[str, object]:
-        """What ``rmpa why`` is answered from, as JSON values; empty for nothing."""
-        found = self._imported.get(entry.source)
-        return found.report() if found is not None else {}
+        self.imported.pop(entry.source).close()
 
     async def close(self) -> None:
         """End calls under way with an error."""

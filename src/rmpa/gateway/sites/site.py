@@ -88,8 +88,8 @@ class SiteNeighbour:
             declared.close()
 
     def report(self) -> dict[str, object]:
-        """Which sites are there, and what crosses, as JSON values."""
-        return {"sites": self.catalogue.sites, "leads": self.leads, "topics": self.topics.report()}
+        """Which sites are there, as JSON values."""
+        return {"sites": self.catalogue.sites, "leads": self.leads}
 
     # --- changes --------------------------------------------------------------------------------------------------
 
@@ -151,6 +151,7 @@ class SiteNeighbour:
     def _lead(self) -> None:
         _log.info("= this gateway leads site %s", self.own.site)
         self.leads = True
+        self.topics.lead(leads=True)
         self.on_leads(True)
         items: list[SiteModule | SiteExport] = [*self.exports.modules, *self.exports.entries]
         for item in items:
@@ -166,6 +167,7 @@ class SiteNeighbour:
             for item in items:
                 self._own_changed(item, there=False)
             self.leads = False
+            self.topics.lead(leads=False)
             self.on_leads(False)
 
     def _own_changed(self, item: SiteModule | SiteExport, there: bool) -> None:
@@ -175,9 +177,7 @@ class SiteNeighbour:
             token = (item if isinstance(item, SiteModule) else item.announced).token()
             if not there:
                 self._tokens.pop(token).close()
-            if isinstance(item, SiteModule):
-                self.topics.answer_for(item, there=there)
-            else:
+            if not isinstance(item, SiteModule):
                 topic = item.source.kind is SourceKind.TOPIC
                 part = self.topics if topic else self.services
                 (part.export if there else part.withdraw)(item)

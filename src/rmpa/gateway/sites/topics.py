@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rmpa.gateway.neighbour import ZenohSample
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules
-    from rmpa.gateway.sites.keys import SiteModule
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
@@ -158,7 +157,7 @@ class ImportedTopic:
 
     # More than twelve fields: demand, header, and the counts of what was lost meanwhile change each other.
 
-    def __init__(self, entry: SiteImport, part: SiteTopics, interrupted: Interrupted | None) -> None:
+    def __init__(self, entry: SiteImport, part: SiteTopics, interrupted: Interrupted | None = None) -> None:
         now = time.monotonic()
         self.entry = entry
         self.wanted = False
@@ -167,13 +166,13 @@ class ImportedTopic:
         self._description: TopicDescription | None = None
         self._problem = ""
         self._held: deque[tuple[bytes, str]] = deque()
-        self._sequence, self._messages = interrupted or (SequenceCounter(), 0)
+        self._sequence, self.messages = interrupted or (SequenceCounter(), 0)
         self._resumes_until = 0.0 if interrupted is None else now + limits.RESUMED_WITHIN
-        self._rate_of = 0.0, now, self._messages
+        self._rate_since = 0.0, now, self.messages
         self._fresh = False
         self._run = 0
         self._last_latched: bytes | None = None
-        self._mismatched = self._dropped = 0
+        self.mismatched = self.dropped = 0
         self._task: asyncio.Task[None] | None = None
         self._linger: asyncio.TimerHandle | None = None
         self._checking: asyncio.TimerHandle | None = None
@@ -184,7 +183,7 @@ class ImportedTopic:
         if not self._sequence.take(source.run, sequence):
             return
         self._fresh = True
-        self._messages += 1
+        self.messages += 1
         if source.latched:
             renewed, self._run = source.run != self._run, source.run
             if renewed and payload == self._last_latched:
@@ -193,7 +192,7 @@ class ImportedTopic:
         if self._description is None or source.md5 != self._description.md5sum:
             self._hold(payload, source.md5)
         else:
-            self._dropped += self._topic.publish(payload)
+            self.dropped += self._topic.publish(payload)
 
     def renew(self, entry: SiteImport) -> None:
         """Its module has started anew, or the way to it was interrupted: ask for the header again."""
@@ -209,29 +208,30 @@ class ImportedTopic:
         if self.wanted:
             self._ask()
 
-    def report(self) -> dict[str, object]:
-        """What ``rmpa why`` is answered from, as JSON values."""
-        rate, since, before = self._rate_of
+    @property
+    def lost(self) -> int:
+        """Messages that were lost between the gateways."""
+        return self._sequence.lost
+
+    @property
+    def problem(self) -> str:
+        """Why its messages do not come, or are not understood; empty for nothing."""
+        return self._problem or self._topic.problem
+
+    def rate(self) -> float:
+        """Messages a second since this was last asked."""
+        rate, since, before = self._rate_since
         passed = time.monotonic() - since
         if passed >= 1:
-            rate = (self._messages - before) / passed
-            self._rate_of = rate, since + passed, self._messages
-        return {
-            "name": self.entry.announced.name,
-            "wanted": self.wanted,
-            "messages": self._messages,
-            "rate": round(rate, 2),
-            "lost": self._sequence.lost,
-            "mismatched": self._mismatched,
-            "dropped": self._dropped,
-            "problem": self._problem or self._topic.problem,
-        }
+            rate = (self.messages - before) / passed
+            self._rate_since = rate, since + passed, self.messages
+        return rate
 
     def close(self) -> Interrupted | None:
         """Take it out of the graph; what it returns is for the same topic once it is back."""
         interrupted = None
         if self.wanted and self._linger is None:
-            interrupted = self._sequence, self._messages
+            interrupted = self._sequence, self.messages
             self._sequence = SequenceCounter()
         if self._task is not None:
             self._task.cancel()
@@ -339,9 +339,9 @@ class ImportedTopic:
         held, self._held = self._held, deque()
         for payload, md5 in held:
             if md5 == header.md5sum:
-                self._dropped += self._topic.publish(payload)
+                self.dropped += self._topic.publish(payload)
             else:
-                self._mismatched += 1
+                self.mismatched += 1
 
     def _hold(self, payload: bytes, md5: str) -> None:
         """Keep a message until the header is known, or known anew: its publisher has another definition."""
@@ -349,7 +349,7 @@ class ImportedTopic:
         size = sum(len(each) for each, _ in self._held) if len(payload) > limits.LARGE_MESSAGE else 0
         while len(self._held) > limits.HELD_MESSAGES_MAX or (size > limits.HELD_BYTES and len(self._held) > 1):
             size -= len(self._held.popleft()[0])
-            self._dropped += 1
+            self.dropped += 1
         if self._description is not None:
             self._problem = f"its messages have the md5 sum {md5}, its header {self._description.md5sum}"
         self._ask()
@@ -386,7 +386,7 @@ class SiteTopics:
         self._imported: dict[_Ident, ImportedTopic] = {}
         self._interrupted: dict[_Ident, Interrupted] = {}
         self._subscriptions: dict[str, _Subscription] = {}
-        self._questions: dict[SiteModule, tuple[Declaration, Declaration]] = {}
+        self._questions: tuple[Declaration, ...] = ()
         self._reader = AttachmentReader()
         self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
 
@@ -424,33 +424,29 @@ class SiteTopics:
             if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
                 del self._interrupted[next(iter(self._interrupted))]
 
-    def answer_for(self, module: SiteModule, *, there: bool) -> None:
-        """Answer questions for headers and definitions of a module of this site, or end that."""
-        if not there:
-            for declared in self._questions.pop(module, ()):
-                declared.close()
-            return
-        prefix, session = f"{ROOT}/{module.site}/{module.name}/d", self.context.session
-        self._questions[module] = (
-            session.queryable(f"{prefix}/t/**", partial(self._asked_header, module), _HEADER_NEEDS),
-            session.queryable(f"{prefix}/m/*", partial(self._asked_definition, module), _DEFINITION_NEEDS),
+    def lead(self, *, leads: bool) -> None:
+        """Answer questions for headers and definitions while this gateway leads its site."""
+        for declared in self._questions:
+            declared.close()
+        prefix, session = f"{ROOT}/{self.context.name}/*/d", self.context.session
+        self._questions = (
+            (
+                session.queryable(f"{prefix}/t/**", self._asked_header, _HEADER_NEEDS),
+                session.queryable(f"{prefix}/m/*", self._asked_definition, _DEFINITION_NEEDS),
+            )
+            if leads
+            else ()
         )
 
-    def exported(self, entry: SiteExport) -> dict[str, object]:
-        """What ``rmpa why`` is answered from of a topic that goes out, as JSON values; empty for none."""
+    def exported(self, entry: SiteExport) -> Export | None:
+        """A topic that goes out."""
         topics = self._exported.get((entry.source.module, entry.source.name), {})
         found = topics.get((entry.source.node, entry.announced.to))
-        return _report(entry.announced.to, found[0]) if found is not None else {}
+        return found[0] if found is not None else None
 
-    def imported(self, entry: SiteImport) -> dict[str, object]:
-        """Likewise of one that comes in."""
-        found = self._imported.get(_ident(entry))
-        return found.report() if found is not None else {}
-
-    def report(self) -> dict[str, object]:
-        """The topics that go out and come in."""
-        out = [_report(to, one) for nodes in self._exported.values() for (_, to), (one, _) in nodes.items()]
-        return {"out": out, "in": [topic.report() for topic in self._imported.values()]}
+    def imported(self, entry: SiteImport) -> ImportedTopic | None:
+        """A topic that comes in."""
+        return self._imported.get(_ident(entry))
 
     async def close(self) -> None:
         """End it: everything was withdrawn and hidden before."""
@@ -500,17 +496,18 @@ class SiteTopics:
 
     # --- questions of other sites -----------------------------------------------------------------------------------
 
-    def _asked_header(self, module: SiteModule, query: ArrivedQuery) -> None:
-        name = query.key.removeprefix(f"{ROOT}/{module.site}/{module.name}/d/t")
+    def _asked_header(self, query: ArrivedQuery) -> None:
+        module, _, topic = query.key.removeprefix(f"{ROOT}/{self.context.name}/").partition("/d/t/")
+        name = f"/{topic}"
         asked = dict(pair.partition("=")[::2] for pair in query.parameters.split(";"))
         node, site = asked.get("node", ""), asked.get("site", "")
-        if refusal := self.context.rules.refusal(site, module.name, name):
+        if refusal := self.context.rules.refusal(site, module, name):
             query.reply_error(f"{REFUSED}{refusal}")
             return
-        topics = self._exported.get((module.name, name), {}).items()
+        topics = self._exported.get((module, name), {}).items()
         found = next((each for (its, to), each in topics if node in ("", its) and to in ("", site)), None)
         if found is None:
-            query.reply_error(f"no such publisher of {name[:200]} at {module.name}")
+            query.reply_error(f"no such publisher of {name[:200]} at {module[:64]}")
         else:
             self._headers.take(query, partial(self._header, *found))
 
@@ -522,28 +519,15 @@ class SiteTopics:
         told = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)
         return msgspec.json.encode(told), b""
 
-    def _asked_definition(self, module: SiteModule, query: ArrivedQuery) -> None:
-        md5 = query.key.rpartition("/")[2]
-        of_module = (nodes for (name, _), nodes in self._exported.items() if name == module.name)
+    def _asked_definition(self, query: ArrivedQuery) -> None:
+        module, _, md5 = query.key.removeprefix(f"{ROOT}/{self.context.name}/").partition("/d/m/")
+        of_module = (nodes for (name, _), nodes in self._exported.items() if name == module)
         for about in (export.about for nodes in of_module for export, _ in nodes.values()):
             if about is not None and about.md5sum == md5:
                 query.reply(query.key, about.definition.encode(errors="surrogateescape"))
                 query.finish()
                 return
         query.reply_error(f"no publisher with the md5 sum {md5[:40]} was connected yet")
-
-
-def _report(to: str, export: Export) -> dict[str, object]:
-    return {
-        "name": export.source.name,
-        "to": to,
-        "wanted": export.wanted,
-        "messages": export.messages,
-        "waiting": export.waiting,
-        "dropped": export.dropped,
-        "limited": export.limited,
-        "problem": export.problem,
-    }
 
 
 def _ident(entry: SiteImport) -> _Ident:

@@ -9,7 +9,7 @@ they are told, between those of the site and its own::
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
@@ -21,6 +21,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.rules import ACCESS
 from rmpa.gateway.sites.keys import GATEWAY, ROOT
+from rmpa.gateway.sites.services import ImportedService
 from rmpa.observe.peer_info import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
 from rmpa.ros.wire.tcpros import printable
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.site import SiteNeighbour
+    from rmpa.gateway.sites.topics import ImportedTopic
+    from rmpa.gateway.topics import Export
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -43,7 +46,7 @@ KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
 """The words for what a source is."""
 _DEMAND_THERE: Final = "demand there"
 _NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
-_ROUTER: Final = "allow it by [[permission]] of the router, for the names of both gateways (zenohd: access_control)"
+_ROUTER: Final = "see access_control of the router, if it is a zenohd with rules of your own"
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
 _PERMISSIONS: Final = (
     "change [[permission]] in the rmpa.toml of the gateway of {} and of its modules, and reload them"
@@ -113,51 +116,53 @@ def _printable(stage: Check) -> Check:
 # The stages, from what a part of the neighbour reports of a topic or service.
 
 
-def sent_stages(site: str, report: Mapping[str, Any], *, asked: bool) -> list[Check]:
+def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:
     """The stages of a topic behind its rule at the exporting gateway.
 
     Args:
         site: Its site.
-        report: What is reported of it.
+        export: The topic.
         asked: Whether another site asks, which knows whether it subscribes; else it is a fault that none does.
     """
-    if not report.get("wanted"):
+    if not export.wanted:
         text = f"no other site subscribes, as the gateway of {site} hears: nothing is sent"
         return [Check(_DEMAND_THERE, WARN if asked else FAIL, text, _NO_DEMAND)]
-    waiting = f", {report['waiting']} wait" if report.get("waiting") else ""
-    text = f"the gateway of {site} has sent {report.get('messages', 0)} messages{waiting}"
-    sent = Check("sent", OK if report.get("messages") else WARN, text)
-    if lost := _lost(report, _SENT_LOSSES):
-        remedy = "rate and size of a [[gateway.rule]] say what may be left out; a contract says what goes first"
-        sent = Check("sent", WARN, f"{text}; {', '.join(lost)}", remedy)
+    waiting = f", {export.waiting} wait" if export.waiting else ""
+    text = f"the gateway of {site} has sent {export.messages} messages{waiting}"
+    lost = _lost(export, _SENT_LOSSES)
+    remedy = "rate and size of a [[gateway.rule]] say what may be left out; a contract says what goes first"
+    sent = Check(
+        "sent", OK if export.messages and not lost else WARN, "; ".join((text, *lost)), remedy if lost else ""
+    )
     return [Check(_DEMAND_THERE, OK, "another site subscribes"), sent]
 
 
-def here_stages(entry: SiteImport, report: Mapping[str, Any]) -> list[Check]:
-    """The stages of the importing site for what is shown there, by what is reported of it."""
+def here_stages(entry: SiteImport, found: ImportedTopic | ImportedService | None) -> list[Check]:
+    """The stages of the importing site for what is shown there; ``found`` is ``None`` if it does not lead."""
     source, there, topic = entry.source, entry.announced.name, entry.source.kind is SourceKind.TOPIC
     was = f" (its {there})" if source.name != there else ""
     shown = f"it is {source.name} here{was}, at /rmpa/{source.site}/{source.module}{source.node}"
     stages = [Check("rule here", OK, entry.why or "it may come in"), Check("shown", OK, shown)]
-    if problem := str(report.get("problem", "")):
-        name = "md5" if "md5" in problem else "header" if topic else "calls"
-        return [*stages, Check(name, FAIL if topic else WARN, problem, _ROUTER if name == "header" else "")]
-    if not topic:
-        text = f"{report.get('calls', 0)} calls from here, {report.get('failed', 0)} failed"
-        return [*stages, Check("calls", OK, text)]
-    if not report.get("wanted"):
+    if found is None:
+        return stages
+    if found.problem:
+        name = "md5" if "md5" in found.problem else "header" if topic else "calls"
+        return [*stages, Check(name, FAIL if topic else WARN, found.problem, _ROUTER if name == "header" else "")]
+    if isinstance(found, ImportedService):
+        return [*stages, Check("calls", OK, f"{found.calls} calls from here, {found.failed} failed")]
+    if not found.wanted:
         text = "no node of this site subscribes: it crosses once one does"
         return [*stages, Check("demand here", FAIL, text, _NO_DEMAND)]
     stages.append(Check("demand here", OK, "a node of this site subscribes"))
-    if not report.get("messages"):
+    if not found.messages:
         return [*stages, Check("arrived", WARN, "no message has come since then", "does its publisher publish?")]
-    lost = _lost(report, _ARRIVED_LOSSES)
-    text = f"{report['messages']} messages have come, {float(report.get('rate', 0)):.1f} Hz"
+    lost = _lost(found, _ARRIVED_LOSSES)
+    text = f"{found.messages} messages have come, {found.rate():.1f} Hz"
     return [*stages, Check("arrived", WARN if lost else OK, "; ".join((text, *lost)))]
 
 
-def _lost(report: Mapping[str, Any], losses: Mapping[str, str]) -> list[str]:
-    return [f"{report[key]} {words}" for key, words in losses.items() if report.get(key)]
+def _lost(topic: Export | ImportedTopic, losses: Mapping[str, str]) -> list[str]:
+    return [f"{getattr(topic, key)} {words}" for key, words in losses.items() if getattr(topic, key)]
 
 
 def _refused_stage(where: str, refused: str, site: str) -> Check:
@@ -190,14 +195,11 @@ class SiteWhy:
 
     Args:
         sites: Its neighbour "other sites".
-        gateway: This gateway's name among its peers.
-        may: ``(asker, access, name)``: whether a module of this site may have a topic or service, by its name here.
     """
 
-    def __init__(self, sites: SiteNeighbour, gateway: str, may: Callable[[str, Access, str], bool]) -> None:
+    def __init__(self, sites: SiteNeighbour) -> None:
         self._sites = sites
-        self._gateway = gateway
-        self._may = may
+        self._rules = sites.context.rules
         self._site = sites.own.site
         self._queryable = sites.context.session.queryable(_why_key(self._site), self._take, _NEEDS)
         sites.closing.append(self.close)
@@ -234,14 +236,14 @@ class SiteWhy:
         told = [
             (there, entry, why)
             for there, entry, why in (*shown, *(each for each in refused if each[0].name == name))
-            if self._may(asker, ACCESS[there.kind], entry.source.name if entry is not None else there.name)
+            if self._rules.tells(asker, there.kind, entry.source.name if entry is not None else there.name)
         ]
         ways = list(await asyncio.gather(*(self._way(*each) for each in told)))
-        permitted = [kind for kind in kinds if self._may(asker, ACCESS[kind], name)]
+        permitted = [kind for kind in kinds if self._rules.tells(asker, kind, name)]
         if site and not ways and permitted:
             ways.append(await self._no_way(name, site, module, permitted))
         elif site and not ways:
-            denied = permission_there(self._gateway, asker, ACCESS[kinds[0]], name)
+            denied = permission_there(self._sites.context.graph.name, asker, ACCESS[kinds[0]], name)
             ways.append(self._diagnosis(name, f"{site}/{module}" if module else site, "", kinds[0], [denied]))
         if site:
             return ways
@@ -262,14 +264,13 @@ class SiteWhy:
         mine = KINDS[there.kind], module
         told = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
         stages = [self._site_stage(site), *_told(site, module, there.name, told, refusal)]
+        topic = self._sites.topics.imported(entry) if entry is not None else None
         if entry is None:
-            here, report = [_refused_stage("here", refused, self._site)], {}
+            here = [_refused_stage("here", refused, self._site)]
         else:
-            part = self._sites.topics if there.kind is SourceKind.TOPIC else self._sites.services
-            report = part.imported(entry)
-            here = here_stages(entry, report)
+            here = here_stages(entry, topic or self._sites.services.imported.get(entry.source))
         unheard = next((at for at, stage in enumerate(stages) if stage.name == _DEMAND_THERE), None)
-        if unheard is not None and stages[unheard].level is not OK and report.get("wanted"):
+        if unheard is not None and stages[unheard].level is not OK and topic is not None and topic.wanted:
             text = f"a node here subscribes, and the gateway of {site} hears of none: a router keeps it back"
             stages[unheard] = Check("router", FAIL, text, _ROUTER)
         name = entry.source.name if entry is not None else there.name
@@ -313,18 +314,17 @@ class SiteWhy:
 
     def _leaving(self, meant: Callable[[MeshSource], bool], asking: str = "") -> Iterator[Diagnosis]:
         """The ways of sources of this site to the one that is ``asking``; empty: for its own module, to all."""
-        rules, exports = self._sites.context.rules, self._sites.exports
-        for source, entries in exports.offered():
+        for source, entries in self._sites.exports.offered():
             if not meant(source):
                 continue
             if not asking:
                 yield from (self._way_out(source, "", entry, "") for entry in entries)
                 continue
             entry = next((each for each in entries if each.announced.to in ("", asking)), None)
-            refused = rules.refusal(asking, source.module, source.name, ACCESS[source.kind])
+            refused = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind])
             if entry is not None or refused:
                 yield self._way_out(source, asking, entry, refused)
-        for source, why in exports.refusals():
+        for source, why in self._sites.exports.refusals():
             if meant(source):
                 yield self._way_out(source, asking, None, why)
 
@@ -335,15 +335,14 @@ class SiteWhy:
         if refused or entry is None:
             stages.append(_refused_stage(where, refused, self._site))
         else:
-            rules = self._sites.context.rules
+            rules = self._rules
             rule = rules.outgoing_to(to, source.module, source.name) if to else rules.outgoing(source)
             stages.append(Check(f"rule {where}", OK, rule.why))
-            if source.kind is SourceKind.TOPIC:
-                report = self._sites.topics.exported(entry)
-                if problem := report.get("problem"):
+            if (export := self._sites.topics.exported(entry)) is not None:
+                if export.problem:
                     remedy = f"`rmpa why {source.name}` at {self._site}"
-                    stages.append(Check(f"publisher {where}", FAIL, str(problem), remedy))
-                stages += sent_stages(self._site, report, asked=bool(asking))
+                    stages.append(Check(f"publisher {where}", FAIL, export.problem, remedy))
+                stages += sent_stages(self._site, export, asked=bool(asking))
         return Diagnosis.of(
             until_failure(stages),
             kind=KINDS[source.kind],
@@ -385,8 +384,7 @@ class SiteWhy:
             query.reply_error(str(error))
             return
         kinds = (SourceKind.SERVICE,) if question.service else tuple(ACCESS)
-        rules = self._sites.context.rules
-        denials = {kind: rules.denial(question.site, question.name, ACCESS[kind]) for kind in kinds}
+        denials = {kind: self._rules.denial(question.site, question.name, ACCESS[kind]) for kind in kinds}
 
         def meant(source: MeshSource) -> bool:
             named = source.name == question.name and question.module in ("", source.module)

@@ -7,22 +7,27 @@ output of foxglove-sdk, whose order of fields is kept.
 
 from __future__ import annotations
 
+import base64
+import binascii
+import math
 import struct
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.limits import UINT32_MAX
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.core.identity import is_global_name
+from rmpa.core.limits import INT32_MAX, INT32_MIN, UINT32_MAX
 from rmpa.web import limits
+from rmpa.web.gateways.frame_writer import Opcode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
-    from rmpa.web.hub.requests import Payload
+    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.hub.node_link import ParamValue, Payload
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """The names of the WebSocket subprotocol, preferred first; the messages here are the same in both."""
@@ -30,6 +35,9 @@ ENCODING: Final = "ros1"
 """The encoding of all messages: what crosses TCPROS, undecoded."""
 SCHEMA_ENCODING: Final = "ros1msg"
 """The encoding of all schemas: a message definition with its dependencies, as in a TCPROS header."""
+WARNING: Final = 1
+ERROR: Final = 2
+"""Levels of a status."""
 
 
 def choose_subprotocol(offered: Iterable[str]) -> str | None:
@@ -38,203 +46,24 @@ def choose_subprotocol(offered: Iterable[str]) -> str | None:
     return next((name for name in SUBPROTOCOLS if name in names), None)
 
 
-class Capability(StrEnum):
-    """An optional feature that a server offers to a client, by its name in ``serverInfo``."""
-
-    CLIENT_PUBLISH = "clientPublish"
-    PARAMETERS = "parameters"
-    PARAMETERS_SUBSCRIBE = "parametersSubscribe"
-    SERVICES = "services"
-    TIME = "time"
-    CONNECTION_GRAPH = "connectionGraph"
-    ASSETS = "assets"
-
-
-class StatusLevel(IntEnum):
-    """The severity of a status message."""
-
-    INFO = 0
-    WARNING = 1
-    ERROR = 2
-
-
 # --- from the server: JSON ---
 
 
-class FromServer(msgspec.Struct, frozen=True, kw_only=True, rename="camel", tag_field="op", omit_defaults=True):
-    """A JSON message of the server."""
-
-    def frame(self) -> TextFrame:
-        """The message as a text frame."""
-        return TextFrame(encode_json(self))
+def message(op: str, **fields: object) -> OutFrame:
+    """A JSON message; ``None`` leaves a field out."""
+    values = {"op": op} | {name: value for name, value in fields.items() if value is not None}
+    return Opcode.TEXT, (encode_json(values),)
 
 
-class _Part(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
-    """A part of a server's message."""
+def status(level: int, text: str, identity: str = "") -> OutFrame:
+    """A text for users; a later one with the same ``identity`` replaces it."""
+    return message("status", level=level, message=text, id=identity or None)
 
 
-class ServerInfo(FromServer, frozen=True, kw_only=True, tag="serverInfo"):
-    """The first message to each client.
-
-    Attributes:
-        name: Of the server, for users.
-        capabilities: What it offers beyond subscriptions.
-        supported_encodings: Of messages that clients publish, and of service calls.
-        metadata: ``ROS_DISTRO = noetic`` tells a client that the data are ROS 1's.
-        session_id: The same for all clients of one run of the server, which tells a restart from a reconnection.
-    """
-
-    name: str
-    capabilities: tuple[Capability, ...]
-    supported_encodings: tuple[str, ...] = ()
-    metadata: dict[str, str] = {}
-    session_id: str = ""
-
-
-class FoxgloveStatus(FromServer, frozen=True, kw_only=True, tag="status"):
-    """A text for users; a later one with the same ``id`` replaces it."""
-
-    level: int
-    message: str
-    id: str = ""
-
-
-class RemoveStatus(FromServer, frozen=True, kw_only=True, tag="removeStatus"):
-    """Status messages that are no longer valid."""
-
-    status_ids: tuple[str, ...]
-
-
-class Channel(_Part, frozen=True, kw_only=True):
-    """A topic with one type that a client may subscribe to."""
-
-    id: int
-    topic: str
-    encoding: str
-    schema_name: str
-    schema_encoding: str | UnsetType = UNSET
-    schema: str
-
-
-class FoxgloveAdvertise(FromServer, frozen=True, kw_only=True, tag="advertise"):
-    """New channels."""
-
-    channels: tuple[Channel, ...]
-
-
-class FoxgloveUnadvertise(FromServer, frozen=True, kw_only=True, tag="unadvertise"):
-    """Channels that are gone; their subscriptions have ended."""
-
-    channel_ids: tuple[int, ...]
-
-
-class ServiceSchema(_Part, frozen=True, kw_only=True):
-    """The type of a service's request or response."""
-
-    encoding: str
-    schema_name: str
-    schema_encoding: str
-    schema: str
-
-
-class FoxgloveService(_Part, frozen=True, kw_only=True):
-    """A service that a client may call."""
-
-    id: int
-    name: str
-    type: str
-    request: ServiceSchema
-    response: ServiceSchema
-
-
-class FoxgloveAdvertiseServices(FromServer, frozen=True, kw_only=True, tag="advertiseServices"):
-    """New services."""
-
-    services: tuple[FoxgloveService, ...]
-
-
-class FoxgloveUnadvertiseServices(FromServer, frozen=True, kw_only=True, tag="unadvertiseServices"):
-    """Services that are gone."""
-
-    service_ids: tuple[int, ...]
-
-
-class ServiceCallFailure(FromServer, frozen=True, kw_only=True, tag="serviceCallFailure"):
-    """A call has failed."""
-
-    service_id: int
-    call_id: int
-    message: str
-
-
-ParameterType: TypeAlias = Literal["byte_array", "float64", "float64_array"]
-
-
-class FoxgloveParameter(_Part, frozen=True, kw_only=True):
-    """A parameter in a message of either side.
-
-    Attributes:
-        name: Its global name.
-        type: ``byte_array``: ``value`` is base64 text. ``float64`` and ``float64_array``: numbers are floating-point
-            ones, also where JSON shows whole ones.
-        value: What JSON can hold (``parameters`` checks it); unset for a parameter that is deleted.
-    """
-
-    name: Annotated[str, Meta(max_length=limits.FOXGLOVE_NAME_MAX)]
-    type: ParameterType | UnsetType = UNSET
-    value: object = UNSET
-
-
-class ParameterValues(FromServer, frozen=True, kw_only=True, tag="parameterValues"):
-    """Values of parameters: the answer to the request ``id``, or an update."""
-
-    parameters: tuple[FoxgloveParameter, ...]
-    id: str | UnsetType = UNSET
-
-
-class PublishedTopic(_Part, frozen=True, kw_only=True):
-    """All publishers of a topic, by their nodes' names."""
-
-    name: str
-    publisher_ids: tuple[str, ...]
-
-
-class SubscribedTopic(_Part, frozen=True, kw_only=True):
-    """All subscribers of a topic, by their nodes' names."""
-
-    name: str
-    subscriber_ids: tuple[str, ...]
-
-
-class AdvertisedService(_Part, frozen=True, kw_only=True):
-    """All providers of a service, by their nodes' names."""
-
-    name: str
-    provider_ids: tuple[str, ...]
-
-
-class ConnectionGraphUpdate(FromServer, frozen=True, kw_only=True, tag="connectionGraphUpdate"):
-    """What has changed in the graph: each entry replaces the earlier one of its name."""
-
-    published_topics: tuple[PublishedTopic, ...]
-    subscribed_topics: tuple[SubscribedTopic, ...]
-    advertised_services: tuple[AdvertisedService, ...]
-    removed_topics: tuple[str, ...]
-    removed_services: tuple[str, ...]
-
-
-ServerMessage: TypeAlias = (
-    ServerInfo
-    | FoxgloveStatus
-    | RemoveStatus
-    | FoxgloveAdvertise
-    | FoxgloveUnadvertise
-    | FoxgloveAdvertiseServices
-    | FoxgloveUnadvertiseServices
-    | ServiceCallFailure
-    | ParameterValues
-    | ConnectionGraphUpdate
-)
+def parameter_values(values: Mapping[str, ParamValue], identity: str | None = None) -> OutFrame:
+    """Values of parameters: the answer to the request ``identity``, or an update."""
+    parameters = [to_parameter(name, value) for name, value in values.items()]
+    return message("parameterValues", parameters=parameters, id=identity)
 
 
 def encode_json(message: object) -> bytes:
@@ -255,33 +84,7 @@ def _clean(value: object) -> object:
     return value
 
 
-# --- from the server: frames ---
-
-
-@dataclass(frozen=True, slots=True)
-class TextFrame:
-    """A text frame: JSON in UTF-8."""
-
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class BinaryFrame:
-    """A binary frame, written as ``header`` and then ``payload``, which is the sender's own buffer and not copied."""
-
-    header: bytes
-    payload: Payload = b""
-
-    def __len__(self) -> int:
-        """Bytes of the frame's contents."""
-        return len(self.header) + len(self.payload)
-
-    def __bytes__(self) -> bytes:
-        """The contents as one value: a copy, for tests and for writers that need one."""
-        return self.header + bytes(self.payload)
-
-
-FoxgloveFrame: TypeAlias = TextFrame | BinaryFrame
+# --- from the server: binary ---
 
 _DATA: Final = struct.Struct("<BIQ")
 _TIME: Final = struct.Struct("<BQ")
@@ -290,129 +93,99 @@ _ASSET: Final = struct.Struct("<BIBI")
 _UINT64_MAX: Final = (1 << 64) - 1
 
 
-def message_data(subscription: int, stamp_ns: int, payload: Payload) -> BinaryFrame:
+def message_data(subscription: int, stamp_ns: int, payload: Payload) -> OutFrame:
     """A message of a subscription; ``stamp_ns`` is its time of receipt, nanoseconds since the epoch."""
-    return BinaryFrame(_DATA.pack(1, subscription, min(max(stamp_ns, 0), _UINT64_MAX)), payload)
+    return _binary(_DATA.pack(1, subscription, min(max(stamp_ns, 0), _UINT64_MAX)), payload)
 
 
-def server_time(stamp_ns: int) -> BinaryFrame:
+def server_time(stamp_ns: int) -> OutFrame:
     """The server's time where it is not the wall clock's, in nanoseconds."""
-    return BinaryFrame(_TIME.pack(2, min(max(stamp_ns, 0), _UINT64_MAX)))
+    return _binary(_TIME.pack(2, min(max(stamp_ns, 0), _UINT64_MAX)))
 
 
-def service_response(service: int, call: int, payload: Payload) -> BinaryFrame:
+def service_response(service: int, call: int, payload: Payload) -> OutFrame:
     """The response to a call."""
-    return BinaryFrame(_SERVICE.pack(3, service, call, len(ENCODING)) + ENCODING.encode(), payload)
+    return _binary(_SERVICE.pack(3, service, call, len(ENCODING)) + ENCODING.encode(), payload)
 
 
-def asset_response(request: int, data: Payload) -> BinaryFrame:
+def asset_response(request: int, data: Payload) -> OutFrame:
     """A fetched asset."""
-    return BinaryFrame(_ASSET.pack(4, request, 0, 0), data)
+    return _binary(_ASSET.pack(4, request, 0, 0), data)
 
 
-def asset_failure(request: int, error: str) -> BinaryFrame:
+def asset_failure(request: int, error: str) -> OutFrame:
     """Says why an asset could not be fetched."""
     text = error.encode("utf-8", "replace")
-    return BinaryFrame(_ASSET.pack(4, request, 1, len(text)) + text)
+    return _binary(_ASSET.pack(4, request, 1, len(text)) + text)
+
+
+def _binary(header: bytes, payload: Payload = b"") -> OutFrame:
+    """A frame whose payload is the sender's own buffer, and not copied."""
+    return Opcode.BINARY, (header, payload)
 
 
 # --- from a client: JSON ---
 
-_Id: TypeAlias = Annotated[int, Meta(ge=0, le=UINT32_MAX)]
-_Text: TypeAlias = Annotated[str, Meta(max_length=limits.FOXGLOVE_NAME_MAX)]
-_Ids: TypeAlias = Annotated[tuple[_Id, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
-_Names: TypeAlias = Annotated[tuple[_Text, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
+Id: TypeAlias = Annotated[int, Meta(ge=0, le=UINT32_MAX)]
+Text: TypeAlias = Annotated[str, Meta(max_length=limits.FOXGLOVE_NAME_MAX)]
+Ids: TypeAlias = Annotated[tuple[Id, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
+Names: TypeAlias = Annotated[tuple[Text, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
+_ParameterType: TypeAlias = Literal["byte_array", "float64", "float64_array"]
 
 
-class _FromClient(msgspec.Struct, frozen=True, rename="camel", tag_field="op"):
-    """A client's message; fields that are not known are ignored, as later versions may add some."""
-
-
-class _PartFromClient(msgspec.Struct, frozen=True, rename="camel"):
-    """A part of a client's message."""
-
-
-class FoxgloveSubscription(_PartFromClient, frozen=True):
+class FoxgloveSubscription(msgspec.Struct, frozen=True, rename="camel"):
     """A subscription: a number that the client chooses, and the channel."""
 
-    id: _Id
+    id: Id
     channel_id: Annotated[int, Meta(ge=0)]
 
 
-class FoxgloveSubscribe(_FromClient, frozen=True, tag="subscribe"):
-    """Asks for the messages of channels."""
-
-    subscriptions: Annotated[tuple[FoxgloveSubscription, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)]
-
-
-class FoxgloveUnsubscribe(_FromClient, frozen=True, tag="unsubscribe"):
-    """Ends subscriptions."""
-
-    subscription_ids: _Ids
-
-
-class ClientChannel(_PartFromClient, frozen=True):
+class ClientChannel(msgspec.Struct, frozen=True, rename="camel"):
     """A topic that a client wants to publish."""
 
-    id: _Id
-    topic: _Text
-    encoding: _Text
-    schema_name: _Text
-    schema: str | None = None
-    schema_encoding: _Text | None = None
+    id: Id
+    topic: Text
+    encoding: Text
+    schema_name: Text
 
 
-class ClientAdvertise(_FromClient, frozen=True, tag="advertise"):
-    """Topics that a client wants to publish."""
+class FoxgloveParameter(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A parameter in a message of either side.
 
-    channels: Annotated[tuple[ClientChannel, ...], Meta(max_length=limits.FOXGLOVE_ADVERTISED_MAX)]
+    Attributes:
+        name: Its global name.
+        type: ``byte_array``: ``value`` is base64 text. ``float64`` and ``float64_array``: numbers are floating-point
+            ones, also where JSON shows whole ones.
+        value: What JSON can hold (``from_parameter`` checks it); unset for a parameter that is deleted.
+    """
 
-
-class ClientUnadvertise(_FromClient, frozen=True, tag="unadvertise"):
-    """Topics that a client publishes no longer."""
-
-    channel_ids: _Ids
-
-
-class GetParameters(_FromClient, frozen=True, tag="getParameters"):
-    """Asks for parameters; for all where no name is given."""
-
-    parameter_names: _Names = ()
-    id: _Text | None = None
+    name: Text
+    type: _ParameterType | UnsetType = UNSET
+    value: object = UNSET
 
 
-class SetParameters(_FromClient, frozen=True, tag="setParameters"):
-    """Sets parameters, and deletes those without a value."""
-
-    parameters: Annotated[tuple[FoxgloveParameter, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)]
-    id: _Text | None = None
-
-
-class SubscribeParameterUpdates(_FromClient, frozen=True, tag="subscribeParameterUpdates"):
-    """Asks for changes of parameters; of all where no name is given."""
-
-    parameter_names: _Names = ()
+Subscriptions: TypeAlias = Annotated[
+    tuple[FoxgloveSubscription, ...], Meta(max_length=limits.FOXGLOVE_SUBSCRIPTIONS_MAX)
+]
+ClientChannels: TypeAlias = Annotated[tuple[ClientChannel, ...], Meta(max_length=limits.FOXGLOVE_ADVERTISED_MAX)]
+FoxgloveParameters: TypeAlias = Annotated[
+    tuple[FoxgloveParameter, ...], Meta(max_length=limits.FOXGLOVE_PARAMETERS_MAX)
+]
 
 
-class UnsubscribeParameterUpdates(_FromClient, frozen=True, tag="unsubscribeParameterUpdates"):
-    """Ends updates of parameters; of all where no name is given."""
+def parse_text(data: bytes | str, decoder: msgspec.json.Decoder[msgspec.Struct]) -> msgspec.Struct:
+    """Parse a text frame of a client.
 
-    parameter_names: _Names = ()
-
-
-class SubscribeConnectionGraph(_FromClient, frozen=True, tag="subscribeConnectionGraph"):
-    """Asks for the graph and its changes."""
-
-
-class UnsubscribeConnectionGraph(_FromClient, frozen=True, tag="unsubscribeConnectionGraph"):
-    """Ends the updates of the graph."""
-
-
-class FoxgloveFetchAsset(_FromClient, frozen=True, tag="fetchAsset"):
-    """Asks for a file."""
-
-    uri: _Text
-    request_id: _Id
+    Raises:
+        LimitExceeded: It is longer than ``limits.FOXGLOVE_TEXT_MAX``; nothing of it was read.
+        RemoteProtocolError: It is not JSON, or not a message of a client.
+    """
+    if len(data) > limits.FOXGLOVE_TEXT_MAX:
+        raise LimitExceeded("JSON message", len(data), limits.FOXGLOVE_TEXT_MAX)
+    try:
+        return decoder.decode(data)
+    except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
+        raise RemoteProtocolError(f"not a message of this protocol: {error}") from None
 
 
 # --- from a client: binary ---
@@ -436,39 +209,7 @@ class ServiceCallRequest:
     payload: memoryview
 
 
-ClientText: TypeAlias = (
-    FoxgloveSubscribe
-    | FoxgloveUnsubscribe
-    | ClientAdvertise
-    | ClientUnadvertise
-    | GetParameters
-    | SetParameters
-    | SubscribeParameterUpdates
-    | UnsubscribeParameterUpdates
-    | SubscribeConnectionGraph
-    | UnsubscribeConnectionGraph
-    | FoxgloveFetchAsset
-)
-ClientBinary: TypeAlias = ClientMessageData | ServiceCallRequest
-_DECODER: Final[msgspec.json.Decoder[ClientText]] = msgspec.json.Decoder(ClientText)
-
-
-def parse_text(data: bytes | str) -> ClientText:
-    """Parse a text frame of a client.
-
-    Raises:
-        LimitExceeded: It is longer than ``limits.FOXGLOVE_TEXT_MAX``; nothing of it was read.
-        RemoteProtocolError: It is not JSON, or not a message of a client.
-    """
-    if len(data) > limits.FOXGLOVE_TEXT_MAX:
-        raise LimitExceeded("JSON message", len(data), limits.FOXGLOVE_TEXT_MAX)
-    try:
-        return _DECODER.decode(data)
-    except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
-        raise RemoteProtocolError(f"not a message of this protocol: {error}") from None
-
-
-def parse_binary(data: Payload) -> ClientBinary:
+def parse_binary(data: Payload) -> ClientMessageData | ServiceCallRequest:
     """Parse a binary frame of a client; its payload is not copied.
 
     Raises:
@@ -503,3 +244,99 @@ def _parse_call(view: memoryview) -> ServiceCallRequest:
     except UnicodeDecodeError:
         raise RemoteProtocolError("the encoding of a service call is not UTF-8") from None
     return ServiceCallRequest(service, call, encoding, view[end:])
+
+
+# --- parameters: ROS tells integers from floating-point numbers and has byte strings, which JSON does not ---
+
+
+def to_parameter(name: str, value: ParamValue) -> FoxgloveParameter:
+    """A parameter as clients get it; ``None`` is one that was deleted.
+
+    Numbers that JSON lacks (NaN, infinities) become the texts ``nan``, ``inf`` and ``-inf``, without a type.
+    """
+    if value is None:
+        return FoxgloveParameter(name=name)
+    if isinstance(value, bytes):
+        return FoxgloveParameter(name=name, type="byte_array", value=base64.b64encode(value).decode())
+    kind: _ParameterType | UnsetType = UNSET
+    if isinstance(value, float) and math.isfinite(value):
+        kind = "float64"
+    elif isinstance(value, list) and value and all(isinstance(each, float) and math.isfinite(each) for each in value):
+        kind = "float64_array"
+    return FoxgloveParameter(name=name, type=kind, value=_to_json(value))
+
+
+def _to_json(value: ParamValue) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    if isinstance(value, list):
+        return [_to_json(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _to_json(each) for key, each in value.items()}
+    return value
+
+
+def from_parameter(parameter: FoxgloveParameter) -> ParamValue:
+    """The value of a client's parameter; ``None`` for one that is to be deleted.
+
+    Raises:
+        RmpaError: The name is no global name, or the value does not fit its type, or ROS cannot hold it.
+    """
+    name, value = parameter.name, parameter.value
+    check_name(name)
+    if value is UNSET or value is None:
+        return None
+    if parameter.type == "byte_array":
+        if isinstance(value, str):
+            try:
+                return base64.b64decode(value, validate=True)
+            except (binascii.Error, ValueError):
+                pass
+        raise RmpaError(f"{name}: a byte_array is base64 text, not {_short(value)}")
+    if parameter.type == "float64":
+        return _float(name, value)
+    if parameter.type == "float64_array":
+        if not isinstance(value, list):
+            raise RmpaError(f"{name}: a float64_array is a list of numbers, not {_short(value)}")
+        return [_float(name, each) for each in value]
+    return _from_json(name, value, 0)
+
+
+def check_name(name: str) -> None:
+    """Refuse what is not a parameter's global name.
+
+    Raises:
+        RmpaError: It is none.
+    """
+    if not is_global_name(name):
+        raise RmpaError(f"{_short(name)} is not a parameter's name; write it like /base/rate")
+
+
+def _float(name: str, value: object) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise RmpaError(f"{name}: a float64 is a number, not {_short(value)}")
+
+
+def _from_json(name: str, value: object, depth: int) -> ParamValue:
+    if depth > limits.FOXGLOVE_PARAMETER_DEPTH_MAX:
+        raise RmpaError(f"{name}: lists and maps are nested deeper than {limits.FOXGLOVE_PARAMETER_DEPTH_MAX}")
+    if isinstance(value, int) and not INT32_MIN <= value <= INT32_MAX:
+        raise RmpaError(f"{name}: {value} does not fit an integer of 32 bits; give it the type float64")
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list):
+        return [_from_json(name, each, depth + 1) for each in value]
+    if isinstance(value, dict):
+        return {str(key): _from_json(name, each, depth + 1) for key, each in value.items()}
+    raise RmpaError(f"{name}: a parameter cannot hold {_short(value)}")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:80]}…"

@@ -1,497 +1,432 @@
-"""The session of a Foxglove client, and the connection graph that it is told.
+"""The session of a Foxglove client: subscribes, publishes, calls, and has parameters and assets; no I/O, no clock.
 
-The connection graph that a Foxglove client is told: which nodes publish, subscribe and serve what.
+It decodes no message: payloads cross as they come from TCPROS.
 """
 
 from __future__ import annotations
 
-import itertools
-import struct
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias
+import functools
+import operator
+from collections import Counter
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
 
 from rmpa.core.counters import TokenBucket
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.web import limits
 from rmpa.web.foxglove import protocol
-from rmpa.web.foxglove.channels import ChannelTable, ParameterRequests
-from rmpa.web.foxglove.protocol import (
-    AdvertisedService,
-    BinaryFrame,
-    Capability,
-    ConnectionGraphUpdate,
-    FoxgloveFrame,
-    PublishedTopic,
-    StatusLevel,
-    SubscribedTopic,
-)
-from rmpa.web.hub import requests
-from rmpa.web.hub.node_link import CONTROL_REMEDY, READ_REMEDY
+from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
+from rmpa.web.gateways.connection import ClientStream, Session, struct_of
+from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Coroutine, Iterable, Mapping
 
-    from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.requests import GraphChanged, Payload
+    from rmpa.web.foxglove.channels import Channel, ChannelTable
+    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.hub.hub import Hub
+    from rmpa.web.hub.node_link import Follower, ParamValue, Payload, Rights
+    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
-_UNCHANGED: Final = ConnectionGraphUpdate(
-    published_topics=(), subscribed_topics=(), advertised_services=(), removed_topics=(), removed_services=()
-)
-
-
-class ConnectionGraph:
-    """The graph as one client has been told it; ``update`` is what differs since."""
-
-    def __init__(self) -> None:
-        self._publishers: dict[str, tuple[str, ...]] = {}
-        self._subscribers: dict[str, tuple[str, ...]] = {}
-        self._providers: dict[str, tuple[str, ...]] = {}
-
-    def update(self, graph: GraphChanged) -> ConnectionGraphUpdate | None:
-        """The changes that lead to this graph; ``None`` without any. A topic without nodes counts as removed."""
-        publishers = {topic.name: topic.publishers for topic in graph.topics if topic.publishers}
-        subscribers = {topic.name: topic.subscribers for topic in graph.topics if topic.subscribers}
-        providers = {service.name: service.providers for service in graph.services}
-        before = self._publishers.keys() | self._subscribers.keys()
-        removed = before - publishers.keys() - subscribers.keys()
-        update = ConnectionGraphUpdate(
-            published_topics=tuple(
-                PublishedTopic(name=name, publisher_ids=ids)
-                for name, ids in _changed(self._publishers, publishers, removed)
-            ),
-            subscribed_topics=tuple(
-                SubscribedTopic(name=name, subscriber_ids=ids)
-                for name, ids in _changed(self._subscribers, subscribers, removed)
-            ),
-            advertised_services=tuple(
-                AdvertisedService(name=name, provider_ids=ids)
-                for name, ids in _changed(self._providers, providers, self._providers.keys() - providers.keys())
-            ),
-            removed_topics=tuple(sorted(removed)),
-            removed_services=tuple(sorted(self._providers.keys() - providers.keys())),
-        )
-        self._publishers, self._subscribers, self._providers = publishers, subscribers, providers
-        return update if update != _UNCHANGED else None
-
-
-def _changed(
-    before: Mapping[str, tuple[str, ...]], now: Mapping[str, tuple[str, ...]], removed: Iterable[str]
-) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Entries that are new or differ, and with no node those that ended while their name remains in the graph."""
-    yield from ((name, ids) for name, ids in now.items() if before.get(name) != ids)
-    gone = before.keys() - now.keys() - set(removed)
-    yield from ((name, ()) for name in sorted(gone))
-
-
-# One client of the Foxglove WebSocket protocol: its frames in, frames and requests to the hub out; no I/O.
-#
-# ``FoxgloveSession`` decodes no message: payloads cross as they come from TCPROS. Definitions, the graph,
-# parameters
-# and services come from the hub (``web.hub.requests``); a hub that has not answered delays only what it was asked
-# for.
-
-
-CLOCK: Final = ("/clock", "rosgraph_msgs/Clock")
-"""The topic that gives the time where ``use_sim_time`` is set, and its type."""
-_CLOCK: Final = struct.Struct("<II")
+_T = TypeVar("_T")
+_U = TypeVar("_U")
 _POLICY_VIOLATION: Final = 1008
 """A WebSocket's close code, RFC 6455, section 7.4.1."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoxgloveClose:
-    """The client is to be disconnected, with this WebSocket close code and reason."""
+class _Subscription(ClientStream):
+    """A subscription of the client, with the number that it chose. One that failed keeps its number."""
 
-    code: int
-    reason: str
+    def __init__(self, session: FoxgloveSession, number: int, channel: Channel) -> None:
+        self._session = session
+        self.id = number
+        self.channel = channel
+        self.topic = channel.topic
+        self.subscription: ClientSubscription | None = None
 
+    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:  # noqa: ARG002
+        """The frame of a message; none of another version of its type."""
+        channel = self.channel
+        if message.md5sum not in ("", channel.md5sum):
+            self._session.table.other_version(channel, message.md5sum)
+            return ()
+        channel.delivered = True
+        stamp = message.stamp_ns if self._session.time_ns is None else self._session.time_ns
+        return (protocol.message_data(self.id, stamp, message.payload),)
 
-Output: TypeAlias = FoxgloveFrame | requests.HubRequest | FoxgloveClose
-
-
-@dataclass(slots=True)
-class _Subscription:
-    id: int
-    channel_id: int
-    handle: int
-    delivered: bool = False  # whether a message of it was sent
-
-
-@dataclass(frozen=True, slots=True)
-class _Call:
-    service_id: int
-    call_id: int
-
-
-class SessionError(RmpaError):
-    """A client asks for what it may not have or what is not there; the session goes on."""
+    def close(self) -> None:
+        """End it, and what waits for it."""
+        self._session.connection.queue.end(self)
+        if self.subscription is not None:
+            self.subscription.close()
 
 
-class FoxgloveSession:
-    """The server's side of one client.
+class _Clock(ClientStream):
+    """``/clock``, which is sent on."""
 
-    ``open`` comes first; then ``receive`` for each frame of the client and ``answer`` for each answer of the hub, in
-    any order. What they return is to be done in its order. ``now`` is in seconds of a monotonic clock.
+    topic = CLOCK
+
+    def __init__(self, session: FoxgloveSession) -> None:
+        self._session = session
+
+    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:  # noqa: ARG002
+        """The server's time."""
+        time_ns = clock_ns(message.payload)
+        if time_ns is None:
+            return ()
+        self._session.time_ns = time_ns
+        return (protocol.server_time(time_ns),)
+
+
+class FoxgloveSession(Session):
+    """One client. Each JSON message of it is a method whose keywords are the message's fields.
 
     Args:
-        name: The server's name, for users.
-        session_id: The same for all clients of one run of the server.
+        hub: The hub.
         rights: What the client may do.
-        sim_time: Whether ``/clock`` gives the time (``use_sim_time``): it is sent on, and stamps the messages.
+        priority: The priority of a topic's messages.
+        address: The client's, for logs.
+        table: What all clients are offered.
+        server: The server's name, for users, and the id of this run of it.
     """
 
-    def __init__(self, name: str, session_id: str, rights: Rights, *, sim_time: bool = False) -> None:
-        self._name = name
-        self._session_id = session_id
-        self._rights = rights
-        self._sim_time = sim_time
-        self._handles = itertools.count(1)
-        self._opened = False
+    kind = "foxglove"
+
+    # More than 12 fields: what the client has of each kind.
+    def __init__(
+        self,
+        hub: Hub,
+        rights: Rights,
+        priority: Callable[[str], int],
+        address: str,
+        table: ChannelTable,
+        server: tuple[str, str],
+    ) -> None:
+        super().__init__(hub, rights, priority, address)
+        self.table = table
+        self._server = server
+        self.time_ns: int | None = None
+        """The time by ``/clock``, where that gives it: it stamps the messages."""
+        self._now = 0.0
         self._errors = TokenBucket(limits.FOXGLOVE_STATUS_RATE, limits.FOXGLOVE_STATUS_BURST)
-        self._channels = ChannelTable(self._next_handle, services=rights.control)
-        self._parameters = ParameterRequests(self._next_handle)
-        self._by_id: dict[int, _Subscription] = {}
-        self._by_channel: dict[int, _Subscription] = {}
-        self._by_handle: dict[int, _Subscription] = {}
-        self._published: dict[int, int] = {}
-        self._publishers: set[int] = set()
-        self._calls: dict[int, _Call] = {}
-        self._assets: dict[int, int] = {}
-        self._graph_handle = 0
-        self._graph: requests.GraphChanged | None = None
-        self._told: ConnectionGraph | None = None
-        self._clock_handle = 0
-        self._time_ns: int | None = None
+        self._subscriptions: dict[int, _Subscription] = {}
+        self._published: dict[int, ClientPublication | None] = {}
+        self._waiting: Counter[str] = Counter()
+        """Requests of each kind that have no answer yet."""
+        self._names: set[str] = set()
+        """The parameters that are followed, or that are left out where all are followed."""
+        self._all = False
+        self._follower: Follower | None = None
 
-    @property
-    def capabilities(self) -> tuple[Capability, ...]:
-        """What the client is told that it may do."""
-        rights = self._rights
-        offered = (
-            (Capability.CLIENT_PUBLISH, rights.control),
-            (Capability.PARAMETERS, rights.view),
-            (Capability.PARAMETERS_SUBSCRIBE, rights.view),
-            (Capability.SERVICES, rights.control),
-            (Capability.TIME, self._sim_time),
-            (Capability.CONNECTION_GRAPH, True),
-            (Capability.ASSETS, rights.view),
-        )
-        return tuple(capability for capability, given in offered if given)
+    # --- the connection ---------------------------------------------------------------------------------------
 
-    def open(self) -> list[Output]:
-        """What comes first: ``serverInfo``, and the request for the graph, from which channels follow.
+    def opened(self) -> None:
+        """Tell what the server is and offers."""
+        view, control, simulated = self.rights.view, self.rights.control, self.hub.time.simulated
+        offered = {"clientPublish": control, "parameters": view, "parametersSubscribe": view, "services": control}
+        offered |= {"time": simulated, "connectionGraph": True, "assets": view}
+        about = {
+            "name": self._server[0],
+            "capabilities": [each for each, given in offered.items() if given],
+            "supportedEncodings": [ENCODING],
+            "metadata": {"ROS_DISTRO": "noetic"},  # a client knows by it that the data are ROS 1's
+            "sessionId": self._server[1],
+        }
+        self.connection.push(message("serverInfo", **about))
+        self.table.join(self, self._withdrawn)
+        if simulated:
+            self.subscribe(CLOCK, CLOCK_TYPE, partial(self.connection.push_message, _Clock(self)), self._tell)
 
-        Raises:
-            LocalProtocolError: The session was opened before.
-        """
-        if self._opened:
-            raise LocalProtocolError("the session is open")
-        self._opened = True
-        self._graph_handle = self._next_handle()
-        out: list[Output] = [
-            protocol.ServerInfo(
-                name=self._name,
-                capabilities=self.capabilities,
-                supported_encodings=(protocol.ENCODING,),
-                metadata={"ROS_DISTRO": "noetic"},
-                session_id=self._session_id,
-            ).frame(),
-            requests.FollowGraph(self._graph_handle),
-        ]
-        if self._sim_time:
-            self._clock_handle = self._next_handle()
-            out.append(requests.Subscribe(self._clock_handle, *CLOCK))
-        return out
+    def closing(self) -> None:
+        """The client has gone."""
+        self.table.leave(self)
 
-    def receive(self, data: Payload | str, now: float) -> list[Output]:
+    def received_frame(self, data: Payload | str, now: float) -> None:
         """Handle a frame of the client: text as ``str``, binary as bytes.
 
         What is wrong with it is told to the client as a status, at most ``limits.FOXGLOVE_STATUS_RATE`` times a
         second in the long run; a client that sends malformed messages at a higher rate is disconnected.
         """
-        out: list[Output] = []
+        self._now = now
         try:
             if isinstance(data, str):
-                for each in self._text(protocol.parse_text(data)):
-                    out += self._refuse(each, now) if isinstance(each, SessionError) else [each]
+                received = protocol.parse_text(data, DECODER)
+                getattr(self, type(received).__name__)(**msgspec.structs.asdict(received))
             else:
-                out += self._binary(protocol.parse_binary(data))
+                binary = protocol.parse_binary(data)
+                if isinstance(binary, protocol.ServiceCallRequest):
+                    self._call(binary)
+                else:
+                    self._publish(binary)
         except RmpaError as error:
-            out += self._refuse(error, now)
-        return out
+            self._refuse(error)
 
-    def answer(self, answer: requests.Answer) -> list[Output]:
-        """Handle an answer of the hub; one for a handle that has ended is ignored."""
-        match answer:
-            case requests.ReceivedMessage():
-                return self._received(answer)
-            case requests.GraphChanged():
-                return list(self._graph_changed(answer))
-            case requests.ParamsChanged() if self._parameters.owns(answer.handle):
-                values = self._parameters.answer(answer)
-                return [] if values is None else [values.frame()]
-            case requests.ServiceResult() if answer.handle in self._calls:
-                call = self._calls.pop(answer.handle)
-                if answer.ok:
-                    return [protocol.service_response(call.service_id, call.call_id, answer.payload)]
-                return [_call_failure(call, answer.error)]
-            case requests.Described() | requests.ServiceFound() if self._channels.owns(answer.handle):
-                return _framed(self._offered(self._channels.answer(answer)))
-            case requests.AssetFetched() if answer.handle in self._assets:
-                return [_asset(self._assets.pop(answer.handle), answer.data)]
-            case requests.Failed():
-                return self._failed(answer)
-        return []
+    def warn(self, text: str, subject: str) -> None:
+        """Send a warning, which a later one of the same subject replaces."""
+        self.connection.push(status(WARNING, text, subject))
 
-    def status(self, level: StatusLevel, message: str, identity: str = "") -> FoxgloveFrame:
-        """A status message of the server's own: it says, for example, what a slow client misses."""
-        return protocol.FoxgloveStatus(level=level, message=message, id=identity).frame()
+    def _withdrawn(self, channels: Iterable[int]) -> None:
+        """These channels have ended, and their subscriptions with them."""
+        gone = {*channels}
+        for number, subscription in [*self._subscriptions.items()]:
+            if subscription.channel.id in gone:
+                del self._subscriptions[number]
+                subscription.close()
 
-    def close(self) -> list[requests.HubRequest]:
-        """End everything that the hub does for this client, which is gone."""
-        out: list[requests.HubRequest] = [requests.Unsubscribe(handle) for handle in self._by_handle]
-        out += [requests.UnadvertiseTopic(handle) for handle in self._published.values()]
-        out += [requests.CancelCall(handle) for handle in self._calls]
-        out += self._parameters.close()
-        if self._clock_handle:
-            out.append(requests.Unsubscribe(self._clock_handle))
-        if self._graph_handle:
-            out.append(requests.UnfollowGraph(self._graph_handle))
-        for table in (self._by_id, self._by_channel, self._by_handle, self._published, self._publishers):
-            table.clear()
-        self._calls.clear()
-        self._assets.clear()
-        return out
+    def _tell(self, error: RmpaError) -> None:
+        self.connection.push(status(ERROR, str(error)))
 
-    # --- the client's messages --------------------------------------------------------------------------------
+    def _refuse(self, error: RmpaError) -> None:
+        if self._errors.take(self._now):
+            self._tell(error)
+        elif isinstance(error, RemoteProtocolError):
+            self.connection.end(_POLICY_VIOLATION, "too many malformed messages", "message")
 
-    def _text(self, message: protocol.ClientText) -> Iterator[Output | SessionError]:
-        match message:
-            case protocol.FoxgloveSubscribe():
-                yield from (each for wanted in message.subscriptions for each in self._subscribe(wanted))
-            case protocol.FoxgloveUnsubscribe():
-                yield from (each for number in message.subscription_ids for each in self._unsubscribe(number))
-            case protocol.ClientAdvertise():
-                self._check(self._rights.control, "publish")
-                yield from (self._advertise(channel) for channel in message.channels)
-            case protocol.ClientUnadvertise():
-                yield from (self._unadvertise(number) for number in message.channel_ids)
-            case protocol.SubscribeConnectionGraph():
-                yield from self._follow_graph()
-            case protocol.UnsubscribeConnectionGraph():
-                self._told = None
-            case protocol.FoxgloveFetchAsset():
-                yield self._fetch(message)
-            case _:
-                yield from self._parameter_requests(message)
+    def _each(self, do: Callable[[Any], None], items: Iterable[Any]) -> None:
+        """Do something with each, refusing those with which it cannot be done."""
+        for item in items:
+            try:
+                do(item)
+            except RmpaError as error:
+                self._refuse(error)
 
-    def _parameter_requests(
+    def _await(
         self,
-        message: protocol.GetParameters
-        | protocol.SetParameters
-        | protocol.SubscribeParameterUpdates
-        | protocol.UnsubscribeParameterUpdates,
-    ) -> list[requests.HubRequest]:
-        if isinstance(message, protocol.SetParameters):
-            self._check(self._rights.control, "set parameters")
-            return self._parameters.set(message)
-        self._check(self._rights.view, "read parameters", READ_REMEDY)
-        if isinstance(message, protocol.GetParameters):
-            return self._parameters.get(message)
-        if isinstance(message, protocol.SubscribeParameterUpdates):
-            return self._parameters.follow(message.parameter_names)
-        return self._parameters.unfollow(message.parameter_names)
+        what: str,
+        most: int,
+        work: Coroutine[Any, Any, _T],
+        done: Callable[[_T], None],
+        failed: Callable[[RmpaError], None],
+    ) -> None:
+        """Answer when something is done; of its kind only so many wait."""
+        if self._waiting[what] >= most:
+            work.close()
+            failed(
+                RmpaError(f"{self._waiting[what]} {what} wait for their answer, which is the limit; try again later")
+            )
+            return
+        self._waiting[what] += 1
 
-    def _binary(self, message: protocol.ClientBinary) -> list[Output]:
-        if isinstance(message, protocol.ServiceCallRequest):
-            return [self._call(message)]
-        self._check(self._rights.control, "publish")
-        handle = self._published.get(message.channel_id)
-        if handle is None:
-            raise SessionError(f"channel {message.channel_id} is not advertised; advertise it before its messages")
-        return [requests.PublishMessage(handle, message.payload)] if handle in self._publishers else []
+        def answered(answer: Callable[[_U], None], value: _U) -> None:
+            self._waiting[what] -= 1
+            answer(value)
 
-    def _subscribe(self, wanted: protocol.FoxgloveSubscription) -> Iterator[Output | SessionError]:
-        channel = self._channels.channels.get(wanted.channel_id)
+        self.run(work, partial(answered, done), partial(answered, failed))
+
+    # --- subscriptions and the graph --------------------------------------------------------------------------
+
+    def op_subscribe(self, *, subscriptions: protocol.Subscriptions) -> None:
+        """Begin to send the messages of channels."""
+        self._each(self._subscribe, subscriptions)
+
+    def _subscribe(self, wanted: protocol.FoxgloveSubscription) -> None:
+        channel = self.table.channels.get(wanted.channel_id)
         if channel is None:
-            yield SessionError(f"there is no channel {wanted.channel_id}; its topic may be gone")
-        elif wanted.id in self._by_id:
-            yield SessionError(f"subscription {wanted.id} exists; end it first, or choose another number")
-        elif wanted.channel_id in self._by_channel:
-            yield SessionError(f"channel {wanted.channel_id} ({channel.topic}) has a subscription of this client")
-        elif len(self._by_id) >= limits.FOXGLOVE_SUBSCRIPTIONS_MAX:
-            yield SessionError(f"{len(self._by_id)} subscriptions are the limit of one client; end some first")
-        else:
-            subscription = _Subscription(wanted.id, wanted.channel_id, self._next_handle())
-            self._by_id[wanted.id] = self._by_channel[wanted.channel_id] = subscription
-            self._by_handle[subscription.handle] = subscription
-            yield requests.Subscribe(subscription.handle, channel.topic, channel.schema_name)
+            raise RmpaError(f"there is no channel {wanted.channel_id}; its topic may be gone")
+        if wanted.id in self._subscriptions:
+            raise RmpaError(f"subscription {wanted.id} exists; end it first, or choose another number")
+        if any(each.channel is channel for each in self._subscriptions.values()):
+            raise RmpaError(f"channel {wanted.channel_id} ({channel.topic}) has a subscription of this client")
+        if len(self._subscriptions) >= limits.FOXGLOVE_SUBSCRIPTIONS_MAX:
+            raise RmpaError(f"{len(self._subscriptions)} subscriptions are the limit of one client; end some first")
+        made = self._subscriptions[wanted.id] = _Subscription(self, wanted.id, channel)
+        take = partial(self.connection.push_message, made)
+        made.subscription = self.subscribe(channel.topic, channel.type, take, self._tell)
 
-    def _unsubscribe(self, number: int) -> Iterator[Output | SessionError]:
-        subscription = self._by_id.get(number)
+    def op_unsubscribe(self, *, subscription_ids: protocol.Ids) -> None:
+        """End subscriptions."""
+        self._each(self._unsubscribe, subscription_ids)
+
+    def _unsubscribe(self, number: int) -> None:
+        subscription = self._subscriptions.pop(number, None)
         if subscription is None:
-            yield SessionError(f"there is no subscription {number} to end")
-            return
-        self._forget(subscription)
-        yield requests.Unsubscribe(subscription.handle)
+            raise RmpaError(f"there is no subscription {number} to end")
+        subscription.close()
 
-    def _forget(self, subscription: _Subscription) -> None:
-        del self._by_id[subscription.id]
-        del self._by_channel[subscription.channel_id]
-        del self._by_handle[subscription.handle]
+    def op_subscribe_connection_graph(self) -> None:
+        """Tell the graph and its changes."""
+        self.table.follow_graph(self)
 
-    def _advertise(self, channel: protocol.ClientChannel) -> Output | SessionError:
-        if channel.id in self._published:
-            return SessionError(f"channel {channel.id} is advertised; withdraw it first, or choose another number")
-        if channel.encoding != protocol.ENCODING:
-            return SessionError(f"{channel.topic}: the encoding {channel.encoding!r} is not {protocol.ENCODING!r}")
+    def op_unsubscribe_connection_graph(self) -> None:
+        """Tell no more of the graph."""
+        self.table.unfollow_graph(self)
+
+    # --- publishing -------------------------------------------------------------------------------------------
+
+    def op_advertise(self, *, channels: protocol.ClientChannels) -> None:
+        """Begin to publish topics."""
+        self.check_control("publish")
+        self._each(self._advertise, channels)
+
+    def _advertise(self, channel: protocol.ClientChannel) -> None:
         topic = channel.topic if channel.topic.startswith("/") else f"/{channel.topic}"
+        if channel.id in self._published:
+            raise RmpaError(f"channel {channel.id} is advertised; withdraw it first, or choose another number")
+        if channel.encoding != ENCODING:
+            raise RmpaError(f"{channel.topic}: the encoding {channel.encoding!r} is not {ENCODING!r}")
         if not is_global_name(topic) or topic == "/":
-            return SessionError(f"{channel.topic!r} is not a topic's name; write it like /cmd_vel")
+            raise RmpaError(f"{channel.topic!r} is not a topic's name; write it like /cmd_vel")
         if not is_type_name(channel.schema_name):
-            return SessionError(f"{topic}: {channel.schema_name!r} is not a type; write it like std_msgs/String")
+            raise RmpaError(f"{topic}: {channel.schema_name!r} is not a type; write it like std_msgs/String")
         if len(self._published) >= limits.FOXGLOVE_ADVERTISED_MAX:
-            return SessionError(f"{len(self._published)} published topics are the limit of one client")
-        handle = self._published[channel.id] = self._next_handle()
-        self._publishers.add(handle)
-        return requests.AdvertiseTopic(handle, topic, channel.schema_name)
+            raise RmpaError(f"{len(self._published)} published topics are the limit of one client")
+        # The client may send messages before it reads that this failed: they are dropped.
+        self._published[channel.id] = None
+        self._published[channel.id] = self.advertise(topic, channel.schema_name, self._tell)
 
-    def _unadvertise(self, number: int) -> Output | SessionError:
-        handle = self._published.pop(number, None)
-        if handle is None:
-            return SessionError(f"channel {number} is not advertised, so it cannot be withdrawn")
-        self._publishers.discard(handle)
-        return requests.UnadvertiseTopic(handle)
+    def op_unadvertise(self, *, channel_ids: protocol.Ids) -> None:
+        """Publish topics no longer."""
+        self._each(self._unadvertise, channel_ids)
 
-    def _call(self, message: protocol.ServiceCallRequest) -> Output:
-        call = _Call(message.service_id, message.call_id)
-        service = self._channels.services.get(message.service_id)
-        if not self._rights.control:
-            return _call_failure(call, f"this client may not call services; {CONTROL_REMEDY}")
+    def _unadvertise(self, number: int) -> None:
+        if number not in self._published:
+            raise RmpaError(f"channel {number} is not advertised, so it cannot be withdrawn")
+        if (publication := self._published.pop(number)) is not None:
+            publication.close()
+
+    def _publish(self, data: protocol.ClientMessageData) -> None:
+        self.check_control("publish")
+        if data.channel_id not in self._published:
+            raise RmpaError(f"channel {data.channel_id} is not advertised; advertise it before its messages")
+        if (publication := self._published[data.channel_id]) is not None:
+            publication.publish(data.payload)
+
+    # --- services and assets ----------------------------------------------------------------------------------
+
+    def _call(self, call: protocol.ServiceCallRequest) -> None:
+        def done(response: Payload) -> None:
+            self.connection.push(protocol.service_response(call.service_id, call.call_id, response))
+
+        def failed(error: RmpaError) -> None:
+            about = {"serviceId": call.service_id, "callId": call.call_id, "message": str(error)}
+            self.connection.push(message("serviceCallFailure", **about))
+
+        try:
+            work = self._service_call(call)
+        except RmpaError as error:
+            failed(error)
+        else:
+            self._await("calls", limits.FOXGLOVE_CALLS_MAX, work, done, failed)
+
+    def _service_call(self, call: protocol.ServiceCallRequest) -> Coroutine[Any, Any, Payload]:
+        self.check_control("call services")
+        service = self.table.services.get(call.service_id)
         if service is None:
-            return _call_failure(call, f"there is no service {message.service_id}; it may be gone")
-        if message.encoding != protocol.ENCODING:
-            return _call_failure(call, f"the encoding {message.encoding[:80]!r} is not {protocol.ENCODING!r}")
-        if len(self._calls) >= limits.FOXGLOVE_CALLS_MAX:
-            return _call_failure(call, f"{len(self._calls)} calls wait for their response, which is the limit")
-        handle = self._next_handle()
-        self._calls[handle] = call
-        return requests.CallService(handle, service.name, service.type, message.payload)
+            raise RmpaError(f"there is no service {call.service_id}; it may be gone")
+        if call.encoding != ENCODING:
+            raise RmpaError(f"the encoding {call.encoding[:80]!r} is not {ENCODING!r}")
+        return self.call(service.name, service.kind.name, call.payload)
 
-    def _fetch(self, message: protocol.FoxgloveFetchAsset) -> Output:
-        error = self._asset_problem(message.uri)
-        if error:
-            return protocol.asset_failure(message.request_id, error)
-        handle = self._next_handle()
-        self._assets[handle] = message.request_id
-        return requests.FetchAsset(handle, message.uri, limits.FOXGLOVE_ASSET_MAX)
+    def op_fetch_asset(self, *, uri: protocol.Text, request_id: protocol.Id) -> None:
+        """Send a file of a ROS package."""
 
-    def _asset_problem(self, uri: str) -> str:
-        scheme, _, path = uri.partition("://")
-        parts = path.split("/")
-        if not self._rights.view:
-            return f"this client may not fetch assets; {READ_REMEDY}"
-        if scheme != "package" or len(parts) < 2 or not all(parts) or not uri.isprintable():
-            return "only files of ROS packages can be fetched: package://NAME/PATH"
-        if any(part in (".", "..") for part in parts) or "\\" in path or "%" in path:
-            return "the path of an asset must not leave its package"
-        if len(self._assets) >= limits.FOXGLOVE_ASSETS_MAX:
-            return f"{len(self._assets)} assets are being fetched, which is the limit; try again later"
-        return ""
+        def done(data: bytes) -> None:
+            self.connection.push(protocol.asset_response(request_id, data))
 
-    def _follow_graph(self) -> Iterator[Output]:
-        self._told = ConnectionGraph()
-        if self._graph is not None and (update := self._told.update(self._graph)):
-            yield update.frame()
+        def failed(error: RmpaError) -> None:
+            self.connection.push(protocol.asset_failure(request_id, str(error)))
 
-    # --- the hub's answers ------------------------------------------------------------------------------------
+        work = self.fetch_asset(uri, limits.FOXGLOVE_ASSET_MAX)
+        self._await("assets", limits.FOXGLOVE_ASSETS_MAX, work, done, failed)
 
-    def _received(self, message: requests.ReceivedMessage) -> list[Output]:
-        if message.handle == self._clock_handle:
-            if len(message.payload) != _CLOCK.size:
-                return []
-            secs, nsecs = _CLOCK.unpack(message.payload)
-            self._time_ns = secs * 1_000_000_000 + nsecs
-            return [protocol.server_time(self._time_ns)]
-        subscription = self._by_handle.get(message.handle)
-        if subscription is None:
-            return []
-        known = self._channels.md5sums.get(subscription.channel_id)
-        if known != message.md5sum and known and message.md5sum:
-            channel = self._channels.channels[subscription.channel_id]
-            found = self._channels.other_version(channel, message.md5sum, keep=subscription.delivered)
-            return _framed(self._offered(found))
-        subscription.delivered = True
-        stamp = message.stamp_ns if self._time_ns is None else self._time_ns
-        return [protocol.message_data(subscription.id, stamp, message.payload)]
+    # --- parameters -------------------------------------------------------------------------------------------
 
-    def _graph_changed(self, graph: requests.GraphChanged) -> Iterator[Output]:
-        if graph.handle != self._graph_handle:
-            return
-        self._graph = graph
-        yield from _framed(self._offered(self._channels.update(graph)))
-        if self._told is not None and (update := self._told.update(graph)):
-            yield update.frame()
+    def op_get_parameters(self, *, parameter_names: protocol.Names = (), id_: protocol.Text | None = None) -> None:
+        """Send parameters; all where no name is given."""
+        _check_names(parameter_names)
+        self._await_values(self.get_params(tuple(dict.fromkeys(parameter_names))), id_)
 
-    def _offered(
-        self, messages: Iterable[protocol.ServerMessage | requests.HubRequest]
-    ) -> Iterator[protocol.ServerMessage | requests.HubRequest]:
-        """The messages; a withdrawn channel ends its subscription too."""
-        for message in messages:
-            yield message
-            if isinstance(message, protocol.FoxgloveUnadvertise):
-                for number in message.channel_ids:
-                    if subscription := self._by_channel.get(number):
-                        self._forget(subscription)
-                        yield requests.Unsubscribe(subscription.handle)
+    def op_set_parameters(self, *, parameters: protocol.FoxgloveParameters, id_: protocol.Text | None = None) -> None:
+        """Set parameters, and delete those without a value; one that is malformed leaves all as they are."""
+        self.check_command("set parameters")
+        values = {each.name: protocol.from_parameter(each) for each in parameters}
+        if values:
+            self._await_values(self._set(values), id_, answered=id_ is not None)
 
-    def _failed(self, failed: requests.Failed) -> list[Output]:
-        handle = failed.handle
-        text = f"{failed.error}; {failed.remedy}" if failed.remedy else failed.error
-        if call := self._calls.pop(handle, None):
-            return [_call_failure(call, text)]
-        if (request := self._assets.pop(handle, None)) is not None:
-            return [protocol.asset_failure(request, text)]
-        if self._channels.owns(handle):
-            return _framed(self._channels.answer(failed))
-        out: list[Output] = [self.status(StatusLevel.ERROR, text)]
-        if self._parameters.owns(handle):
-            values = self._parameters.failed(handle)
-            return out if values is None else [*out, values.frame()]
-        if handle in self._publishers:
-            # The client may not have read it yet: the messages that it sends meanwhile are dropped.
-            self._publishers.discard(handle)
-            return out
-        # A failed subscription keeps its number until the client ends it, or its channel is withdrawn.
-        return out if handle in self._by_handle or handle in (self._graph_handle, self._clock_handle) else []
+    async def _set(self, values: Mapping[str, ParamValue]) -> Mapping[str, ParamValue]:
+        """Set parameters; returns those that could be set."""
+        taken: dict[str, ParamValue] = {}
+        for name, value in values.items():
+            try:
+                if value is None:
+                    await self.hub.params.delete(name)
+                else:
+                    await self.hub.params.set(name, value)
+                    taken[name] = value
+            except RmpaError as error:
+                self._tell(error)
+        return taken
 
-    # --- inside -----------------------------------------------------------------------------------------------
+    def _await_values(
+        self, work: Coroutine[Any, Any, Mapping[str, ParamValue]], identity: str | None, *, answered: bool = True
+    ) -> None:
+        def done(values: Mapping[str, ParamValue]) -> None:
+            if answered:
+                self.connection.push(protocol.parameter_values(values, identity))
 
-    def _next_handle(self) -> int:
-        return next(self._handles)
+        def failed(error: RmpaError) -> None:
+            self._tell(error)
+            done({})
 
-    def _check(self, right: bool, what: str, remedy: str = CONTROL_REMEDY) -> None:
-        if not right:
-            raise SessionError(f"this client may not {what}; {remedy}")
+        self._await("requests for parameters", limits.FOXGLOVE_PARAMETER_REQUESTS_MAX, work, done, failed)
 
-    def _refuse(self, error: RmpaError, now: float) -> list[Output]:
-        if self._errors.take(now):
-            return [self.status(StatusLevel.ERROR, str(error))]
-        if isinstance(error, RemoteProtocolError):
-            return [FoxgloveClose(_POLICY_VIOLATION, "too many malformed messages")]
-        return []
+    def op_subscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
+        """Send changes of parameters; of all where no name is given."""
+        _check_names(parameter_names)
+        if not parameter_names:
+            self._follow(set(), all_=True)
+        elif self._all:
+            self._follow(self._names.difference(parameter_names), all_=True)
+        else:
+            self._follow(self._names.union(parameter_names), all_=False)
+
+    def op_unsubscribe_parameter_updates(self, *, parameter_names: protocol.Names = ()) -> None:
+        """End updates of parameters; of all where no name is given."""
+        if not parameter_names:
+            self._follow(set(), all_=False)
+        elif self._all:
+            self._follow(self._names.union(parameter_names), all_=True)
+        else:
+            self._follow(self._names.difference(parameter_names), all_=False)
+
+    def _follow(self, names: set[str], *, all_: bool) -> None:
+        if len(names) > limits.FOXGLOVE_PARAMETERS_MAX:
+            raise RmpaError(
+                f"{len(names)} parameters are more than the {limits.FOXGLOVE_PARAMETERS_MAX} that a client may name;"
+                " follow all by an empty list"
+            )
+        if self._follower is not None:
+            self._follower.close()
+        self._follower = None
+        self._names, self._all = names, all_
+        if all_ or names:
+            self._follower = self.follow_params(() if all_ else tuple(sorted(names)), self._params_changed)
+
+    def _params_changed(self, values: Mapping[str, ParamValue]) -> None:
+        shown = {name: value for name, value in values.items() if not (self._all and name in self._names)}
+        if shown:
+            self.connection.push(protocol.parameter_values(shown))
 
 
-def _framed(messages: Iterable[protocol.ServerMessage | requests.HubRequest]) -> list[Output]:
-    return [each.frame() if isinstance(each, protocol.FromServer) else each for each in messages]
+def _check_names(names: Iterable[str]) -> None:
+    for name in names:
+        protocol.check_name(name)
 
 
-def _call_failure(call: _Call, error: str) -> FoxgloveFrame:
-    return protocol.ServiceCallFailure(service_id=call.service_id, call_id=call.call_id, message=error).frame()
+def _camel(name: str) -> str:
+    first, *further = name.removeprefix("op_").removesuffix("_").split("_")
+    return first + "".join(map(str.capitalize, further))
 
 
-def _asset(request: int, data: Payload) -> BinaryFrame:
-    if len(data) > limits.FOXGLOVE_ASSET_MAX:
-        return protocol.asset_failure(request, f"its {len(data)} bytes are more than {limits.FOXGLOVE_ASSET_MAX}")
-    return protocol.asset_response(request, data)
+OPS: Final = {
+    _camel(name): struct_of(method, tag_field="op", tag=_camel(name), rename=_camel)
+    for name, method in vars(FoxgloveSession).items()
+    if name.startswith("op_")
+}
+"""The fields of each JSON message of a client."""
+DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
+    functools.reduce(operator.or_, OPS.values())
+)

@@ -1,4 +1,4 @@
-"""One WebSocket client: its queue, and the task that writes.
+"""One WebSocket client: its queue, and the tasks that read and write.
 
 Messages wait in the queue as the hub delivers them, and are encoded when the connection can take them: what a slow
 client does not get costs no encoding, and payloads are shared by all clients.
@@ -7,29 +7,23 @@ client does not get costs no encoding, and payloads are shared by all clients.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import inspect
 import logging
 import socket
 import struct
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, Final, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, get_type_hints
 
+import msgspec
 from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
-from rmpa.web.gateways.frame_writer import FrameWriter, Opcode
-from rmpa.web.hub.node_link import FairQueue
-from rmpa.web.hub.requests import (
-    CallService,
-    DeleteParam,
-    Failed,
-    FindService,
-    PublishMessage,
-    ReceivedMessage,
-    SetParam,
-    Unsubscribe,
-)
+from rmpa.web.gateways.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
+from rmpa.web.hub.hub import HubClient
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -38,26 +32,120 @@ if TYPE_CHECKING:
 
     from rmpa.web.gateways.frame_writer import FrameSocket
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import HubClient, Rights
-    from rmpa.web.hub.requests import Answer, HubRequest, Payload
+    from rmpa.web.hub.node_link import Payload, Rights
+    from rmpa.web.hub.topics import ReceivedMessage
 
-
-# How long a client's message has been arriving, and how old it may be; no I/O.
-#
-# The library gathers the bytes and fragments of a message (RFC 6455, section 5.4) and passes only whole ones on.
-# What a
-# connection received beyond the whole ones belongs to a message that is not whole yet.
-
-
+_log = logging.getLogger(__name__)
 _PING: Final = struct.Struct("!I")
 _UNANSWERED_MAX: Final = 8
 """Pings without an answer, behind which no further one is sent: they wait as the client's frames do."""
 _CONTROL_HEADER: Final = 6
 """Bytes of a client's control frame before its payload: two, and the mask."""
+_OVERHEAD: Final = 128
+"""Bytes that an entry of the queue takes beside its payload."""
+_TURN: Final = 16
+"""Entries that are written before other tasks have their turn."""
+_SILENT_LOOKS: Final = 3
+"""Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
+_Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
+"""Makes the frames of an entry of the queue, when they can be written."""
+_AGE_PINGS: Final = 4
+"""Pings within the age that a client's commands may have."""
+
+
+# --- the protocol ----------------------------------------------------------------------------------------------
+
+
+def struct_of(method: Callable[..., None], **config: Any) -> type[msgspec.Struct]:
+    """The struct of what a client sends for a method to be called: its fields are the method's keywords.
+
+    Args:
+        method: Its keyword arguments are the fields, with their types and defaults.
+        config: Of the struct.
+    """
+    hints = get_type_hints(method, include_extras=True)
+    keywords = [each for each in inspect.signature(method).parameters.values() if each.kind is each.KEYWORD_ONLY]
+    fields = [
+        (each.name, hints[each.name]) if each.default is each.empty else (each.name, hints[each.name], each.default)
+        for each in keywords
+    ]
+    return msgspec.defstruct(method.__name__, fields, kw_only=True, frozen=True, **config)
+
+
+class Session(HubClient):
+    """What a client's frames mean in its protocol, and its messages; no I/O.
+
+    Args:
+        hub: The hub.
+        rights: What the client may do.
+        priority: The priority of a topic's messages: higher ones go first.
+        address: The client's, for logs.
+    """
+
+    kind = ""
+    """The protocol's name, for logs and lists."""
+    dates_commands = False
+    """Whether the protocol itself says how old a command is."""
+    timer_waits = True
+    """Whether the timer waits while the client takes nothing; else the session itself holds back."""
+
+    def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
+        super().__init__(hub, f"{self.kind} {address}", rights)
+        self.address = address
+        self.connection = ClientConnection(self, priority)
+
+    def late(self) -> str:
+        """Why a command that comes now may be too old, by the pings that the client has answered."""
+        age, most = self.connection.age(), self.rights.command_age
+        return f"it may have come {age:.1f} s late, more than {most:g} s, and is dropped" if age > most else ""
+
+    def show_late(self, text: str) -> None:
+        """Warn of what is published too late, now and then."""
+        if self.connection.may_warn_late():
+            self.warn(text, "late")
+
+    @abstractmethod
+    def opened(self) -> None:
+        """The WebSocket is open."""
+
+    @abstractmethod
+    def received_frame(self, data: str | bytes, now: float) -> None:
+        """A frame of the client."""
+
+    @abstractmethod
+    def warn(self, text: str, subject: str) -> None:
+        """Tell the client that it misses something; ``subject`` is ``late``, or a topic and what is dropped of it."""
+
+    def closing(self) -> None:
+        """The connection has ended; the hub still takes requests."""
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is to be called; ``None`` for never."""
+        return None
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due."""
+
+
+class ClientStream:
+    """A subscription whose messages wait in a queue of its own. ``topic`` is the global name."""
+
+    topic: str
+
+    @abstractmethod
+    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:
+        """The frames of a message; called when the connection can take them."""
+
+
+# --- the age of what arrives -----------------------------------------------------------------------------------
 
 
 class MessageArrival:
-    """Finds a message that never ends. A byte too few may be counted for it, and never one too many."""
+    """Finds a message that never ends. A byte too few may be counted for it, and never one too many.
+
+    The library gathers the bytes and fragments of a message (RFC 6455, section 5.4) and passes only whole ones on.
+    What a connection received beyond the whole ones belongs to a message that is not whole yet.
+    """
 
     def __init__(self) -> None:
         self._accounted = 0
@@ -132,51 +220,22 @@ class CommandAge:
         return now - self._younger_than
 
 
-_log = logging.getLogger(__name__)
-_Command: TypeAlias = PublishMessage | CallService | FindService | SetParam | DeleteParam
-"""What may act on a robot; a call without a type begins with the search for it."""
-OutFrame: TypeAlias = "tuple[Opcode, Sequence[Payload]]"
-"""A frame for the client: its kind, and its payload in pieces."""
-_OVERHEAD: Final = 128
-"""Bytes that an entry of the queue takes beside its payload."""
-_TURN: Final = 16
-"""Entries that are written before other tasks have their turn."""
-_SILENT_LOOKS: Final = 3
-"""Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
-_AGE_PINGS: Final = 4
-"""Pings within the age that a client's commands may have."""
-_INTERNAL_ERROR: Final = 1011
-"""A WebSocket's close code, RFC 6455, section 7.4.1."""
+# --- the connection --------------------------------------------------------------------------------------------
 
 
-class ClientConnection(ABC):
+class ClientConnection:
     """One client of a gateway.
 
     Args:
-        hub: The hub.
-        rights: What the client may do.
+        session: Its protocol.
         priority: The priority of a topic's messages: higher ones go first.
-        address: The client's, for logs.
     """
 
-    kind = ""
-    """The protocol's name, for logs and lists."""
-    dates_commands = False
-    """Whether the protocol itself says how old a command is."""
-    timer_waits = True
-    """Whether the session's timer waits while the client takes nothing; else the session itself holds back."""
-
-    def __init__(
-        self,
-        hub: Hub,
-        rights: Rights,
-        priority: Callable[[str], int],
-        address: str,
-    ) -> None:
-        self.hub = hub
-        self.rights = rights
-        self.address = address
-        self.queue: FairQueue[ReceivedMessage | OutFrame] = FairQueue()
+    # More than 12 fields: the socket, the two timers, and what is known of both directions.
+    def __init__(self, session: Session, priority: Callable[[str], int]) -> None:
+        self._session = session
+        self._priority = priority
+        self.queue: FairQueue[_Entry] = FairQueue()
         self.sent = 0
         """Messages and answers that were written."""
         self._heard = 0
@@ -184,73 +243,43 @@ class ClientConnection(ABC):
         self._arrival = MessageArrival()
         self._age: CommandAge | None = None
         self._late_told = -limits.DROPS_SHOWN
-        self._priority = priority
         self._wake = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
         self._out: FrameWriter | None = None
         self._close: tuple[int, str] | None = None
         self._close_timer: asyncio.TimerHandle | None = None
-        self._refused: Callable[[str, str], None] | None = None
-        self._client: HubClient | None = None
+        self._refused: Callable[[str, str], None] = lambda *_: None
         self._drops_shown = 0
         self._drops_at = 0.0
 
-    @property
-    def client(self) -> HubClient:
-        """The client as the hub knows it."""
-        assert self._client is not None, "run() connects it"  # noqa: S101
-        return self._client
+    # --- for the session --------------------------------------------------------------------------------------
 
-    # --- the protocol -----------------------------------------------------------------------------------------
+    def push(self, *frames: OutFrame) -> None:
+        """Queue frames that are not dropped."""
+        for frame in frames:
+            self._queue(None, partial(_as_it_is, frame), sum(map(len, frame[1])))
 
-    @abstractmethod
-    def opened(self) -> None:
-        """The WebSocket is open."""
+    def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
+        """Queue a message of a subscription."""
+        self._queue(stream, partial(stream.frames, message), len(message.payload))
 
-    @abstractmethod
-    def received_frame(self, data: str | bytes) -> None:
-        """A frame of the client."""
+    def push_frames(self, stream: ClientStream, frames: Iterable[OutFrame]) -> None:
+        """Queue frames of a subscription, whose message the session had held back."""
+        for frame in frames:
+            self._queue(stream, partial(_as_it_is, frame), sum(map(len, frame[1])))
 
-    @abstractmethod
-    def answered(self, answer: Answer) -> None:
-        """An answer of the hub that is no message of a subscription."""
+    def age(self) -> float:
+        """Seconds that the frame which comes now may be old at most; 0 where that is not bounded."""
+        return self._age.bound(self._now()) if self._age is not None else 0.0
 
-    @abstractmethod
-    def encode(self, message: ReceivedMessage) -> Iterable[OutFrame]:
-        """The frames of a message; called when the connection can take them."""
-
-    def show_late(self, text: str) -> None:  # noqa: B027 - not each protocol can tell
-        """Tell the client that what it publishes comes too late."""
-
-    @abstractmethod
-    def show_drops(self, dropped: dict[str, int]) -> None:
-        """Tell the client how many messages of which topics it has missed so far."""
-
-    def closing(self) -> None:  # noqa: B027 - not each protocol has something to end
-        """The connection has ended; the hub still takes requests."""
-
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is to be called; ``None`` for never."""
-        return None
-
-    def handle_timer(self) -> None:  # noqa: B027 - not each protocol has timers
-        """Do what is due."""
-
-    # --- for the protocol -------------------------------------------------------------------------------------
-
-    def push(self, frame: OutFrame, handle: int = 0) -> None:
-        """Queue a frame: of the subscription ``handle``, or one that is not dropped."""
-        size = sum(map(len, frame[1])) + _OVERHEAD
-        self._queue(handle, frame, size, self.client.subscriptions.get(handle, ""))
-
-    def ask(self, request: HubRequest) -> None:
-        """Pass a request on to the hub, but no command that may be too old; an ended subscription's queue goes."""
-        if isinstance(request, Unsubscribe):
-            self.queue.end(request.handle)
-        if not (isinstance(request, _Command) and self._refuses(request)):
-            self.hub.ask(self.client, request)
+    def may_warn_late(self) -> bool:
+        """Whether it is time for another text on what comes too late."""
+        now = self._now()
+        told, self._late_told = self._late_told, now
+        if now - told < limits.DROPS_SHOWN:
+            self._late_told = told
+        return now - told >= limits.DROPS_SHOWN
 
     def end(self, code: int, reason: str, refusal: str = "") -> None:
         """Close the WebSocket; what the client still sends is ignored.
@@ -258,16 +287,16 @@ class ClientConnection(ABC):
         Args:
             code: Of RFC 6455, section 7.4.
             reason: For the client and the log.
-            refusal: Which of ``figures.REASONS`` is counted, where the client is the cause.
+            refusal: Which of ``gateways.REASONS`` is counted, where the client is the cause.
         """
         if self._close is not None:
             return
         self._close = (code, reason)
         self._wake.set()
         # A client that does not read would hold the close frame up for long.
-        self._close_timer = self._loop.call_later(2 * limits.CLOSE_TIMEOUT, self._abort)
+        self._close_timer = asyncio.get_running_loop().call_later(2 * limits.CLOSE_TIMEOUT, self._abort)
         if refusal:
-            self._refuse(refusal, reason)
+            self._refused(refusal, reason)
 
     def unmasked(self) -> None:
         """Disconnect a client that sent a frame without a mask (RFC 6455, section 5.1)."""
@@ -278,18 +307,9 @@ class ClientConnection(ABC):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        at = self.next_timer()
+        at = self._session.next_timer()
         if at is not None:
-            self._timer = self._loop.call_at(at, self._due)
-
-    # --- the hub ----------------------------------------------------------------------------------------------
-
-    def receive(self, answer: Answer) -> None:
-        """Take an answer of the hub."""
-        if isinstance(answer, ReceivedMessage):
-            self._queue(answer.handle, answer, len(answer.payload) + _OVERHEAD, answer.topic)
-        else:
-            self.answered(answer)
+            self._timer = asyncio.get_running_loop().call_at(at, self._due)
 
     @property
     def unsent(self) -> int:
@@ -311,13 +331,14 @@ class ClientConnection(ABC):
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
             upgraded: Called when the handshake is done; what it returns counts the bytes that the client has sent.
-            refused: ``(reason, text)``: called if the client is disconnected for one of ``figures.REASONS``.
+            refused: ``(reason, text)``: called if the client is disconnected for one of ``gateways.REASONS``.
 
         Raises:
             PeerRefused: There are too many clients.
         """
         self._refused = refused
-        self._client = self.hub.connect(f"{self.kind} {self.address}", self.rights, self.receive)
+        session = self._session
+        session.hub.connect(session)
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
@@ -329,25 +350,25 @@ class ClientConnection(ABC):
             _tune(self._transport)
             self._out = FrameWriter(self._transport, writer.drain)
             socket_.before_close = self._out.hand_over
-            self.opened()
+            session.opened()
             works = [("write to", self._write(socket_, self._out)), ("watch", self._watch())]
-            if self.rights.command_age and not self.dates_commands:
-                self._age = CommandAge(self._loop.time())
+            if session.rights.command_age and not session.dates_commands:
+                self._age = CommandAge(self._now())
                 works.append(("ask the age of", self._ask_age(self._age)))
             for name, work in works:
-                tasks.append(self._loop.create_task(work, name=f"{name} {self.client.name}"))
+                tasks.append(asyncio.get_running_loop().create_task(work, name=f"{name} {session.name}"))
             await self._read(socket_)
         finally:
             try:
-                self.closing()
+                session.closing()
             finally:
                 for timer in (self._timer, self._close_timer):
                     if timer is not None:
                         timer.cancel()
                 for task in tasks:
                     task.cancel()
-                self.hub.disconnect(self._client)
-                self.queue.clear()
+                session.hub.disconnect(session)
+                self.queue = FairQueue()
                 if self._out is not None:
                     self._out.close()
                 if tasks:
@@ -375,22 +396,21 @@ class ClientConnection(ABC):
                     self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 try:
-                    self.received_frame(message.data)
+                    self._session.received_frame(message.data, self._now())
+                    self.arm()
                 except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
-                    _log.exception("! a frame of %s failed", self.client.name)
-                    await socket_.close(code=_INTERNAL_ERROR, message=b"the server failed; its log says why")
+                    _log.exception("! a frame of %s failed", self._session.name)
+                    text = b"the server failed; its log says why"
+                    await socket_.close(code=WSCloseCode.INTERNAL_ERROR, message=text)
                     return
 
     def _failed(self, error: object) -> None:
         """The WebSocket has ended by an error: of the connection, or a frame that breaks RFC 6455 or is too long."""
         if isinstance(error, WebSocketError):
-            self._refuse("message_size" if error.code == WSCloseCode.MESSAGE_TOO_BIG else "message", str(error))
+            too_big = error.code == WSCloseCode.MESSAGE_TOO_BIG
+            self._refused("message_size" if too_big else "message", str(error))
         else:
-            _log.debug("! %s: %s", self.client.name, error)
-
-    def _refuse(self, reason: str, text: str) -> None:
-        if self._refused is not None:
-            self._refused(reason, text)
+            _log.debug("! %s: %s", self._session.name, error)
 
     async def _watch(self) -> None:
         """Disconnect a client without a sign of life: it sends nothing, answers no ping, and takes nothing.
@@ -402,7 +422,7 @@ class ClientConnection(ABC):
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
             now, received = self._waiting, self._received()
-            if self._arrival.takes_too_long(received, self._loop.time()):
+            if self._arrival.takes_too_long(received, self._now()):
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return
             alive = (self._heard, received) != heard or (waiting and now != waiting)
@@ -410,29 +430,15 @@ class ClientConnection(ABC):
             heard, waiting = (self._heard, received), now
             if not waiting:
                 self._send(Opcode.PING, ())
-        _log.info("= %s gave no sign of life, and is disconnected", self.client.name)
+        _log.info("= %s gave no sign of life, and is disconnected", self._session.name)
         self._abort()
 
     async def _ask_age(self, age: CommandAge) -> None:
         while True:
-            payload = age.ping(self._loop.time())
+            payload = age.ping(self._now())
             if payload is not None:
                 self._send(Opcode.PING, (payload,))
-            await asyncio.sleep(self.rights.command_age / _AGE_PINGS)
-
-    def _refuses(self, request: _Command) -> bool:
-        """Whether a command may be too old; the client is told."""
-        now, most = self._loop.time(), self.rights.command_age
-        if self._age is None or (age := self._age.bound(now)) <= most:
-            return False
-        text = f"it may have come {age:.1f} s late, more than {most:g} s, and is dropped"
-        remedy = "send it again; command_age_ms of [web] sets the bound"
-        if not isinstance(request, PublishMessage):
-            self.answered(Failed(request.handle, text, remedy))
-        elif now - self._late_told >= limits.DROPS_SHOWN:
-            self._late_told = now
-            self.show_late(f"what was published on {self.client.publishers.get(request.handle, '?')}: {text}")
-        return True
+            await asyncio.sleep(self._session.rights.command_age / _AGE_PINGS)
 
     async def _write(self, socket_: FrameSocket, out: FrameWriter) -> None:
         try:
@@ -446,17 +452,21 @@ class ClientConnection(ABC):
                     self._wake.clear()
                     await self._wake.wait()
                     continue
-                for frame in self.encode(entry) if isinstance(entry, ReceivedMessage) else (entry,):
-                    self._send(*frame)
+                before = self.sent
+                for opcode, parts in entry(self._now()):
+                    self._send(opcode, parts)
+                if self.sent == before:
+                    # A message that is held back needs the timer; to ask for it at each message would take time.
+                    self.arm()
                 self._tell_drops()
                 await out.drain()
                 turn += 1
                 if turn % _TURN == 0:
                     await asyncio.sleep(0)
         except ConnectionError as error:
-            _log.debug("= %s: %s", self.client.name, error)
+            _log.debug("= %s: %s", self._session.name, error)
         except Exception:  # noqa: BLE001 - a task's top
-            _log.exception("! writing to %s failed", self.client.name)
+            _log.exception("! writing to %s failed", self._session.name)
             self._abort()
 
     @property
@@ -467,45 +477,53 @@ class ClientConnection(ABC):
     def _waiting(self) -> int:
         return self._out.unsent if self._out is not None else 0
 
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
     def _send(self, opcode: Opcode, parts: Sequence[Payload]) -> None:
         if self._out is None or self._out.is_closing:
             return
         self.sent += opcode in (Opcode.TEXT, Opcode.BINARY)
         self._out.write(opcode, parts)
 
-    def _queue(self, handle: int, entry: ReceivedMessage | OutFrame, size: int, topic: str) -> None:
+    def _queue(self, stream: ClientStream | None, entry: _Entry, size: int) -> None:
         if self._gone:
             return
-        priority = self._priority(topic) if handle else 0
-        self.queue.push(handle, entry, size, priority)
+        self.queue.push(stream, entry, size + _OVERHEAD, self._priority(stream.topic) if stream else 0)
         if self.queue.overflow:
-            _log.warning("! %s does not read its answers, and is disconnected", self.client.name)
+            _log.warning("! %s does not read its answers, and is disconnected", self._session.name)
             self._abort()
         self._wake.set()
 
     def _tell_drops(self) -> None:
-        if self.queue.dropped_total == self._drops_shown or self._loop.time() < self._drops_at:
+        if self.queue.dropped_total == self._drops_shown or self._now() < self._drops_at:
             return
         self._drops_shown = self.queue.dropped_total
-        self._drops_at = self._loop.time() + limits.DROPS_SHOWN
-        topics = self.client.subscriptions
-        self.show_drops({topics[handle]: count for handle, count in self.queue.dropped.items() if handle in topics})
+        self._drops_at = self._now() + limits.DROPS_SHOWN
+        for stream, count in self.queue.dropped.items():
+            text = f"{count} messages were dropped so far, as this client is too slow for all that it reads"
+            self._session.warn(f"{stream.topic}: {text}", f"dropped {stream.topic}")
 
     def _due(self) -> None:
         self._timer = None
-        if self.timer_waits and self._waiting > limits.WRITE_BUFFER:
+        if self._session.timer_waits and self._waiting > limits.WRITE_BUFFER:
             # The client cannot take what the session holds back: it stays there, within its bounds.
-            self._timer = self._loop.call_later(limits.TIMER_RETRY, self._due)
+            self._timer = asyncio.get_running_loop().call_later(limits.TIMER_RETRY, self._due)
             return
         try:
-            self.handle_timer()
+            self._session.handle_timer(self._now())
         except RmpaError:
-            _log.exception("! a timer of %s failed", self.client.name)
+            _log.exception("! a timer of %s failed", self._session.name)
         self.arm()
 
     def _abort(self) -> None:
         if self._transport is not None:
             self._transport.abort()
+
+
+def _as_it_is(frame: OutFrame, _: float) -> tuple[OutFrame]:
+    return (frame,)
 
 
 def _tune(transport: asyncio.Transport) -> None:
@@ -520,7 +538,5 @@ def _tune(transport: asyncio.Transport) -> None:
     for name, value in options:
         option = getattr(socket, name, None)
         if sock is not None and option is not None:
-            try:
+            with contextlib.suppress(OSError):
                 sock.setsockopt(socket.IPPROTO_TCP, option, value)
-            except OSError as error:
-                _log.debug("! %s: %s", name, error)

@@ -1,4 +1,4 @@
-"""Writes WebSocket frames to a client's connection without a copy of large payloads.
+"""What waits for a WebSocket client, and its frames to the connection without a copy of large payloads.
 
 Before Python 3.12 asyncio's transport copies what the socket does not take at once, for each client. Here a frame's
 header and payload go to the socket in one system call, and what it does not take waits as views of the payload, which
@@ -10,10 +10,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from aiohttp import WSCloseCode, web
 
@@ -22,18 +24,11 @@ from rmpa.web import limits
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.web.hub.requests import Payload
+    from rmpa.web.hub.node_link import Payload
 
-
-# Headers of WebSocket frames (RFC 6455, section 5.2): those that the server writes, and those of a client; no I/O.
-#
-# The library writes whole frames by joining header and payload, a copy of each image for each client. Here the
-# header
-# is made alone, and the payload is handed to the transport as it is.
-
-
+_T = TypeVar("_T")
 _FIN: Final = 0x80
 _MASKED: Final = 0x80
 _MASK_BYTES: Final = 4
@@ -51,6 +46,10 @@ class Opcode(IntEnum):
     PONG = 10
 
 
+OutFrame: TypeAlias = tuple[Opcode, Sequence["Payload"]]
+"""A frame for the client: its kind, and its payload in pieces."""
+
+
 class MaskCheck:
     """Finds a frame of a client that is not masked, which the library takes (RFC 6455, section 5.1)."""
 
@@ -61,26 +60,22 @@ class MaskCheck:
 
     def passes(self, data: bytes) -> bool:
         """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
-        at, size = 0, len(data)
-        while at < size:
+        at = 0
+        while at < len(data):
             if self._payload:
-                taken = min(self._payload, size - at)
+                taken = min(self._payload, len(data) - at)
                 self._payload -= taken
                 at += taken
                 continue
             self._header.append(data[at])
             at += 1
-            if len(self._header) < 2:
-                continue
-            length = self._header[1]
-            if not length & _MASKED:
+            length = self._header[1] & ~_MASKED if len(self._header) > 1 else 0
+            if len(self._header) == 2 and not self._header[1] & _MASKED:
                 return False
-            extra = {126: 2, 127: 8}.get(length & ~_MASKED, 0)
-            if len(self._header) < 2 + extra:
-                continue
-            short = length & ~_MASKED
-            self._payload = _MASK_BYTES + (int.from_bytes(self._header[2:], "big") if extra else short)
-            self._header.clear()
+            extra = {126: 2, 127: 8}.get(length, 0)
+            if len(self._header) == 2 + extra:
+                self._payload = _MASK_BYTES + (int.from_bytes(self._header[2:], "big") if extra else length)
+                self._header.clear()
         return True
 
 
@@ -91,6 +86,148 @@ def frame_header(opcode: Opcode, size: int) -> bytes:
     if size < 1 << 16:
         return _MIDDLE.pack(_FIN | opcode, 126, size)
     return _LONG.pack(_FIN | opcode, 127, size)
+
+
+@dataclass(slots=True)
+class _Queue(Generic[_T]):
+    stream: object
+    priority: int
+    entries: deque[tuple[_T, int]] = field(default_factory=deque)
+    size: int = 0
+
+
+class FairQueue(Generic[_T]):
+    """What waits for one client: a queue for each subscription, bounded in bytes, served in turn.
+
+    Higher priorities go first; the subscriptions of one priority take turns, a message each, so that a map does not
+    hold up commands. Beyond a bound the oldest message of the subscription with the most bytes is dropped, of the
+    lowest priority first. What belongs to no subscription goes before all else and is never dropped; a client that
+    lets it grow beyond the bound does not read at all, and is to be disconnected (``overflow``).
+
+    Args:
+        total_bytes: Bytes of all entries together. One message always fits where no other waits.
+        subscription_bytes: Bytes of one subscription; its newest message always fits.
+    """
+
+    def __init__(
+        self,
+        total_bytes: int = limits.CLIENT_QUEUE_BYTES,
+        subscription_bytes: int = limits.SUBSCRIPTION_QUEUE_BYTES,
+    ) -> None:
+        self._total = total_bytes
+        self._each = subscription_bytes
+        self._urgent: deque[tuple[_T, int]] = deque()
+        self._urgent_bytes = 0
+        self._data_bytes = 0
+        self._queues: dict[object, _Queue[_T]] = {}
+        self._turns: dict[int, deque[_Queue[_T]]] = {}
+        """The subscriptions that have entries, by priority, in the order of their turns."""
+        self.dropped: Counter[Any] = Counter()
+        """Messages dropped so far, by subscription, of the present ones."""
+        self.dropped_total = 0
+        """Messages dropped so far, those of ended subscriptions included."""
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to send."""
+        return bool(self._urgent or self._turns)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that wait."""
+        return self._urgent_bytes + self._data_bytes
+
+    @property
+    def overflow(self) -> bool:
+        """Whether the entries that are never dropped exceed the bound alone."""
+        return self._urgent_bytes > self._total
+
+    @property
+    def waiting(self) -> Mapping[object, int]:
+        """Messages that wait, by subscription."""
+        return {queue.stream: len(queue.entries) for queue in self._queues.values() if queue.entries}
+
+    def push(self, stream: object, entry: _T, size: int, priority: int = 0) -> None:
+        """Add an entry.
+
+        Args:
+            stream: The subscription; ``None`` for an entry that is never dropped.
+            entry: What is to be sent.
+            size: Its bytes.
+            priority: Of the subscription; a higher one is served first.
+        """
+        if stream is None:
+            self._urgent.append((entry, size))
+            self._urgent_bytes += size
+            self._make_room(None)
+            return
+        queue = self._queues.get(stream)
+        if queue is None:
+            queue = self._queues[stream] = _Queue(stream, priority)
+        if not queue.entries:
+            queue.priority = priority
+            self._turns.setdefault(priority, deque()).append(queue)
+        queue.entries.append((entry, size))
+        queue.size += size
+        self._data_bytes += size
+        while queue.size > self._each and len(queue.entries) > 1:
+            self._drop_oldest(queue)
+        self._make_room(queue)
+
+    def pop(self) -> _T | None:
+        """The next entry; ``None`` where there is none."""
+        if self._urgent:
+            entry, size = self._urgent.popleft()
+            self._urgent_bytes -= size
+            return entry
+        if not self._turns:
+            return None
+        priority = max(self._turns)
+        turns = self._turns[priority]
+        queue = turns.popleft()
+        entry, size = queue.entries.popleft()
+        queue.size -= size
+        self._data_bytes -= size
+        if queue.entries:
+            turns.append(queue)
+        elif not turns:
+            del self._turns[priority]
+        return entry
+
+    def end(self, stream: object) -> None:
+        """Forget a subscription, and what waits for it."""
+        self.dropped.pop(stream, None)
+        queue = self._queues.pop(stream, None)
+        if queue is not None and queue.entries:
+            self._data_bytes -= queue.size
+            self._forget_turn(queue)
+
+    def _make_room(self, newest: _Queue[_T] | None) -> None:
+        """Drop until all together fit; the newest message stays where it is the only one."""
+        while self.bytes > self._total and self._turns:
+            turns = self._turns[min(self._turns)]
+            fullest = max(turns, key=lambda queue: queue.size)
+            if fullest is newest and len(fullest.entries) == 1:
+                if len(self._turns) == 1 and len(turns) == 1 and not self._urgent:
+                    return
+                # Others of the same or a higher priority wait: the newest gives way if it alone has this priority.
+                others = [queue for queue in turns if queue is not newest]
+                fullest = max(others, key=lambda queue: queue.size) if others else fullest
+            self._drop_oldest(fullest)
+
+    def _drop_oldest(self, queue: _Queue[_T]) -> None:
+        _, size = queue.entries.popleft()
+        queue.size -= size
+        self._data_bytes -= size
+        self.dropped[queue.stream] += 1
+        self.dropped_total += 1
+        if not queue.entries:
+            self._forget_turn(queue)
+
+    def _forget_turn(self, queue: _Queue[_T]) -> None:
+        turns = self._turns[queue.priority]
+        turns.remove(queue)
+        if not turns:
+            del self._turns[queue.priority]
 
 
 _log = logging.getLogger(__name__)

@@ -1,7 +1,4 @@
-"""The graph of the local core and the definitions of its types, for all clients.
-
-The graph of the local core: as the agent tells it, else read from the master again and again.
-"""
+"""The graph of the local core, as the agent tells it or the master is asked for it, and the definitions of types."""
 
 from __future__ import annotations
 
@@ -9,9 +6,11 @@ import asyncio
 import contextlib
 import logging
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from rmpa.core.counters import TokenBucket
+import msgspec
+
+from rmpa.core.counters import TokenBucket, logged_failure
 from rmpa.core.errors import RmpaError
 from rmpa.observe.control import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
@@ -24,36 +23,51 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
 from rmpa.web import limits
-from rmpa.web.hub.requests import GraphService, GraphTopic
+from rmpa.web.hub.node_link import Follower
+from rmpa.web.hub.services import SharedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.node_link import Key, NodeLink
-    from rmpa.web.hub.services import FoundService
+    from rmpa.web.hub.node_link import NodeLink
+    from rmpa.web.hub.services import ServiceCalls
 
-
-# The topics, services and nodes of the graph, from rows of the agent or from the master's own answers; no I/O.
-
-
-_Rows = dict[str, tuple[str, ...]]
+_log = logging.getLogger(__name__)
 _T = TypeVar("_T")
-_KNOWN_TYPES: Final = {"/rosout": "rosgraph_msgs/Log", "/rosout_agg": "rosgraph_msgs/Log"}
+_KNOWN_TYPES: Final = {"/rosout": ("rosgraph_msgs/Log",), "/rosout_agg": ("rosgraph_msgs/Log",)}
 """Types where the master has none: clients tell ROS 1 by that of ``/rosout``."""
 
 
+class GraphTopic(msgspec.Struct, frozen=True):
+    """A topic with its types (more than one where publishers disagree) and the names of its nodes."""
+
+    name: str
+    types: tuple[str, ...]
+    publishers: tuple[str, ...] = ()
+    subscribers: tuple[str, ...] = ()
+
+
+class GraphService(msgspec.Struct, frozen=True):
+    """A service with its type ("" while unknown), the nodes that offer it and its URI (rosrpc://host:port)."""
+
+    name: str
+    type: str
+    providers: tuple[str, ...] = ()
+    uri: str = ""
+
+
 class GraphTable:
-    """The graph as it was last told. What did not change costs next to nothing.
+    """The graph as it was last told. What did not change costs next to nothing. No I/O.
 
     Args:
-        found: ``(service)``: its type and URI as far as known, else two empty texts.
+        found: The types and URIs of services, by name, as far as they are known.
         services_changed: ``(names)``: services that have other providers than before, or were registered anew.
     """
 
     def __init__(
-        self, found: Callable[[str], tuple[str, str]], services_changed: Callable[[Iterable[str]], None]
+        self, found: Mapping[str, tuple[str, str]], services_changed: Callable[[Iterable[str]], None]
     ) -> None:
         self._found = found
         self._services_changed = services_changed
@@ -75,7 +89,7 @@ class GraphTable:
 
     def update(self, rows: GraphRows) -> bool:
         """Take rows; returns whether the graph differs from what it was."""
-        topics = _differing(self._rows, rows.topics)
+        topics = [row for row in rows.topics if self._rows.get(row.name) != row]
         services = [row for row in rows.services if not rows.whole or self._other_providers(row)]
         if rows.whole:
             names = {row.name for row in rows.topics}
@@ -86,7 +100,12 @@ class GraphTable:
             return False
         self._nodes = None
         for row in topics:
-            self._keep(row)
+            if row.publishers or row.subscribers:
+                self._rows[row.name] = row
+            else:
+                self._rows.pop(row.name, None)
+            if not row.publishers:
+                self._seen.pop(row.name, None)
         if topics:
             self.topics = _updated(self.topics, {row.name: self._topic(row.name) for row in topics})
         if services:
@@ -115,26 +134,18 @@ class GraphTable:
         known = self.services.get(row.name)
         return set(row.providers) != set(known.providers if known else ())
 
-    def _keep(self, row: TopicRow) -> None:
-        if row.publishers or row.subscribers:
-            self._rows[row.name] = row
-        else:
-            self._rows.pop(row.name, None)
-        if not row.publishers:
-            self._seen.pop(row.name, None)
-
     def _topic(self, name: str) -> GraphTopic | None:
         row = self._rows.get(name)
         if row is None:
             return None
         types = dict.fromkeys(() if row.type in (ANY, "") else (row.type,)) | self._seen.get(name, {})
-        known = tuple(types) or ((_KNOWN_TYPES[name],) if name in _KNOWN_TYPES else ())
+        known = tuple(types) or _KNOWN_TYPES.get(name, ())
         return GraphTopic(name, known, tuple(sorted(row.publishers)), tuple(sorted(row.subscribers)))
 
     def _service(self, row: ServiceRow) -> GraphService | None:
         if not row.providers:
             return None
-        type_, uri = self._found(row.name)
+        type_, uri = self._found.get(row.name, ("", ""))
         return GraphService(row.name, type_, tuple(sorted(row.providers)), uri)
 
 
@@ -162,8 +173,8 @@ def rows_of(state: XmlRpcValue, types: XmlRpcValue) -> GraphRows:
     )
 
 
-def _table(value: XmlRpcValue) -> _Rows:
-    found: _Rows = {}
+def _table(value: XmlRpcValue) -> dict[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
     for row in value if isinstance(value, list) else ():
         match row:
             case [str(name), list(nodes)]:
@@ -171,31 +182,14 @@ def _table(value: XmlRpcValue) -> _Rows:
     return found
 
 
-def _differing(known: Mapping[str, TopicRow], rows: Iterable[TopicRow]) -> list[TopicRow]:
-    return [row for row in rows if known.get(row.name) != row]
-
-
 def _updated(before: Mapping[str, _T], changes: Mapping[str, _T | None]) -> dict[str, _T]:
     """A copy in order of names with these changes; ``None`` removes."""
-    made = dict(before)
-    for name, value in changes.items():
-        if value is None:
-            made.pop(name, None)
-        else:
-            made[name] = value
-    if all(name in before for name in changes):
-        return made
-    return {name: made[name] for name in sorted(made)}
-
-
-# Definitions of message and service types: those that rmpa brings, this machine's, and those of publishers.
-
-
-_log = logging.getLogger(__name__)
+    made = {name: value for name, value in {**before, **changes}.items() if value is not None}
+    return made if changes.keys() <= before.keys() else dict(sorted(made.items()))
 
 
 class TypeLibrary:
-    """All types that are known, and those that clients wait for.
+    """All types that are known: those that rmpa brings, this machine's, and those of publishers.
 
     A publisher's own definition replaces another version of the same name, because its messages have that form.
 
@@ -209,12 +203,11 @@ class TypeLibrary:
         self._versions: OrderedDict[tuple[str, str], MessageType] = OrderedDict()
         self._services: OrderedDict[str, ServiceType] = OrderedDict()
         self._missing: OrderedDict[tuple[str, bool], tuple[float, RmpaError]] = OrderedDict()
-        self._finding: dict[str, asyncio.Future[MessageType]] = {}
-        self._wanted: dict[str, dict[Key, Callable[[MessageType], None]]] = {}
+        self._finding: SharedTasks[str, MessageType] = SharedTasks()
         self._asked = asyncio.Semaphore(limits.DESCRIBE_AT_ONCE)
         self._searches = TokenBucket(limits.SEARCH_RATE, limits.SEARCH_BURST)
-
-    # --- at once, for the sessions ---------------------------------------------------------------------------
+        self.on_learnt: Callable[[MessageType], None] = lambda _: None
+        """Called with each message type that becomes known."""
 
     def message(self, name: str) -> MessageType:
         """A message type that is known or on this machine; its first search reads files.
@@ -224,14 +217,12 @@ class TypeLibrary:
         """
         kind = self._messages.get(name)
         if kind is None:
-            self._check_missing(name, service=False)
-            if known_text(name) is None:
-                self._search()
+            self._may_search(name, brought=known_text(name) is not None, service=False)
             try:
                 kind = MessageType(name) if known_text(name) is not None else find_message_type(name)
             except RmpaError as error:
                 if isinstance(error, UnknownTypeError) and error.fetchable:
-                    self._start_finding(name)  # a publisher may tell it, for the next question
+                    self._finding.start(name, lambda: self._find(name))  # a publisher may tell it, for the next time
                 raise self._remember(name, error, service=False) from None
             self._keep(name, kind)
         return kind
@@ -253,39 +244,31 @@ class TypeLibrary:
         """
         return self._versions.get((name, md5sum)) or self.message(name)
 
-    def seen_version(self, name: str, md5sum: str) -> MessageType | None:
-        """The version of a message type with that md5 sum, if it is known."""
-        return self._versions.get((name, md5sum))
-
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""
         kind = self._services.get(name)
         if kind is None:
-            self._check_missing(name, service=True)
-            if name not in known_services():
-                self._search()
+            self._may_search(name, brought=name in known_services(), service=True)
             try:
                 kind = ServiceType(name) if name in known_services() else find_service_type(name)
             except RmpaError as error:
                 raise self._remember(name, error, service=True) from None
             self._services[name] = kind
-            if len(self._services) > ros_limits.TYPES_FOUND_MAX:
-                self._services.popitem(last=False)
+            _bound(self._services, ros_limits.TYPES_FOUND_MAX)
         return kind
 
-    # --- with time --------------------------------------------------------------------------------------------
-
-    async def find_message(self, name: str) -> MessageType:
-        """A message type that is known, on this machine, or told by a publisher.
+    async def find_message(self, name: str, md5sum: str = "") -> MessageType:
+        """A message type that is known, on this machine, or told by a publisher; with ``md5sum`` that version of it.
 
         Raises:
             DefinitionError: None of them has it.
             UnreachableError: The master does not answer.
         """
-        kind = self._messages.get(name)
-        if kind is not None:
-            return kind
-        return await asyncio.shield(self._start_finding(name))
+        if md5sum:
+            if (name, md5sum) not in self._versions:
+                raise RmpaError(f"no publisher has told the version {md5sum} of {name}")
+            return self._versions[name, md5sum]
+        return self._messages.get(name) or await self._finding.get(name, lambda: self._find(name))
 
     async def find_service(self, name: str) -> ServiceType:
         """A service type that is known or on this machine.
@@ -303,9 +286,8 @@ class TypeLibrary:
 
     def learn(self, header: Mapping[str, str]) -> None:
         """Take the definition of a publisher's header."""
-        name = header.get("type", "")
+        name, md5sum = header.get("type", ""), header.get("md5sum", "")
         known = self._messages.get(name)
-        md5sum = header.get("md5sum", "")
         if not name or (known is not None and known.md5sum == md5sum) or (name, md5sum) in self._versions:
             return
         if not header.get("message_definition"):
@@ -317,44 +299,11 @@ class TypeLibrary:
             return
         self._keep(name, kind)
 
-    def want(self, key: Key, name: str, known: Callable[[MessageType], None]) -> None:
-        """Call ``known`` once when a message type becomes known that was not found."""
-        self._wanted.setdefault(name, {})[key] = known
-
-    def forget_client(self, number: int) -> None:
-        """Drop what a client wanted."""
-        for name, wanted in [*self._wanted.items()]:
-            for key in [key for key in wanted if key[0] == number]:
-                del wanted[key]
-            if not wanted:
-                del self._wanted[name]
-
-    @property
-    def wanted(self) -> tuple[str, ...]:
-        """The message types that clients wait for."""
-        return tuple(self._wanted)
-
     async def close(self) -> None:
         """End all searches."""
-        finding = [*self._finding.values()]
-        for each in finding:
-            each.cancel()
-        await asyncio.gather(*finding, return_exceptions=True)
+        await self._finding.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
-
-    def _start_finding(self, name: str) -> asyncio.Future[MessageType]:
-        finding = self._finding.get(name)
-        if finding is None:
-            finding = self._finding[name] = asyncio.ensure_future(self._find(name))
-
-            def found(finding: asyncio.Future[MessageType]) -> None:
-                del self._finding[name]
-                if not finding.cancelled():
-                    finding.exception()  # nothing may wait for it
-
-            finding.add_done_callback(found)
-        return finding
 
     async def _find(self, name: str) -> MessageType:
         async with self._asked:
@@ -369,24 +318,21 @@ class TypeLibrary:
             return self._messages.get(name) or self._keep(name, kind)
 
     def _keep(self, name: str, kind: MessageType) -> MessageType:
-        self._messages[name] = kind
-        self._versions[name, kind.md5sum] = kind
-        while len(self._versions) > ros_limits.TYPES_FOUND_MAX:
-            self._versions.popitem(last=False)
+        self._messages[name] = self._versions[name, kind.md5sum] = kind
+        _bound(self._messages, ros_limits.TYPES_FOUND_MAX)
+        _bound(self._versions, ros_limits.TYPES_FOUND_MAX)
         self._missing.pop((name, False), None)
-        while len(self._messages) > ros_limits.TYPES_FOUND_MAX:
-            self._messages.popitem(last=False)
-        for known in self._wanted.pop(name, {}).values():
-            known(kind)
+        self.on_learnt(kind)
         return kind
 
-    def _search(self) -> None:
+    def _may_search(self, name: str, *, brought: bool, service: bool) -> None:
         """Count a search on this machine, which reads files, and walks through all packages for an unknown type.
 
         Raises:
-            RmpaError: There were too many at once; the event loop serves robots too.
+            RmpaError: It was searched for in vain just now, or too many were; the event loop serves robots too.
         """
-        if not self._searches.take(asyncio.get_running_loop().time()):
+        self._check_missing(name, service=service)
+        if not brought and not self._searches.take(asyncio.get_running_loop().time()):
             raise RmpaError("too many types were searched for at once; ask again in a second")
 
     def _check_missing(self, name: str, *, service: bool) -> None:
@@ -396,9 +342,13 @@ class TypeLibrary:
 
     def _remember(self, name: str, error: RmpaError, *, service: bool) -> RmpaError:
         self._missing[name, service] = asyncio.get_running_loop().time(), error
-        while len(self._missing) > ros_limits.TYPES_MISSING_MAX:
-            self._missing.popitem(last=False)
+        _bound(self._missing, ros_limits.TYPES_MISSING_MAX)
         return error
+
+
+def _bound(table: OrderedDict[Any, Any], most: int) -> None:
+    while len(table) > most:
+        table.popitem(last=False)
 
 
 class GraphWatch:
@@ -406,25 +356,18 @@ class GraphWatch:
 
     Args:
         link: Has the node.
-        found: What is known of services.
-        services_changed: ``(names)``: services that have other providers than before.
+        calls: Knows and finds the types of services; is told of those that have other providers than before.
         master_back: Called when the master answers again after it did not.
     """
 
-    def __init__(
-        self,
-        link: NodeLink,
-        found: Mapping[str, FoundService],
-        *,
-        services_changed: Callable[[Iterable[str]], None],
-        master_back: Callable[[], None],
-    ) -> None:
+    # More than 12 fields: three say how the graph comes, and two are for tests and for the monitor's page.
+    def __init__(self, link: NodeLink, calls: ServiceCalls, master_back: Callable[[], None]) -> None:
         self._link = link
-        link.on_registration.append(self.look)
-        self._found = found
-        self._table = GraphTable(self._service, services_changed)
+        link.on_registration = self.look
+        self._calls = calls
+        self._table = GraphTable(calls.found, calls.forget)
         self._master_back = master_back
-        self._followers: dict[Key, Callable[[], None]] = {}
+        self._followers: dict[Follower, Callable[[], None]] = {}
         self._task: asyncio.Task[None] | None = None
         self._look = asyncio.Event()
         self._documents: tuple[bytes, bytes] = (b"", b"")
@@ -436,8 +379,6 @@ class GraphWatch:
         """Whether each change is told by ``look`` or ``take``, so that it need not be searched for."""
         self.taken = False
         """Whether ``take`` has given the graph, and tells its changes: then the master is not asked for it."""
-        self.changes = 0
-        """How often it has changed."""
         self.reads = 0
         """How often it was read from the master."""
 
@@ -488,32 +429,48 @@ class GraphWatch:
         self.taken = self.told = False
         self.look()
 
-    def follow(self, key: Key, changed: Callable[[], None]) -> None:
+    def follow(self, changed: Callable[[], None]) -> Follower:
         """Call ``changed`` at each change; now, too, where the graph is known."""
-        self._followers[key] = changed
+        follower = Follower(self._followers)
+        self._followers[follower] = changed
         if self.loaded.is_set():
             changed()
-
-    def unfollow(self, key: Key) -> None:
-        """End a ``follow``."""
-        self._followers.pop(key, None)
-
-    def forget_client(self, number: int) -> None:
-        """End what a client follows."""
-        for key in [key for key in self._followers if key[0] == number]:
-            del self._followers[key]
+        return follower
 
     def saw_type(self, topic: str, type_: str) -> None:
         """A publisher of a topic has this type; the master knows one only."""
         if self._table.saw_type(topic, type_):
             self._tell()
 
-    def found_service(self) -> None:
-        """The type of a service became known."""
-        self._table.found_services()
-        self._tell()
+    async def find(self, service: str) -> str:
+        """The type of a service that the graph does not say; the graph has it then.
+
+        Raises:
+            RmpaError: There is no such service, or its server does not answer.
+        """
+        type_, _ = await self._calls.find(service)
+        known = self.services.get(service)
+        if known is not None and known.type != type_:
+            self._found()
+        return type_
+
+    async def find_all(self) -> None:
+        """Find the types of all services, for ``limits.FIND_ALL_TIMEOUT``; of a server that does not tell none."""
+        searches = [
+            asyncio.ensure_future(self._calls.find(each.name)) for each in self.services.values() if not each.type
+        ]
+        if searches:
+            _, pending = await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
+            for search in pending:
+                search.cancel()
+            await asyncio.gather(*searches, return_exceptions=True)
+            self._found()
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _found(self) -> None:
+        self._table.found_services()
+        self._tell()
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
@@ -537,7 +494,8 @@ class GraphWatch:
                 self._tell()
             ended = loop.time()
             took = ended - began
-            period = self._period()
+            period = limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
+            period = limits.GRAPH_TOLD_PERIOD if self.told else period
             share = limits.GRAPH_CHANGED_SHARE if changed else limits.GRAPH_SHARE
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(max(period - took, took * share)):
@@ -546,11 +504,6 @@ class GraphWatch:
                 # a rest does not wait for a large graph's sake: the rest has been as long as a look.
                 rested = loop.time() - ended
                 await asyncio.sleep(max(limits.GRAPH_GATHER, took - rested))
-
-    def _period(self) -> float:
-        if self.told:
-            return limits.GRAPH_TOLD_PERIOD
-        return limits.GRAPH_PERIOD if self.active else limits.GRAPH_IDLE_PERIOD
 
     async def _read(self, node: Node) -> bool:
         """Read the graph; returns whether it differs from the last one."""
@@ -572,17 +525,10 @@ class GraphWatch:
         return self._table.update(rows)
 
     def _tell(self) -> None:
-        self.changes += 1
         self.loaded.set()
         for changed in [*self._followers.values()]:
-            try:
+            with logged_failure(_log, "a client could not be told of the graph"):
                 changed()
-            except Exception:  # noqa: BLE001 - a fault of one client must not end the watch for all
-                _log.exception("! a client could not be told of the graph")
-
-    def _service(self, name: str) -> tuple[str, str]:
-        found = self._found.get(name)
-        return (found.type, found.uri) if found else ("", "")
 
 
 async def _exchange(node: Node, method: str) -> bytes:

@@ -1,22 +1,21 @@
-"""The hub: the one ROS node of the web server, and what its clients share."""
+"""The hub: the one ROS node of the web server, what its clients share, and what each of them may ask of it."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
-import itertools
 import logging
 import os
 import time
-from typing import TYPE_CHECKING, Any, Self
+import weakref
+from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 
 from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
-from rmpa.web.hub import requests
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
-from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, OWN_CLIENT, READ_REMEDY, HubClient, NodeLink
-from rmpa.web.hub.publishers import ClientCounts, ParamMirror, Publishers, RosTime
+from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
+from rmpa.web.hub.params import ParamMirror, RosTime
 from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics
 
@@ -24,15 +23,22 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.node_link import Key, MakeNode, NodeRules, Receive, Rights, Where
-    from rmpa.web.hub.requests import HubRequest
+    from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
+    from rmpa.web.hub.services import ServedService
+    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+_Closable: TypeAlias = "ClientSubscription | ClientPublication | ServedService | Follower"
+_WHO: Final = "the web server"
+_COUNT: Final = "/client_count"
+_CLIENTS: Final = "/connected_clients"
+_TYPES: Final = {_COUNT: "std_msgs/Int32", _CLIENTS: "rosbridge_msgs/ConnectedClients"}
+_NANO: Final = 1_000_000_000
 
 
 class Hub:
-    """Serves the requests of all clients; an async context manager. The node is started with the first client.
+    """What all clients share; an async context manager. The node is started with the first client.
 
     Args:
         where: Finds the master.
@@ -42,6 +48,7 @@ class Hub:
         rules: What the node may do.
     """
 
+    # More than 12 fields: the parts, each once.
     def __init__(
         self,
         where: Where,
@@ -51,60 +58,18 @@ class Hub:
         environ: Mapping[str, str] | None = None,
         rules: NodeRules = EVERYTHING,
     ) -> None:
-        self._environ = os.environ if environ is None else environ
-        self._now_ns = now_ns
-        self._numbers = itertools.count(1)
+        self.environ = os.environ if environ is None else environ
         self._started = False
-        self._clients: dict[int, HubClient] = {}
-        self._tasks: dict[Key, asyncio.Task[None]] = {}
-        self.link = NodeLink(where, make_node, self._param_updated, rules)
+        self._clients: dict[HubClient, None] = {}
+        self.link = NodeLink(where, make_node, rules)
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
         self.served = ServedServices(self.link)
-        self.graph = GraphWatch(
-            self.link,
-            self.calls.found,
-            services_changed=self._services_changed,
-            master_back=self.params.reload,
-        )
-        self.topics = HubTopics(
-            self.link, self._learn, self._own_latched, lambda: self.graph.topics, self.types.at_hand, now_ns
-        )
-        self.graph.follow((OWN_CLIENT, 3), self.topics.graph_changed)
-        self.publishers = Publishers(
-            self.link,
-            self.types.find_message,
-            known=self.types.at_hand,
-            deliver=self._published,
-            ended=self.topics.forget_own,
-            now_ns=now_ns,
-        )
-        self.time = RosTime(self.topics, self.params, (OWN_CLIENT, 1), now_ns)
-        self.counts = ClientCounts(self.publishers, self.types, (OWN_CLIENT, 2), now_ns)
-        self._handlers: Mapping[type[HubRequest], Callable[[HubClient, Any], None]] = {
-            requests.Subscribe: self._subscribe,
-            requests.Unsubscribe: self._unsubscribe,
-            requests.AdvertiseTopic: self._advertise,
-            requests.UnadvertiseTopic: self._unadvertise,
-            requests.PublishMessage: self._publish,
-            requests.CallService: self._call,
-            requests.FindService: self._find_service,
-            requests.FindServices: self._find_services,
-            requests.CancelCall: self._cancel,
-            requests.ServeService: self._serve,
-            requests.EndService: self._end_service,
-            requests.Respond: self._respond,
-            requests.GetParams: self._get_params,
-            requests.SetParam: self._set_param,
-            requests.DeleteParam: self._delete_param,
-            requests.FollowParams: self._follow_params,
-            requests.UnfollowParams: lambda client, request: self.params.unfollow((client.number, request.handle)),
-            requests.FollowGraph: self._follow_graph,
-            requests.UnfollowGraph: lambda client, request: self.graph.unfollow((client.number, request.handle)),
-            requests.DescribeType: self._describe,
-            requests.FetchAsset: self._fetch_asset,
-        }
+        self.graph = GraphWatch(self.link, self.calls, self.params.reload)
+        self.topics = HubTopics(self.link, self.types, self.graph, now_ns)
+        self.time = RosTime(self.topics, self.params, now_ns)
+        self.counts = ClientCounts(self, now_ns)
 
     async def __aenter__(self) -> Self:
         return self
@@ -129,331 +94,266 @@ class Hub:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for client in [*self._clients.values()]:
+        tasks = [task for client in self._clients for task in client.tasks]
+        for client in self.clients:
             self.disconnect(client)
-        tasks = [*self._tasks.values()]
-        for task in tasks:
-            task.cancel()
         if tasks:
             await asyncio.wait(tasks)
-        await self.graph.close()
-        await self.params.close()
-        await self.types.close()
-        await self.calls.close()
-        await self.link.close()
-        await self.topics.close()
-        await self.publishers.close()
-        await self.served.close()
-
-    # --- clients ----------------------------------------------------------------------------------------------
+        for part in (self.graph, self.params, self.types, self.calls, self.link):
+            await part.close()
+        self.topics.close()
+        self.served.close()
+        await self.link.withdrawn()
 
     @property
     def clients(self) -> tuple[HubClient, ...]:
         """All clients."""
-        return tuple(self._clients.values())
+        return tuple(self._clients)
 
-    def connect(
-        self,
-        name: str,
-        rights: Rights,
-        receive: Receive,
-    ) -> HubClient:
+    def connect(self, client: HubClient) -> None:
         """Take a client.
-
-        Args:
-            name: For logs and lists.
-            rights: What it may do.
-            receive: Takes the answers, also within ``ask``; it must not raise.
 
         Raises:
             PeerRefused: There are too many.
         """
         if len(self._clients) >= limits.CLIENTS_MAX:
             problem = f"{len(self._clients)} clients are connected, which is the limit"
-            raise PeerRefused("the web server", problem, "close some pages")
-        client = HubClient(next(self._numbers), name, rights, receive)
-        self._clients[client.number] = client
+            raise PeerRefused(_WHO, problem, "close some pages")
+        self._clients[client] = None
         self.start()
         self.graph.active = True
         self.graph.look()
-        return client
 
     def disconnect(self, client: HubClient) -> None:
         """The client has gone: end all that it had. Its publishers stay for a while, as a page may be reloaded."""
-        if self._clients.pop(client.number, None) is None:
-            return
-        for handle, topic in client.subscriptions.items():
-            self.topics.unsubscribe((client.number, handle), topic)
-        for handle, topic in client.publishers.items():
-            self.publishers.unadvertise((client.number, handle), topic)
-        for handle, service in client.services.items():
-            self.served.end((client.number, handle), service)
-        for key in [key for key in self._tasks if key[0] == client.number]:
-            self._tasks[key].cancel()
-        self.params.forget_client(client.number)
-        self.graph.forget_client(client.number)
-        self.types.forget_client(client.number)
-        self.counts.remove(client.number)
-        self.graph.active = bool(self._clients)
+        if client in self._clients:
+            del self._clients[client]
+            client.end_all()
+            self.counts.remove(client)
+            self.graph.active = bool(self._clients)
 
-    def ask(self, client: HubClient, request: HubRequest) -> None:
-        """Do what a client's session asks; what cannot be done is answered by ``Failed``."""
-        if client.number not in self._clients:
-            return
-        try:
-            self._handlers[type(request)](client, request)
-        except RmpaError as error:
-            _fail(client, request.handle, error)
+
+class HubClient:
+    """One client, from ``Hub.connect`` to ``Hub.disconnect``: what it asks for, as far as it may.
+
+    All methods raise ``PeerRefused`` for what it may not. What they return is open until it is closed, or the client
+    has gone.
+
+    Args:
+        hub: The hub.
+        name: For logs and lists.
+        rights: What it may do.
+    """
+
+    def __init__(self, hub: Hub, name: str, rights: Rights) -> None:
+        self.hub = hub
+        self.name = name
+        self.rights = rights
+        self.tasks: set[asyncio.Task[None]] = set()
+        self._open: weakref.WeakSet[_Closable] = weakref.WeakSet()
+
+    def late(self) -> str:
+        """Why a command that comes now may be too old; empty: it is not."""
+        return ""
+
+    def show_late(self, text: str) -> None:
+        """Tell the client that what it publishes comes too late."""
 
     # --- topics -----------------------------------------------------------------------------------------------
 
-    def _subscribe(self, client: HubClient, request: requests.Subscribe) -> None:
-        subscribed = self.topics.names
-        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and request.topic not in subscribed:
-            known = self.graph.topics.get(request.topic)
+    def subscribe(
+        self,
+        topic: str,
+        type_: str | None,
+        receive: Callable[[ReceivedMessage], None],
+        failed: Callable[[RmpaError], None],
+        differs: Callable[[str], None] = lambda _: None,
+    ) -> ClientSubscription:
+        """Subscribe to a topic; see ``HubTopics.subscribe``."""
+        subscribed = self.hub.topics.names
+        if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and topic not in subscribed:
+            known = self.hub.graph.topics.get(topic)
             if known is None or not known.publishers:
-                problem = f"its clients subscribe to {len(subscribed)} topics, and {request.topic} has no publisher"
-                raise PeerRefused("the web server", problem, "subscribe when it has one, or to fewer topics")
-        client.subscriptions[request.handle] = request.topic
-        self.topics.subscribe(
-            (client.number, request.handle),
-            request.topic,
-            request.type,
-            client.receive,
-            functools.partial(_fail, client, request.handle),
-            client.receive,
-        )
+                problem = f"its clients subscribe to {len(subscribed)} topics, and {topic} has no publisher"
+                raise PeerRefused(_WHO, problem, "subscribe when it has one, or to fewer topics")
+        made = self.hub.topics.subscribe(topic, type_, receive, failed, differs)
+        self._open.add(made)
+        return made
 
-    def _unsubscribe(self, client: HubClient, request: requests.Unsubscribe) -> None:
-        topic = client.subscriptions.pop(request.handle, None)
-        if topic is not None:
-            self.topics.unsubscribe((client.number, request.handle), topic)
+    def advertise(
+        self, topic: str, type_: str, failed: Callable[[RmpaError], None], *, latch: bool = False
+    ) -> ClientPublication:
+        """Publish a topic; see ``Publishers.advertise``."""
+        self.check_control("publish")
+        made = self.hub.topics.publishers.advertise(topic, type_, failed, latch=latch, accepts=self._accepts)
+        self._open.add(made)
+        return made
 
-    def _advertise(self, client: HubClient, request: requests.AdvertiseTopic) -> None:
-        _check(client.rights.control, "publish")
-
-        def failed(error: RmpaError) -> None:
-            client.publishers.pop(request.handle, None)
-            _fail(client, request.handle, error)
-
-        self.publishers.advertise(
-            (client.number, request.handle), request.topic, request.type, failed, latch=request.latch
-        )
-        client.publishers[request.handle] = request.topic
-
-    def _unadvertise(self, client: HubClient, request: requests.UnadvertiseTopic) -> None:
-        topic = client.publishers.pop(request.handle, None)
-        if topic is not None:
-            self.publishers.unadvertise((client.number, request.handle), topic)
-
-    def _publish(self, client: HubClient, request: requests.PublishMessage) -> None:
-        topic = client.publishers.get(request.handle)
-        if topic is not None:
-            self.publishers.publish(topic, request.payload)
-
-    def _published(self, topic: str, type_: str, payload: memoryview, latch: bool) -> None:
-        self.topics.publish(topic, type_, payload, latch=latch)
-
-    def _own_latched(self, topic: str) -> tuple[str, memoryview, int] | None:
-        return self.publishers.latched(topic)
-
-    def _learn(self, topic: str, header: Mapping[str, str]) -> None:
-        self.types.learn(header)
-        if header.get("type"):
-            self.graph.saw_type(topic, header["type"])
+    def _accepts(self, topic: str) -> bool:
+        if text := self.late():
+            self.show_late(f"what was published on {topic}: {text}")
+        return not text
 
     # --- services ---------------------------------------------------------------------------------------------
 
-    def _call(self, client: HubClient, request: requests.CallService) -> None:
-        _check(client.rights.control, "call services")
-        md5sum = self.types.service(request.type).md5sum if request.type else ""
+    def call(
+        self, service: str, type_: str, request: Payload, timeout: float | None = None
+    ) -> Coroutine[Any, Any, Payload]:
+        """Call a service; see ``ServiceCalls.call``. With an empty ``type_`` it may have any."""
+        self.check_command("call services")
+        md5sum = self.hub.types.service(type_).md5sum if type_ else ""
+        return self.hub.calls.call(service, md5sum, request, timeout)
 
-        async def call() -> None:
-            try:
-                body = await self.calls.call(request.service, md5sum, request.request, request.timeout)
-            except RmpaError as error:
-                client.receive(requests.ServiceResult(request.handle, ok=False, error=str(error)))
-            else:
-                client.receive(requests.ServiceResult(request.handle, ok=True, payload=body))
+    def find_service(self, service: str) -> Coroutine[Any, Any, str]:
+        """The type of a service that is to be called; see ``GraphWatch.find``."""
+        self._check_age()
+        return self.hub.graph.find(service)
 
-        self._run(client, request.handle, call())
+    def serve(
+        self,
+        service: str,
+        type_: str,
+        called: Callable[[bytes, asyncio.Future[Payload]], None],
+        failed: Callable[[RmpaError], None],
+    ) -> ServedService:
+        """Offer a service; see ``ServedServices.serve``."""
+        self.check_control("offer services")
+        made = self.hub.served.serve(service, self.hub.types.service(type_), called, failed)
+        self._open.add(made)
+        return made
 
-    def _find_service(self, client: HubClient, request: requests.FindService) -> None:
-        async def find() -> None:
-            found = await self.calls.find(request.service)
-            known = self.graph.services.get(request.service)
-            if known is not None and known.type != found.type:
-                self.graph.found_service()
-            client.receive(requests.ServiceFound(request.handle, found.type, found.uri))
+    # --- parameters and files ---------------------------------------------------------------------------------
 
-        self._run(client, request.handle, find())
+    @property
+    def param_tree(self) -> Mapping[str, ParamValue]:
+        """The parameters that the client may see, as a tree."""
+        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
 
-    def _find_services(self, client: HubClient, request: requests.FindServices) -> None:
-        async def find() -> None:
-            unknown = [each.name for each in self.graph.services.values() if not each.type]
-            searches = [asyncio.ensure_future(self.calls.find(name)) for name in unknown]
-            if searches:
-                _, pending = await asyncio.wait(searches, timeout=limits.FIND_ALL_TIMEOUT)
-                for search in pending:
-                    search.cancel()
-                await asyncio.gather(*searches, return_exceptions=True)  # a server that does not tell stays unknown
-                self.graph.found_service()
-            client.receive(requests.ServiceFound(request.handle, ""))
+    async def get_params(self, names: tuple[str, ...] = (), prefix: str = "/") -> Mapping[str, ParamValue]:
+        """The values of ``names`` that are there; without names those of all parameters below ``prefix``."""
+        self._check_view("read parameters")
+        await self.hub.params.loaded.wait()
+        return self.hub.link.rules.visible(self.hub.params.values(names, prefix))
 
-        self._run(client, request.handle, find())
+    def set_param(self, name: str, value: ParamValue) -> Coroutine[Any, Any, None]:
+        """Set a parameter; see ``ParamMirror.set``."""
+        self.check_command("set parameters")
+        return self.hub.params.set(name, value)
 
-    def _cancel(self, client: HubClient, request: requests.CancelCall) -> None:
-        task = self._tasks.get((client.number, request.handle))
-        if task is not None:
-            task.cancel()
+    def delete_param(self, name: str) -> Coroutine[Any, Any, None]:
+        """Delete a parameter, with all below it; see ``ParamMirror.delete``."""
+        self.check_command("delete parameters")
+        return self.hub.params.delete(name)
 
-    def _services_changed(self, names: Any) -> None:
-        for name in names:
-            self.calls.forget(name)
+    def follow_params(self, names: tuple[str, ...], changed: Callable[[Mapping[str, ParamValue]], None]) -> Follower:
+        """Call ``changed`` at each change of ``names``, or of all; ``None`` is a parameter that was deleted."""
+        self._check_view("read parameters")
 
-    def _serve(self, client: HubClient, request: requests.ServeService) -> None:
-        _check(client.rights.control, "offer services")
+        def visible(values: Mapping[str, ParamValue]) -> None:
+            if shown := self.hub.link.rules.visible(values):
+                changed(shown)
 
-        def failed(error: RmpaError) -> None:
-            client.services.pop(request.handle, None)
-            _fail(client, request.handle, error)
+        made = self.hub.params.follow(names, visible)
+        self._open.add(made)
+        return made
 
-        def called(call: int, payload: bytes) -> None:
-            client.receive(requests.ServiceRequest(request.handle, call, payload))
+    async def fetch_asset(self, uri: str, most: int) -> bytes:
+        """A file of a ROS package; see ``read_asset``."""
+        self._check_view("fetch assets")
+        return await asyncio.to_thread(read_asset, uri, most, self.hub.environ)
 
-        kind = self.types.service(request.type)
-        self.served.serve((client.number, request.handle), request.service, kind, called, failed)
-        client.services[request.handle] = request.service
+    # --- tasks and the end ------------------------------------------------------------------------------------
 
-    def _end_service(self, client: HubClient, request: requests.EndService) -> None:
-        service = client.services.pop(request.handle, None)
-        if service is not None:
-            self.served.end((client.number, request.handle), service)
-
-    def _respond(self, client: HubClient, request: requests.Respond) -> None:
-        service = client.services.get(request.handle)
-        if service is not None:
-            key = client.number, request.handle
-            self.served.respond(key, service, request.call, ok=request.ok, response=request.response)
-
-    # --- parameters -------------------------------------------------------------------------------------------
-
-    def _param_updated(self, key: str, value: XmlRpcValue) -> None:
-        self.params.updated(key, value)
-
-    def _get_params(self, client: HubClient, request: requests.GetParams) -> None:
-        _check(client.rights.view, "read parameters", READ_REMEDY)
-
-        async def get() -> None:
-            await self.params.loaded.wait()
-            values = self.link.rules.visible(self.params.values(request.names, request.prefix))
-            client.receive(requests.ParamsChanged(request.handle, values))
-
-        self._run(client, request.handle, get())
-
-    def _set_param(self, client: HubClient, request: requests.SetParam) -> None:
-        _check(client.rights.control, "set parameters")
-
-        async def set_() -> None:
-            await self.params.set(request.name, request.value)
-            client.receive(requests.ParamsChanged(request.handle, {request.name: request.value}))
-
-        self._run(client, request.handle, set_())
-
-    def _delete_param(self, client: HubClient, request: requests.DeleteParam) -> None:
-        _check(client.rights.control, "delete parameters")
-
-        async def delete() -> None:
-            await self.params.delete(request.name)
-            client.receive(requests.ParamsChanged(request.handle, {request.name: None}))
-
-        self._run(client, request.handle, delete())
-
-    def _follow_params(self, client: HubClient, request: requests.FollowParams) -> None:
-        _check(client.rights.view, "read parameters", READ_REMEDY)
-
-        def changed(values: Mapping[str, requests.ParamValue]) -> None:
-            visible = self.link.rules.visible(values)
-            if visible:
-                client.receive(requests.ParamsChanged(request.handle, visible))
-
-        self.params.follow((client.number, request.handle), request.names, changed)
-
-    # --- the graph and types ----------------------------------------------------------------------------------
-
-    def _follow_graph(self, client: HubClient, request: requests.FollowGraph) -> None:
-        graph = self.graph
-
-        def changed() -> None:
-            topics, services = tuple(graph.topics.values()), tuple(graph.services.values())
-            client.receive(requests.GraphChanged(request.handle, topics, services))
-
-        graph.follow((client.number, request.handle), changed)
-
-    def _describe(self, client: HubClient, request: requests.DescribeType) -> None:
-        async def describe() -> None:
-            if request.service:
-                service = await self.types.find_service(request.type)
-                text, response = service.request.definition, service.response.definition
-                client.receive(requests.Described(request.handle, request.type, text, response))
-                return
-
-            def known(kind: Any) -> None:
-                answer = requests.Described(request.handle, request.type, kind.definition, md5sum=kind.md5sum)
-                client.receive(answer)
-
-            if request.md5sum:
-                version = self.types.seen_version(request.type, request.md5sum)
-                if version is None:
-                    raise RmpaError(f"no publisher has told the version {request.md5sum} of {request.type}")
-                known(version)
-                return
-            try:
-                known(await self.types.find_message(request.type))
-            except RmpaError:
-                self.types.want((client.number, request.handle), request.type, known)
-                raise
-
-        self._run(client, request.handle, describe())
-
-    def _fetch_asset(self, client: HubClient, request: requests.FetchAsset) -> None:
-        _check(client.rights.view, "fetch assets", READ_REMEDY)
-
-        async def fetch() -> None:
-            data = await asyncio.to_thread(read_asset, request.uri, request.most, self._environ)
-            client.receive(requests.AssetFetched(request.handle, data))
-
-        self._run(client, request.handle, fetch())
-
-    # --- inside -----------------------------------------------------------------------------------------------
-
-    def _run(self, client: HubClient, handle: int, work: Coroutine[Any, Any, None]) -> None:
-        """Do what takes time, in a task; its error is answered by ``Failed``."""
-        key = client.number, handle
+    def run(
+        self, work: Coroutine[Any, Any, _T], done: Callable[[_T], None], failed: Callable[[RmpaError], None]
+    ) -> None:
+        """Do what takes time, while the client is there; then call ``done`` with its result, or ``failed``."""
 
         async def run() -> None:
             try:
-                await work
-            except RmpaError as error:
-                _fail(client, handle, error)
+                try:
+                    done(await work)
+                except RmpaError as error:
+                    failed(error)
             except Exception:  # noqa: BLE001 - a task's top
-                _log.exception("! a request of %s failed", client.name)
-                _fail(client, handle, RmpaError("the web server failed; its log says why"))
-
-        task = self._tasks[key] = asyncio.get_running_loop().create_task(run(), name=f"request of {client.name}")
+                _log.exception("! a request of %s failed", self.name)
+                failed(RmpaError("the web server failed; its log says why"))
 
         def ended(task: asyncio.Task[None]) -> None:
             work.close()  # of a client that has gone before it began
-            if self._tasks.get(key) is task:
-                del self._tasks[key]
+            self.tasks.discard(task)
 
+        task = asyncio.get_running_loop().create_task(run(), name=f"request of {self.name}")
+        self.tasks.add(task)
         task.add_done_callback(ended)
 
+    def end_all(self) -> None:
+        """Close what is open, and give up what is under way."""
+        for task in self.tasks:
+            task.cancel()
+        for each in [*self._open]:
+            each.close()
 
-def _check(right: bool, what: str, remedy: str = CONTROL_REMEDY) -> None:
-    if not right:
-        raise PeerRefused("the web server", f"this client may not {what}", remedy)
+    # --- rights -----------------------------------------------------------------------------------------------
+
+    def _check_view(self, what: str) -> None:
+        if not self.rights.view:
+            raise PeerRefused(_WHO, f"this client may not {what}", READ_REMEDY)
+
+    def check_control(self, what: str) -> None:
+        """Refuse what changes something to a client that may only look."""
+        if not self.rights.control:
+            raise PeerRefused(_WHO, f"this client may not {what}", CONTROL_REMEDY)
+
+    def check_command(self, what: str) -> None:
+        """Refuse also what may be too old."""
+        self.check_control(what)
+        self._check_age()
+
+    def _check_age(self) -> None:
+        if text := self.late():
+            raise RmpaError(f"{text}; send it again; command_age_ms of [web] sets the bound")
 
 
-def _fail(client: HubClient, handle: int, error: RmpaError) -> None:
-    client.receive(requests.Failed.of(handle, error))
+class ClientCounts:
+    """rosbridge_suite's counts: the number and the list of rosbridge clients, latched, from the first client on.
+
+    Args:
+        hub: Publishes them.
+        now_ns: The wall clock, in nanoseconds.
+    """
+
+    def __init__(self, hub: Hub, now_ns: Callable[[], int]) -> None:
+        self._hub = hub
+        self._now_ns = now_ns
+        self._clients: dict[HubClient, dict[str, Any]] = {}
+        self._publications: list[ClientPublication] | None = None
+
+    def add(self, client: HubClient, address: str) -> None:
+        """A client is there."""
+        seconds, nanoseconds = divmod(self._now_ns(), _NANO)
+        time = {"secs": seconds, "nsecs": nanoseconds}
+        self._clients[client] = {"ip_address": address, "connection_time": time}
+        self._publish()
+
+    def remove(self, client: HubClient) -> None:
+        """A client has gone."""
+        if self._clients.pop(client, None) is not None:
+            self._publish()
+
+    def _publish(self) -> None:
+        if self._publications is None:
+            self._publications = []
+            for topic, type_ in _TYPES.items():
+                with contextlib.suppress(PeerRefused):  # a client publishes that topic with another type
+                    made = self._hub.topics.publishers.advertise(topic, type_, self._refused, latch=True)
+                    self._publications.append(made)
+        clients = [*self._clients.values()]
+        values = {_COUNT: {"data": len(clients)}, _CLIENTS: {"clients": clients}}
+        for each in self._publications:
+            codec = codec_for(self._hub.types.message(_TYPES[each.topic]))
+            each.publish(codec.write(values[each.topic], 0).payload)
+
+    @staticmethod
+    def _refused(error: RmpaError) -> None:
+        _log.warning("! %s", error)

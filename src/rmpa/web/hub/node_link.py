@@ -1,21 +1,15 @@
-"""The hub's node, its clients with their rights, and the turns of their messages.
-
-The hub's node, made anew when its master was away or has shut it down, and what is registered with it.
-"""
+"""What clients and the node may do, and the hub's node: made anew when its master was away or has shut it down."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import logging
-from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar, Union
 
 from rmpa.config.peer_rules import Access
-from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.parameters import canonical, leaves
 from rmpa.web import limits
@@ -23,174 +17,16 @@ from rmpa.web import limits
 if TYPE_CHECKING:
     from collections.abc import Awaitable
 
-    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.node import Node, Publisher, Service, Subscriber
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions
-    from rmpa.web.hub.requests import Answer, ParamValue
 
-
-# The messages that wait for one client: a queue for each subscription, bounded in bytes, served in turn. No I/O.
-#
-# Higher priorities go first; the subscriptions of one priority take turns, a message each, so that a map does not
-# hold
-# up commands. Beyond a bound the oldest message of the subscription with the most bytes is dropped, of the lowest
-# priority first. Handle 0 is for all that is no message of a subscription: it goes before all else and is never
-# dropped; a client that lets it grow beyond the bound does not read at all, and is to be disconnected
-# (``overflow``).
-
-
-_T = TypeVar("_T")
-
-
-@dataclass(slots=True)
-class _Queue(Generic[_T]):
-    handle: int
-    priority: int
-    entries: deque[tuple[_T, int]] = field(default_factory=deque)
-    size: int = 0
-
-
-class FairQueue(Generic[_T]):
-    """The queues of one client.
-
-    Args:
-        total_bytes: Bytes of all entries together. One message always fits where no other waits.
-        subscription_bytes: Bytes of one subscription; its newest message always fits.
-    """
-
-    def __init__(
-        self,
-        total_bytes: int = limits.CLIENT_QUEUE_BYTES,
-        subscription_bytes: int = limits.SUBSCRIPTION_QUEUE_BYTES,
-    ) -> None:
-        self._total = total_bytes
-        self._each = subscription_bytes
-        self._urgent: deque[tuple[_T, int]] = deque()
-        self._urgent_bytes = 0
-        self._data_bytes = 0
-        self._queues: dict[int, _Queue[_T]] = {}
-        self._turns: dict[int, deque[_Queue[_T]]] = {}
-        """The subscriptions that have entries, by priority, in the order of their turns."""
-        self.dropped: Counter[int] = Counter()
-        """Messages dropped so far, by handle, of the present subscriptions."""
-        self.dropped_total = 0
-        """Messages dropped so far, those of ended subscriptions included."""
-
-    def __bool__(self) -> bool:
-        """Whether there is anything to send."""
-        return bool(self._urgent or self._turns)
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that wait."""
-        return self._urgent_bytes + self._data_bytes
-
-    @property
-    def overflow(self) -> bool:
-        """Whether the entries of handle 0 alone exceed the bound."""
-        return self._urgent_bytes > self._total
-
-    @property
-    def waiting(self) -> Mapping[int, int]:
-        """Messages that wait, by handle."""
-        return {queue.handle: len(queue.entries) for queue in self._queues.values() if queue.entries}
-
-    def push(self, handle: int, entry: _T, size: int, priority: int = 0) -> int:
-        """Add an entry; returns the number of older ones that were dropped for it.
-
-        Args:
-            handle: The subscription; 0 for an entry that is never dropped.
-            entry: What is to be sent.
-            size: Its bytes.
-            priority: Of the subscription; a higher one is served first.
-        """
-        if handle == 0:
-            self._urgent.append((entry, size))
-            self._urgent_bytes += size
-            return self._make_room(None)
-        queue = self._queues.get(handle)
-        if queue is None:
-            queue = self._queues[handle] = _Queue(handle, priority)
-        if not queue.entries:
-            queue.priority = priority
-            self._turns.setdefault(priority, deque()).append(queue)
-        queue.entries.append((entry, size))
-        queue.size += size
-        self._data_bytes += size
-        dropped = 0
-        while queue.size > self._each and len(queue.entries) > 1:
-            self._drop_oldest(queue)
-            dropped += 1
-        return dropped + self._make_room(queue)
-
-    def pop(self) -> _T | None:
-        """The next entry; ``None`` where there is none."""
-        if self._urgent:
-            entry, size = self._urgent.popleft()
-            self._urgent_bytes -= size
-            return entry
-        if not self._turns:
-            return None
-        priority = max(self._turns)
-        turns = self._turns[priority]
-        queue = turns.popleft()
-        entry, size = queue.entries.popleft()
-        queue.size -= size
-        self._data_bytes -= size
-        if queue.entries:
-            turns.append(queue)
-        elif not turns:
-            del self._turns[priority]
-        return entry
-
-    def end(self, handle: int) -> None:
-        """Forget a subscription, and what waits for it."""
-        self.dropped.pop(handle, None)
-        queue = self._queues.pop(handle, None)
-        if queue is not None and queue.entries:
-            self._data_bytes -= queue.size
-            self._forget_turn(queue)
-
-    def clear(self) -> None:
-        """Forget everything that waits."""
-        self._urgent.clear()
-        self._turns.clear()
-        self._queues.clear()
-        self._urgent_bytes = self._data_bytes = 0
-
-    # --- inside -----------------------------------------------------------------------------------------------
-
-    def _make_room(self, newest: _Queue[_T] | None) -> int:
-        """Drop until all together fit; the newest message stays where it is the only one."""
-        dropped = 0
-        while self.bytes > self._total and self._turns:
-            turns = self._turns[min(self._turns)]
-            fullest = max(turns, key=lambda queue: queue.size)
-            if fullest is newest and len(fullest.entries) == 1:
-                if len(self._turns) == 1 and len(turns) == 1 and not self._urgent:
-                    break
-                # Others of the same or a higher priority wait: the newest gives way if it alone has this priority.
-                others = [queue for queue in turns if queue is not newest]
-                fullest = max(others, key=lambda queue: queue.size) if others else fullest
-            self._drop_oldest(fullest)
-            dropped += 1
-        return dropped
-
-    def _drop_oldest(self, queue: _Queue[_T]) -> None:
-        _, size = queue.entries.popleft()
-        queue.size -= size
-        self._data_bytes -= size
-        self.dropped[queue.handle] += 1
-        self.dropped_total += 1
-        if not queue.entries:
-            self._forget_turn(queue)
-
-    def _forget_turn(self, queue: _Queue[_T]) -> None:
-        turns = self._turns[queue.priority]
-        turns.remove(queue)
-        if not turns:
-            del self._turns[queue.priority]
-
+_log = logging.getLogger(__name__)
+ParamValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
+    bool, int, float, str, bytes, list["ParamValue"], dict[str, "ParamValue"], None
+]
+Payload: TypeAlias = bytes | bytearray | memoryview
+"""A ROS 1 serialized message, without its length prefix."""
 
 # What clients may do: kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``.
 
@@ -321,14 +157,27 @@ READ_REMEDY = "send the token of rmpa web; where it has none, start it with --to
 """For clients that want to read what only clients with the token may."""
 
 
-_log = logging.getLogger(__name__)
+class Follower:
+    """What follows changes, until it is closed.
 
-_U = TypeVar("_U")
+    Args:
+        followers: All of one kind, with what is called for each.
+    """
+
+    def __init__(self, followers: dict[Follower, Any]) -> None:
+        self._followers = followers
+
+    def close(self) -> None:
+        """Follow no more."""
+        self._followers.pop(self, None)
+
 
 MakeNode: TypeAlias = "Callable[[str, Callable[[str, XmlRpcValue], None]], Node]"
 """Makes a node that is not started: ``(master URI, on_param_update)``."""
 Where: TypeAlias = "Callable[[], Awaitable[str]]"
 """Finds the master's URI; raises ``RmpaError`` while there is none."""
+_T = TypeVar("_T", bound="Subscriber | Publisher | Service")
+_U = TypeVar("_U")
 
 
 class NodeLink:
@@ -337,37 +186,27 @@ class NodeLink:
     Args:
         where: Finds the master.
         make: Makes a node.
-        on_param_update: ``(key, value)``: a parameter has changed that the node follows.
         rules: What the node may do.
     """
 
-    def __init__(
-        self,
-        where: Where,
-        make: MakeNode,
-        on_param_update: Callable[[str, XmlRpcValue], None],
-        rules: NodeRules = EVERYTHING,
-    ) -> None:
+    def __init__(self, where: Where, make: MakeNode, rules: NodeRules = EVERYTHING) -> None:
         self.rules = rules
         self._where = where
         self._make = make
-        self._on_param_update = on_param_update
         self._task: asyncio.Task[None] | None = None
         self._ready: asyncio.Event = asyncio.Event()
         self.node: Node | None = None
         """The node, while the master knows it."""
         self.problem = "the ROS master was not asked yet"
         """Why there is no node; empty while there is one."""
-        self.on_node: list[Callable[[Node], None]] = []
+        self.ending: dict[tuple[str, str], Registration[Any]] = {}
+        """What is being withdrawn, by kind and name."""
+        self.on_node: Callable[[Node], None] = lambda _: None
         """Called with each new node."""
-        self.on_registration: list[Callable[[], None]] = []
+        self.on_registration: Callable[[], None] = lambda: None
         """Called when something was registered or withdrawn."""
-
-    def registration_changed(self) -> None:
-        """Call ``on_registration``."""
-        for callback in self.on_registration:
-            with logged_failure(_log, "what follows a registration failed"):
-                callback()
+        self.on_param_update: Callable[[str, XmlRpcValue], None] = lambda *_: None
+        """``(key, value)``: a parameter has changed that the node follows."""
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -379,6 +218,11 @@ class NodeLink:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
+
+    async def withdrawn(self) -> None:
+        """Wait until all is withdrawn that has ended."""
+        while self.ending:
+            await next(iter(self.ending.values())).closed()
 
     async def current(self) -> Node:
         """The node; waits until there is one."""
@@ -411,9 +255,11 @@ class NodeLink:
     async def _run(self) -> None:
         while True:
             try:
-                async with self._make(await self._where(), self._on_param_update) as node:
-                    self._began(node)
+                async with self._make(await self._where(), self.on_param_update) as node:
+                    self.node, self.problem = node, ""
+                    self._ready.set()
                     try:
+                        self.on_node(node)
                         await node.stopped.wait()
                     finally:
                         self.node = None
@@ -429,150 +275,80 @@ class NodeLink:
                 self.problem = f"it failed: {error}"
             await asyncio.sleep(limits.NODE_RETRY)
 
-    def _began(self, node: Node) -> None:
-        self.node = node
-        self.problem = ""
-        self._ready.set()
-        for callback in self.on_node:
-            with logged_failure(_log, "what follows a new node failed"):
-                callback(node)
-
 
 class Registration(Generic[_T]):
-    """Keeps one thing registered with the present node: a subscription, a publisher or a service.
+    """Keeps one thing registered with the present node, after that of the same kind and name is withdrawn.
 
     Args:
         link: Has the node.
-        name: For logs.
-        register: Registers it; what it returns is handed to ``withdraw``.
-        withdraw: Ends it.
+        kind: ``topic``, ``publisher`` or ``service``.
+        name: Of the topic or service.
+        register: Registers it.
         on_failed: ``(error)``: it was refused, and is not tried again. What only waits for the master is.
-        after: The registration of the same name that is ending.
     """
 
     def __init__(
         self,
         link: NodeLink,
+        kind: str,
         name: str,
         register: Callable[[Node], Awaitable[_T]],
-        withdraw: Callable[[_T], Awaitable[None]],
         on_failed: Callable[[RmpaError], None],
-        after: Registration[_T] | None = None,
     ) -> None:
         self._link = link
+        self._key = kind, name
         self._register = register
-        self._withdraw = withdraw
         self._on_failed = on_failed
-        self._unwanted = asyncio.Event()
+        self._wanted = True
+        self._resting: asyncio.Future[Any] | None = None
         self.value: _T | None = None
         """What ``register`` returned, while it is registered."""
-        self._task: asyncio.Task[None] = asyncio.get_running_loop().create_task(
-            self._run(after), name=f"register {name}"
-        )
+        work = self._run(link.ending.get(self._key))
+        self._task = asyncio.get_running_loop().create_task(work, name=f"register {kind} {name}")
 
     def end(self) -> None:
         """Withdraw it, in its task."""
-        self._unwanted.set()
+        self._wanted = False
+        if self._resting is not None:
+            self._resting.cancel()
+        self._link.ending[self._key] = self
+        self._task.add_done_callback(self._ended)
+
+    def _ended(self, _: object) -> None:
+        if self._link.ending.get(self._key) is self:
+            del self._link.ending[self._key]
 
     async def closed(self) -> None:
         """Wait, after ``end``, until it is withdrawn."""
         await asyncio.wait([self._task])
+        await asyncio.sleep(0)  # its callback has run
 
-    def when_closed(self, call: Callable[[], None]) -> None:
-        """Have a function called when all is done."""
-        self._task.add_done_callback(lambda _: call())
-
-    async def _run(self, after: Registration[_T] | None) -> None:
-        if after is not None:
-            await after.closed()
-        while not self._unwanted.is_set():
-            node = await self._first(self._link.current())
+    async def _run(self, before: Registration[_T] | None) -> None:
+        if before is not None:
+            await before.closed()
+        while self._wanted:
+            node = await self._rest(self._link.current())
             if node is None:
                 return
             try:
                 self.value = await self._register(node)
             except UnreachableError as error:
                 _log.debug("! %s", error)
-                await self._first(asyncio.sleep(limits.NODE_RETRY))
+                await self._rest(asyncio.sleep(limits.NODE_RETRY))
                 continue
             except (RmpaError, ValueError) as error:  # ValueError: an illegal name
                 self._on_failed(error if isinstance(error, RmpaError) else RmpaError(str(error)))
                 return
-            self._link.registration_changed()
-            await self._first(node.stopped.wait())
+            self._link.on_registration()
+            if self._wanted:
+                await self._rest(node.stopped.wait())
             value, self.value = self.value, None
             if not node.stopped.is_set():
-                await self._withdraw(value)
-                self._link.registration_changed()
+                await value.close()
+                self._link.on_registration()
 
-    async def _first(self, other: Awaitable[_U]) -> _U | None:
-        """Wait for it, or until it is no longer wanted: then ``None``."""
-        loop = asyncio.get_running_loop()
-        unwanted = loop.create_task(self._unwanted.wait())
-        task = asyncio.ensure_future(other)
-        try:
-            await asyncio.wait([unwanted, task], return_when=asyncio.FIRST_COMPLETED)
-            return task.result() if task.done() else None
-        finally:
-            for each in (unwanted, task):
-                each.cancel()
-            await asyncio.wait([unwanted, task])
-
-
-class EndingRegistrations(Generic[_T]):
-    """Registrations that are being withdrawn, by name: a new one of the same name waits for the old one."""
-
-    def __init__(self) -> None:
-        self._registrations: dict[str, Registration[_T]] = {}
-
-    def end(self, name: str, registration: Registration[_T]) -> None:
-        """Withdraw a registration; it is kept until that is done."""
-        registration.end()
-        self._registrations[name] = registration
-        registration.when_closed(functools.partial(self._closed, name, registration))
-
-    def take(self, name: str) -> Registration[_T] | None:
-        """The registration of this name that is still being withdrawn, which is no longer kept here."""
-        return self._registrations.pop(name, None)
-
-    async def closed(self) -> None:
-        """Wait until all are withdrawn."""
-        for registration in [*self._registrations.values()]:
-            await registration.closed()
-
-    def _closed(self, name: str, registration: Registration[_T]) -> None:
-        if self._registrations.get(name) is registration:
-            del self._registrations[name]
-
-
-# A client as the hub knows it, and the key of what it has asked for.
-
-
-Key: TypeAlias = "tuple[int, int]"
-"""The number of a client and one of its handles: unique in the hub."""
-OWN_CLIENT: Final = 0
-"""The number of the hub itself, and of what it keeps for all clients; clients count from 1."""
-Receive: TypeAlias = "Callable[[Answer], None]"
-
-
-@dataclass(slots=True, eq=False)
-class HubClient:
-    """One client.
-
-    Args:
-        number: Never used again.
-        name: For logs and lists.
-        rights: What it may do.
-        receive: Takes answers; it must not raise.
-    """
-
-    number: int
-    name: str
-    rights: Rights
-    receive: Receive
-    subscriptions: dict[int, str] = field(default_factory=dict)
-    """The topics by handle."""
-    publishers: dict[int, str] = field(default_factory=dict)
-    """The published topics by handle."""
-    services: dict[int, str] = field(default_factory=dict)
-    """The served services by handle."""
+    async def _rest(self, other: Awaitable[_U]) -> _U | None:
+        """Wait for it, or until this is no longer wanted: then ``None``."""
+        self._resting = asyncio.ensure_future(other)
+        await asyncio.wait([self._resting])
+        return None if self._resting.cancelled() else self._resting.result()

@@ -1,18 +1,14 @@
-"""Services that clients call and serve, and files of ROS packages.
-
-Files of ROS packages, for clients that draw a robot: ``package://NAME/PATH``.
-"""
+"""Services that clients call and serve, and files of ROS packages for clients that draw a robot."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
-import itertools
 import os
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError
@@ -21,16 +17,49 @@ from rmpa.ros.node.endpoints import probe
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
-from rmpa.web.hub.node_link import EndingRegistrations, Registration
+from rmpa.web.hub.node_link import Registration
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 
     from rmpa.ros.node.node import Node, Service
     from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.wire.tcpros import ServiceDescription
-    from rmpa.web.hub.node_link import Key, NodeLink
-    from rmpa.web.hub.requests import Payload
+    from rmpa.web.hub.node_link import NodeLink, Payload
+
+_K = TypeVar("_K")
+_T = TypeVar("_T")
+
+
+class SharedTasks(Generic[_K, _T]):
+    """Answers that take time, each found by one task for all who ask for it meanwhile."""
+
+    def __init__(self) -> None:
+        self._tasks: dict[_K, asyncio.Task[_T]] = {}
+
+    def start(self, key: _K, find: Callable[[], Coroutine[object, object, _T]]) -> asyncio.Task[_T]:
+        """The task that finds this; nothing need wait for it."""
+        task = self._tasks.get(key)
+        if task is None:
+            task = self._tasks[key] = asyncio.get_running_loop().create_task(find(), name=f"find {key}")
+            task.add_done_callback(functools.partial(self._ended, key))
+        return task
+
+    async def get(self, key: _K, find: Callable[[], Coroutine[object, object, _T]]) -> _T:
+        """The answer; raises what ``find`` raises."""
+        return await asyncio.shield(self.start(key, find))
+
+    async def close(self) -> None:
+        """End all."""
+        tasks = [*self._tasks.values()]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _ended(self, key: _K, task: asyncio.Task[_T]) -> None:
+        del self._tasks[key]
+        if not task.cancelled():
+            task.exception()  # nothing may wait for it
+
 
 _SCHEME: Final = "package://"
 _MANIFESTS: Final = ("package.xml", "manifest.xml")
@@ -124,22 +153,25 @@ def _is_package(folder: Path) -> bool:
     return any((folder / name).is_file() for name in _MANIFESTS)
 
 
-# Services that clients offer: the node serves them, and hands each call to its client.
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class ServedService:
+    """A service that a client offers, from ``ServedServices.serve``."""
 
-
-@dataclass(slots=True, eq=False)
-class _Served:
+    services: ServedServices
     name: str
-    key: Key
     kind: ServiceType
-    request: Callable[[int, bytes], None]
+    called: Callable[[bytes, asyncio.Future[Payload]], None]
     failed: Callable[[RmpaError], None]
     registration: Registration[Service] | None = None
-    calls: dict[int, asyncio.Future[Payload]] = field(default_factory=dict)
+    calls: set[asyncio.Future[Payload]] = field(default_factory=set)
+
+    def close(self, reason: str = "") -> None:
+        """Offer it no more; its open calls fail."""
+        self.services.end(self, reason or f"the client that offers {self.name} has ended it")
 
 
 class ServedServices:
-    """All services that clients offer.
+    """All services that clients offer: the node serves them, and hands each call to its client.
 
     Args:
         link: Has the node.
@@ -147,25 +179,21 @@ class ServedServices:
 
     def __init__(self, link: NodeLink) -> None:
         self._link = link
-        self._served: dict[str, _Served] = {}
-        self._ending: EndingRegistrations[Service] = EndingRegistrations()
-        self._numbers = itertools.count(1)
+        self._served: dict[str, ServedService] = {}
 
     def serve(
         self,
-        key: Key,
         name: str,
         kind: ServiceType,
-        request: Callable[[int, bytes], None],
+        called: Callable[[bytes, asyncio.Future[Payload]], None],
         failed: Callable[[RmpaError], None],
-    ) -> None:
+    ) -> ServedService:
         """Offer a service; a client that offers it already loses it, which may have gone without a word.
 
         Args:
-            key: The client and its handle.
             name: The global name.
             kind: Its type.
-            request: ``(call, payload)``: hands a call to the client, which answers by ``respond``.
+            called: ``(request, response)``: hands a call to the client, which sets the response or an exception.
             failed: Called where the service cannot be registered, or another client offers it; it has then ended.
 
         Raises:
@@ -174,100 +202,64 @@ class ServedServices:
         self._link.rules.check(Access.SERVE, name)
         if (old := self._served.get(name)) is not None:
             self._refused(old, RmpaError(f"another client offers {name} now"))
-        served = self._served[name] = _Served(name, key, kind, request, failed)
-        served.registration = Registration(
-            self._link,
-            name,
-            functools.partial(self._register, served),
-            _withdraw,
-            functools.partial(self._refused, served),
-            after=self._ending.take(name),
-        )
+        served = self._served[name] = ServedService(self, name, kind, called, failed)
+        register = functools.partial(self._register, served)
+        refused = functools.partial(self._refused, served)
+        served.registration = Registration(self._link, "service", name, register, refused)
+        return served
 
-    def respond(self, key: Key, name: str, call: int, *, ok: bool, response: Payload | str) -> None:
-        """Answer a call; one that has ended is ignored."""
-        served = self._served.get(name)
-        future = served.calls.get(call) if served is not None and served.key == key else None
-        if future is None or future.done():
+    def end(self, served: ServedService, reason: str) -> None:
+        """End a service, once; its open calls fail."""
+        if self._served.get(served.name) is not served:
             return
-        if ok and not isinstance(response, str):
-            future.set_result(response)
-        else:
-            future.set_exception(RmpaError(str(response)))
+        del self._served[served.name]
+        for response in served.calls:
+            if not response.done():
+                response.set_exception(RmpaError(reason))
+        if served.registration is not None:
+            served.registration.end()
 
-    def end(self, key: Key, name: str) -> None:
-        """End a service; its open calls fail."""
-        served = self._served.get(name)
-        if served is not None and served.key == key:
-            self._end(served)
-
-    async def close(self) -> None:
-        """End all, after the node was closed."""
+    def close(self) -> None:
+        """End all."""
         for served in [*self._served.values()]:
-            self._end(served)
-        await self._ending.closed()
+            served.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    async def _register(self, served: _Served, node: Node) -> Service:
+    async def _register(self, served: ServedService, node: Node) -> Service:
         handler = functools.partial(self._call, served)
         return await node.advertise_service(
             served.name, served.kind, handler, timeout=limits.SERVED_TIMEOUT, raw=True
         )
 
-    async def _call(self, served: _Served, request: bytes) -> Payload:
+    async def _call(self, served: ServedService, request: bytes) -> Payload:
         if len(served.calls) >= limits.SERVED_CALLS_MAX:
             raise RmpaError(f"{len(served.calls)} calls of {served.name} wait for its client, which is the limit")
-        number = next(self._numbers)
-        future: asyncio.Future[Payload] = asyncio.get_running_loop().create_future()
-        served.calls[number] = future
+        response: asyncio.Future[Payload] = asyncio.get_running_loop().create_future()
+        served.calls.add(response)
         try:
-            served.request(number, request)
-            return await future
+            served.called(request, response)
+            return await response
         finally:
-            del served.calls[number]
+            served.calls.discard(response)
 
-    def _refused(self, served: _Served, error: RmpaError) -> None:
+    def _refused(self, served: ServedService, error: RmpaError) -> None:
         if self._served.get(served.name) is served:
-            self._end(served)
+            served.close()
             served.failed(error)
-
-    def _end(self, served: _Served) -> None:
-        del self._served[served.name]
-        for future in served.calls.values():
-            if not future.done():
-                future.set_exception(RmpaError(f"the client that offers {served.name} has ended it"))
-        if served.registration is not None:
-            self._ending.end(served.name, served.registration)
-
-
-async def _withdraw(service: Service) -> None:
-    await service.close()
-
-
-# Services that clients call: a few open connections to each server, shared by all clients.
-
-
-@dataclass(frozen=True, slots=True)
-class FoundService:
-    """What a server has said of its service."""
-
-    type: str
-    uri: str
 
 
 @dataclass(slots=True, eq=False)
 class _Server:
     """The connections to the server of one service, for one md5 sum."""
 
-    slots: asyncio.Semaphore
-    idle: list[tuple[ServiceConnection, float]] = field(default_factory=list)
-    busy: set[ServiceConnection] = field(default_factory=set)
+    slots: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(limits.CALLS_AT_ONCE))
+    idle: dict[ServiceConnection, asyncio.TimerHandle] = field(default_factory=dict)
     users: int = 0
 
 
 class ServiceCalls:
-    """Calls services, and asks servers for their types.
+    """Calls services over a few connections to each server, and asks servers for their types, for all clients.
 
     Args:
         link: Has the node.
@@ -275,16 +267,11 @@ class ServiceCalls:
 
     def __init__(self, link: NodeLink) -> None:
         self._link = link
-        self._servers: dict[tuple[str, str], _Server] = {}
-        self._sweep: asyncio.TimerHandle | None = None
-        self._found: dict[str, FoundService] = {}
-        self._finding: dict[str, asyncio.Future[FoundService]] = {}
+        self._servers: defaultdict[tuple[str, str], _Server] = defaultdict(_Server)
+        self._finding: SharedTasks[str, tuple[str, str]] = SharedTasks()
         self._probes = asyncio.Semaphore(limits.PROBES_AT_ONCE)
-
-    @property
-    def found(self) -> dict[str, FoundService]:
-        """What is known of services, by name."""
-        return self._found
+        self.found: dict[str, tuple[str, str]] = {}
+        """The types and URIs that servers have told, by the service's name."""
 
     async def call(self, service: str, md5sum: str, request: Payload, timeout: float | None) -> Payload:  # noqa: ASYNC109
         """Call a service.
@@ -304,9 +291,7 @@ class ServiceCalls:
         self._link.rules.check(Access.CALL, service)
         seconds = limits.CALL_TIMEOUT if timeout is None else min(timeout, limits.CALL_TIMEOUT_MAX)
         key = service, md5sum or ANY
-        server = self._servers.get(key)
-        if server is None:
-            server = self._servers[key] = _Server(asyncio.Semaphore(limits.CALLS_AT_ONCE))
+        server = self._servers[key]
         if server.users >= limits.CALLS_WAITING + limits.CALLS_AT_ONCE:
             raise ServiceFailed(service, f"{limits.CALLS_WAITING} calls wait for its server already", sent=False)
         server.users += 1
@@ -317,48 +302,34 @@ class ServiceCalls:
             raise ServiceFailed(service, f"no answer within {seconds:g} s") from None
         finally:
             server.users -= 1
-            if not server.users and not server.idle and self._servers.get(key) is server:
-                del self._servers[key]
+            self._forget_unused(key)
         if not ok:
             raise PeerRefused(f"service {service}", str(bytes(body), "utf-8", "replace"))
         return body
 
-    async def find(self, service: str) -> FoundService:
-        """Ask a service's server for its type; the answer is kept until ``forget``.
+    async def find(self, service: str) -> tuple[str, str]:
+        """Ask a service's server for its type; the answer, with its URI, is kept until ``forget``.
 
         Raises:
             RmpaError: There is no such service, or its server does not answer.
         """
-        found = self._found.get(service)
-        if found is not None:
-            return found
-        asked = self._finding.get(service)
-        if asked is None:
-            asked = self._finding[service] = asyncio.ensure_future(self._probe(service))
-            asked.add_done_callback(lambda _: self._finding.pop(service, None))
-        return await asyncio.shield(asked)
+        return self.found.get(service) or await self._finding.get(service, lambda: self._probe(service))
 
-    def forget(self, service: str) -> None:
-        """The service has another provider, or none: forget what is known of it, and connect anew."""
-        self._found.pop(service, None)
-        for (name, _), server in self._servers.items():
-            if name == service:
-                for connection, _ in server.idle:
-                    connection.close()
-                server.idle.clear()
+    def forget(self, services: Iterable[str]) -> None:
+        """These have other providers, or none: forget what is known of them, and connect anew."""
+        names = {*services}
+        for name in names:
+            self.found.pop(name, None)
+        for key in [key for key in self._servers if key[0] in names]:
+            for connection in [*self._servers[key].idle]:
+                self._drop(key, connection)
 
     async def close(self) -> None:
         """Close all connections; the callers have been cancelled before."""
-        if self._sweep is not None:
-            self._sweep.cancel()
-        asked = [*self._finding.values()]
-        for each in asked:
-            each.cancel()
-        await asyncio.gather(*asked, return_exceptions=True)
-        for server in self._servers.values():
-            for connection in [*(each for each, _ in server.idle), *server.busy]:
-                connection.close()
-        self._servers.clear()
+        await self._finding.close()
+        for key, server in [*self._servers.items()]:
+            for connection in [*server.idle]:
+                self._drop(key, connection)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -367,7 +338,6 @@ class ServiceCalls:
     ) -> tuple[bool, bytes | bytearray]:
         while True:
             connection, fresh = await self._take(server, key)
-            server.busy.add(connection)
             try:
                 result = await connection.call(request)
             except ServiceFailed as error:
@@ -378,14 +348,15 @@ class ServiceCalls:
                 connection.close()
                 raise
             else:
-                self._give_back(server, connection)
+                if not connection.closed:
+                    loop = asyncio.get_running_loop()
+                    server.idle[connection] = loop.call_later(limits.CALL_IDLE, self._drop, key, connection)
                 return result
-            finally:
-                server.busy.discard(connection)
 
     async def _take(self, server: _Server, key: tuple[str, str]) -> tuple[ServiceConnection, bool]:
         while server.idle:
-            connection, _ = server.idle.pop()
+            connection, timer = server.idle.popitem()
+            timer.cancel()
             if not connection.closed:
                 return connection, False
         service, md5sum = key
@@ -393,34 +364,23 @@ class ServiceCalls:
         uri = await node.lookup_service(service)
         return await ServiceConnection.open(uri, service, node.name, md5sum=md5sum), True
 
-    def _give_back(self, server: _Server, connection: ServiceConnection) -> None:
-        loop = asyncio.get_running_loop()
-        if not connection.closed:
-            server.idle.append((connection, loop.time()))
-        if self._sweep is None:
-            self._sweep = loop.call_later(limits.CALL_IDLE, self._close_unused)
+    def _drop(self, key: tuple[str, str], connection: ServiceConnection) -> None:
+        self._servers[key].idle.pop(connection).cancel()
+        connection.close()
+        self._forget_unused(key)
 
-    def _close_unused(self) -> None:
-        loop = asyncio.get_running_loop()
-        self._sweep = None
-        before = loop.time() - limits.CALL_IDLE
-        for key, server in [*self._servers.items()]:
-            for connection, since in server.idle:
-                if since <= before:
-                    connection.close()
-            server.idle = [each for each in server.idle if not each[0].closed]
-            if not server.users and not server.idle:
-                del self._servers[key]
-        if self._servers:
-            self._sweep = loop.call_later(limits.CALL_IDLE / 2, self._close_unused)
+    def _forget_unused(self, key: tuple[str, str]) -> None:
+        server = self._servers.get(key)
+        if server is not None and not server.users and not server.idle:
+            del self._servers[key]
 
-    async def _probe(self, service: str) -> FoundService:
+    async def _probe(self, service: str) -> tuple[str, str]:
         async with self._probes:
             node = self._link.need()
             uri = await node.lookup_service(service)
             opened = await probe(uri, service, node.name, ros_limits.SERVICE_OPEN_TIMEOUT)
-        description: ServiceDescription = opened.description
-        if not description.type or description.type == ANY:
+        type_ = opened.description.type
+        if not type_ or type_ == ANY:
             raise RmpaError(f"the server of {service} does not tell its type")
-        found = self._found[service] = FoundService(description.type, uri)
+        found = self.found[service] = type_, uri
         return found

@@ -1,33 +1,33 @@
-"""The hub's subscriptions: one ROS subscription a topic for all clients, and the latched messages for newcomers."""
+"""The hub's topics: one subscription and one publisher of its node for all clients, and what is latched."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
-import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from rmpa.config.peer_rules import Access
+from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused
+from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
-from rmpa.web.hub.node_link import EndingRegistrations, Registration
-from rmpa.web.hub.requests import OtherType, ReceivedMessage
+from rmpa.web.hub.node_link import Registration
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, KeysView, Mapping
+    from collections.abc import Callable, Iterable, KeysView, Mapping
 
     from rmpa.core.errors import RmpaError
-    from rmpa.ros.node.node import Node, Subscriber
+    from rmpa.ros.node.node import Node, Publisher, Subscriber
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.hub.node_link import Key, NodeLink
-    from rmpa.web.hub.requests import GraphTopic
-
-
-# Buffers for the payloads of received messages, used again and again. No I/O.
+    from rmpa.web.hub.graph import GraphWatch, TypeLibrary
+    from rmpa.web.hub.node_link import NodeLink, Payload
 
 
 class PayloadBuffers:
@@ -99,34 +99,55 @@ OWN: Final = ""
 """The source of what clients of this hub publish: the node has no connection to itself."""
 
 
-@dataclass(slots=True, eq=False)
-class _Sink:
-    """One subscription of one client."""
+class ReceivedMessage(msgspec.Struct, frozen=True):
+    """One message, for all who subscribe to its topic.
 
-    handle: int
+    Attributes:
+        payload: Stays valid and unchanged for as long as it is referenced.
+        stamp_ns: Its time of receipt (UTC, nanoseconds).
+        source: The node that published it in this module's graph; "" for a client of the hub.
+        md5sum: That of the publisher's version of the type; "" where it is not told.
+    """
+
+    topic: str
+    type: str
+    payload: memoryview
+    stamp_ns: int
+    source: str = OWN
+    md5sum: str = ""
+
+
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class ClientSubscription:
+    """One subscription of one client, from ``HubTopics.subscribe``."""
+
+    topics: HubTopics
+    topic: str
     type: str | None
-    deliver: Callable[[ReceivedMessage], None]
+    receive: Callable[[ReceivedMessage], None]
     failed: Callable[[RmpaError], None]
-    differs: Callable[[OtherType], None] | None = None
+    differs: Callable[[str], None]
     told: set[str] = field(default_factory=set)
     """Other types that ``differs`` was called for."""
+
+    def close(self) -> None:
+        """End it; the last one's topic lingers for ``limits.SUBSCRIPTION_LINGER``."""
+        self.topics.unsubscribe(self)
 
 
 @dataclass(slots=True, eq=False)
 class _Latched:
-    """The last message of a latching source, and which sinks have had it."""
+    """The last message of a latching source, and which subscriptions have had it."""
 
+    message: ReceivedMessage
     header: Mapping[str, str]
-    type: str
-    payload: memoryview
-    stamp_ns: int
-    had: set[_Sink] = field(default_factory=set)
+    had: set[ClientSubscription] = field(default_factory=set)
 
 
 @dataclass(slots=True, eq=False)
 class _Topic:
     name: str
-    sinks: dict[Key, _Sink] = field(default_factory=dict)
+    subscriptions: dict[ClientSubscription, None] = field(default_factory=dict)
     registration: Registration[Subscriber] | None = None
     kind: MessageType | None = None
     """The type that it is registered with; ``None``: any."""
@@ -134,42 +155,29 @@ class _Topic:
     latched: dict[str, _Latched] = field(default_factory=dict)
     headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
     """The last header of each publisher, by its name."""
-    messages: int = 0
-    bytes: int = 0
 
 
 class HubTopics:
-    """All subscriptions.
+    """All subscriptions, and what clients of the hub publish to each other.
 
     Args:
         link: Has the node.
-        learn: ``(topic, header)``: a publisher's header, at each new connection, before its first message.
-        own_latched: The type, payload and time of the latched message that a client of this hub publishes on a topic.
-        graph: All topics of the graph by name; ``graph_changed`` is called at its changes.
-        find: A message type, if it is known at once.
+        types: Is told the headers of publishers, and knows the types.
+        graph: Likewise, and the topics.
         now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(
-        self,
-        link: NodeLink,
-        learn: Callable[[str, Mapping[str, str]], None],
-        own_latched: Callable[[str], tuple[str, memoryview, int] | None],
-        graph: Callable[[], Mapping[str, GraphTopic]] = dict,
-        find: Callable[[str], MessageType | None] = lambda _: None,
-        now_ns: Callable[[], int] = time.time_ns,
-    ) -> None:
+    def __init__(self, link: NodeLink, types: TypeLibrary, graph: GraphWatch, now_ns: Callable[[], int]) -> None:
         self._link = link
-        self._learn = learn
-        self._own_latched = own_latched
+        self._types = types
         self._graph = graph
-        self._find = find
         self._now_ns = now_ns
         self._topics: dict[str, _Topic] = {}
-        self._ending: EndingRegistrations[Subscriber] = EndingRegistrations()
         self._latched_bytes = 0
         self._latched_order: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._buffers = PayloadBuffers()
+        self.publishers = Publishers(link, types, self, now_ns)
+        graph.follow(self._graph_changed)
 
     @property
     def names(self) -> KeysView[str]:
@@ -178,91 +186,85 @@ class HubTopics:
 
     def subscribe(
         self,
-        key: Key,
         topic: str,
         type_: str | None,
-        deliver: Callable[[ReceivedMessage], None],
-        failed: Callable[[RmpaError], None],
-        differs: Callable[[OtherType], None] | None = None,
-    ) -> None:
-        """Begin a subscription; latched messages that are there are delivered before this returns.
+        receive: Callable[[ReceivedMessage], None],
+        failed: Callable[[RmpaError], None] = lambda _: None,
+        differs: Callable[[str], None] = lambda _: None,
+    ) -> ClientSubscription:
+        """Begin a subscription. Latched messages that are there come first, right after this has returned.
 
         Args:
-            key: The client and its handle.
             topic: The global name.
             type_: The only type that is wanted; ``None`` for any.
-            deliver: Takes each message.
-            failed: Called where the rules or the master refuse the subscription, which has then ended.
+            receive: Takes each message.
+            failed: Called where the master refuses the subscription, which has then ended.
             differs: Called once for each other type that all its publishers have.
+
+        Raises:
+            PeerRefused: The rules deny it.
         """
-        try:
-            self._link.rules.check(Access.SUBSCRIBE, topic)
-        except PeerRefused as error:
-            failed(error)
-            return
-        sink = _Sink(key[1], None if type_ == ANY else type_, deliver, failed, differs)
+        self._link.rules.check(Access.SUBSCRIBE, topic)
+        made = ClientSubscription(self, topic, None if type_ == ANY else type_, receive, failed, differs)
         there = self._topics.get(topic)
         if there is None:
             there = self._topics[topic] = _Topic(topic)
-            there.registration = self._registration(there)
-            own = self._own_latched(topic)
-            if own is not None:
-                self._keep(there, OWN, _Latched({}, *own))
+            self._register_with(there, None)
+            if (own := self.publishers.latched(topic)) is not None:
+                self._keep(there, _Latched(own, {}))
         if there.linger is not None:
             there.linger.cancel()
             there.linger = None
-        there.sinks[key] = sink
-        self._judge(there)
-        self._replay(there, sink)
+        there.subscriptions[made] = None
+        loop = asyncio.get_running_loop()
+        loop.call_soon(self._replay, there, made)
+        loop.call_soon(self._judge, there)
+        return made
 
-    def unsubscribe(self, key: Key, topic: str) -> None:
-        """End a subscription; the last one's topic lingers for ``limits.SUBSCRIPTION_LINGER``."""
-        there = self._topics.get(topic)
-        sink = there.sinks.pop(key, None) if there is not None else None
-        if there is None or sink is None:
+    def unsubscribe(self, subscription: ClientSubscription) -> None:
+        """End a subscription, once."""
+        there = self._topics.get(subscription.topic)
+        if there is None or subscription not in there.subscriptions:
             return
+        del there.subscriptions[subscription]
         for latched in there.latched.values():
-            latched.had.discard(sink)
-        if not there.sinks:
-            loop = asyncio.get_running_loop()
-            there.linger = loop.call_later(limits.SUBSCRIPTION_LINGER, self._end, there)
+            latched.had.discard(subscription)
+        if not there.subscriptions:
+            there.linger = asyncio.get_running_loop().call_later(limits.SUBSCRIPTION_LINGER, self._end, there)
 
-    def publish(self, topic: str, type_: str, payload: memoryview, *, latch: bool) -> None:
+    def publish_own(self, message: ReceivedMessage, *, latch: bool) -> None:
         """Deliver what a client of this hub publishes, to which the node itself does not subscribe."""
-        there = self._topics.get(topic)
+        there = self._topics.get(message.topic)
         if there is not None:
-            self._deliver(there, OWN, {"type": type_}, type_, payload, self._now_ns(), latch=latch)
+            self._deliver(there, message, {} if latch else None)
 
     def forget_own(self, topic: str) -> None:
         """Forget the latched message of the hub's own publisher, which has ended."""
         self._forget_latched(topic, OWN)
 
-    def graph_changed(self) -> None:
-        """Publishers have come or gone: tell the subscriptions whose type is another."""
-        for there in [*self._topics.values()]:
-            self._judge(there)
-
-    async def close(self) -> None:
-        """End all, after the node was closed."""
+    def close(self) -> None:
+        """End all."""
         for there in [*self._topics.values()]:
             self._end(there)
-        await self._ending.closed()
+        self.publishers.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _registration(self, there: _Topic) -> Registration[Subscriber]:
-        return Registration(
-            self._link,
-            there.name,
-            functools.partial(self._register, there),
-            _withdraw,
-            functools.partial(self._refused, there),
-            after=self._ending.take(there.name),
-        )
+    def _register_with(self, there: _Topic, kind: MessageType | None) -> None:
+        if there.registration is not None:
+            there.registration.end()
+        there.kind = kind
+        register = functools.partial(self._register, there)
+        refused = functools.partial(self._refused, there)
+        there.registration = Registration(self._link, "topic", there.name, register, refused)
 
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
         take = functools.partial(self._take, there)
         return await node.subscribe(there.name, there.kind, on_bytes=take, own=False)
+
+    def _graph_changed(self) -> None:
+        for there in [*self._topics.values()]:
+            self._judge(there)
 
     def _judge(self, there: _Topic) -> None:
         """Compare the types that are wanted with those that are published.
@@ -271,37 +273,35 @@ class HubTopics:
         then refuse the connection as they refuse any node's, so that no message is sent in vain, and ``rmpa why`` and
         the diagnostics name the mismatch.
         """
-        topic = self._graph().get(there.name)
+        if self._topics.get(there.name) is not there:
+            return
+        topic = self._graph.topics.get(there.name)
         types = topic.types if topic is not None and topic.publishers else ()
-        wanted = {sink.type for sink in there.sinks.values()}
-        for sink in [*there.sinks.values()] if types else ():
-            if sink.type is not None and sink.type not in types and types[0] not in sink.told:
-                sink.told.add(types[0])
-                if sink.differs is not None:
-                    sink.differs(OtherType(sink.handle, there.name, types[0]))
+        wanted = {each.type for each in there.subscriptions}
+        for each in [*there.subscriptions] if types else ():
+            if each.type is not None and each.type not in types and types[0] not in each.told:
+                each.told.add(types[0])
+                each.differs(types[0])
         unfit = types and len(wanted) == 1 and not wanted & {None, *types}
-        kind = self._find(next(iter(wanted)) or "") if unfit else None
-        if there.registration is not None and kind is not there.kind:
-            there.kind = kind
-            self._ending.end(there.name, there.registration)
-            there.registration = self._registration(there)
+        kind = self._types.at_hand(next(iter(wanted)) or "") if unfit else None
+        if kind is not there.kind:
+            self._register_with(there, kind)
 
     def _refused(self, there: _Topic, error: RmpaError) -> None:
         if self._topics.get(there.name) is there:
-            sinks = [*there.sinks.values()]
-            there.sinks.clear()
+            subscriptions = [*there.subscriptions]
             self._end(there)
-            for sink in sinks:
-                sink.failed(error)
+            for each in subscriptions:
+                each.failed(error)
 
     def _end(self, there: _Topic) -> None:
         if there.linger is not None:
             there.linger.cancel()
-        del self._topics[there.name]
         for source in [*there.latched]:
-            self._forget_latched(there.name, source, there)
+            self._forget_latched(there.name, source)
+        del self._topics[there.name]
         if there.registration is not None:
-            self._ending.end(there.name, there.registration)
+            there.registration.end()
         if not self._topics:
             self._buffers.clear()
 
@@ -309,94 +309,272 @@ class HubTopics:
         if self._topics.get(there.name) is not there:
             return  # it has ended, and is being withdrawn
         stamp_ns = self._now_ns()
-        source = header.get("callerid", "?")
+        source, type_ = header.get("callerid", "?"), header.get("type", "")
         if there.headers.get(source) is not header:
             there.headers[source] = header
             if len(there.headers) > limits.SEEN_PUBLISHERS_MAX:
                 del there.headers[next(iter(there.headers))]
-            self._learn(there.name, header)
-        latch = header.get("latching") == "1"
+            self._types.learn(header)
+            if type_:
+                self._graph.saw_type(there.name, type_)
         payload = self._buffers.copy(data)
-        self._deliver(there, source, header, header.get("type", ""), payload, stamp_ns, latch=latch)
+        message = ReceivedMessage(there.name, type_, payload, stamp_ns, source, header.get("md5sum", ""))
+        self._deliver(there, message, header if header.get("latching") == "1" else None)
 
-    def _deliver(
-        self,
-        there: _Topic,
-        source: str,
-        header: Mapping[str, str],
-        type_: str,
-        payload: memoryview,
-        stamp_ns: int,
-        *,
-        latch: bool,
-    ) -> None:
-        there.messages += 1
-        there.bytes += len(payload)
-        had: set[_Sink] | None = None
-        if latch:
-            latched = there.latched.get(source)
-            if latched is not None and source != OWN and latched.header is not header and latched.payload == payload:
-                # The publisher sends its latched message at each new connection: most sinks have had it.
-                latched.header = header
-            else:
-                latched = self._keep(there, source, _Latched(header, type_, payload, stamp_ns))
-            had = latched.had
-        md5sum = header.get("md5sum", "")
-        for sink in [*there.sinks.values()]:
-            if sink.type not in (None, type_):
-                continue
-            if had is not None:
-                if sink in had:
-                    continue
-                had.add(sink)
-            _deliver_to(
-                sink,
-                ReceivedMessage(sink.handle, there.name, type_, payload, stamp_ns, source=source, md5sum=md5sum),
-            )
+    def _deliver(self, there: _Topic, message: ReceivedMessage, latching: Mapping[str, str] | None) -> None:
+        """Hand a message to all; ``latching`` is its publisher's header, if that latches."""
+        if latching is None:
+            _hand(message, there.subscriptions)
+            return
+        latched = there.latched.get(message.source)
+        again = latched is not None and latched.header is not latching and latched.message.payload == message.payload
+        if latched is not None and again and message.source != OWN:
+            # The publisher sends its latched message at each new connection: most have had it.
+            latched.header = latching
+        else:
+            latched = self._keep(there, _Latched(message, latching))
+        _hand_latched(latched, there.subscriptions)
 
-    def _keep(self, there: _Topic, source: str, latched: _Latched) -> _Latched:
-        self._forget_latched(there.name, source, there)
+    def _keep(self, there: _Topic, latched: _Latched) -> _Latched:
+        source = latched.message.source
+        self._forget_latched(there.name, source)
         there.latched[source] = latched
         self._latched_order[there.name, source] = None
-        self._latched_bytes += len(latched.payload)
+        self._latched_bytes += len(latched.message.payload)
         while self._latched_bytes > limits.LATCHED_BYTES and len(self._latched_order) > 1:
             self._forget_latched(*next(iter(self._latched_order)))
         return latched
 
-    def _forget_latched(self, topic: str, source: str, there: _Topic | None = None) -> None:
-        there = there or self._topics.get(topic)
-        self._latched_order.pop((topic, source), None)
-        latched = there.latched.pop(source, None) if there is not None else None
-        if latched is not None:
-            self._latched_bytes -= len(latched.payload)
+    def _forget_latched(self, topic: str, source: str) -> None:
+        if (topic, source) in self._latched_order:
+            del self._latched_order[topic, source]
+            self._latched_bytes -= len(self._topics[topic].latched.pop(source).message.payload)
 
-    def _replay(self, there: _Topic, sink: _Sink) -> None:
+    def _replay(self, there: _Topic, subscription: ClientSubscription) -> None:
         subscriber = there.registration.value if there.registration is not None else None
-        connected = subscriber.callers if subscriber is not None else set()
-        for source, latched in there.latched.items():
-            if (source == OWN or source in connected) and sink.type in (None, latched.type):
-                latched.had.add(sink)
-                _deliver_to(
-                    sink,
-                    ReceivedMessage(
-                        sink.handle,
-                        there.name,
-                        latched.type,
-                        latched.payload,
-                        latched.stamp_ns,
-                        latched=True,
-                        source=source,
-                        md5sum=latched.header.get("md5sum", ""),
-                    ),
-                )
+        connected = {OWN} | (subscriber.callers if subscriber is not None else set())
+        if subscription in there.subscriptions:
+            for source, latched in there.latched.items():
+                if source in connected:
+                    _hand_latched(latched, (subscription,))
 
 
-def _deliver_to(sink: _Sink, message: ReceivedMessage) -> None:
-    try:
-        sink.deliver(message)
-    except Exception:  # noqa: BLE001 - a fault of one client must not cost the others their messages
-        _log.exception("! a message of %s could not be delivered", message.topic)
+def _hand_latched(latched: _Latched, subscriptions: Iterable[ClientSubscription]) -> None:
+    news = [each for each in subscriptions if each not in latched.had]
+    latched.had.update(each for each in news if each.type in (None, latched.message.type))
+    _hand(latched.message, news)
 
 
-async def _withdraw(subscriber: Subscriber) -> None:
-    await subscriber.close()
+def _hand(message: ReceivedMessage, subscriptions: Iterable[ClientSubscription]) -> None:
+    for each in [*subscriptions]:
+        if each.type in (None, message.type):
+            # A fault of one client must not cost the others their messages.
+            with logged_failure(_log, "a message of %s could not be delivered", message.topic):
+                each.receive(message)
+
+
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class ClientPublication:
+    """One client's share of a publisher, from ``Publishers.advertise``."""
+
+    publishers: Publishers
+    topic: str
+    failed: Callable[[RmpaError], None]
+    accepts: Callable[[str], bool]
+
+    def publish(self, payload: Payload) -> None:
+        """Publish a message, numbered. The payload must not change afterwards."""
+        if self.accepts(self.topic):
+            self.publishers.publish(self, payload)
+
+    def close(self) -> None:
+        """Leave the publisher; the last one's is withdrawn after ``limits.UNADVERTISE_DELAY``."""
+        self.publishers.unadvertise(self)
+
+
+@dataclass(slots=True, eq=False)
+class _Publisher:
+    """One published topic."""
+
+    topic: str
+    type: str
+    latch: bool
+    users: set[ClientPublication]
+    numbers: HeaderNumbers | None = None
+    """Numbers its messages; ``None`` while its type is not known."""
+    registration: Registration[Publisher] | None = None
+    linger: asyncio.TimerHandle | None = None
+    early: deque[tuple[float, Payload]] | None = field(default_factory=deque)
+    """What was published before subscribers were connected; ``None`` from then on."""
+    early_bytes: int = 0
+    latched: ReceivedMessage | None = None
+
+
+class Publishers:
+    """All published topics of the hub: one publisher of the node for each, which all clients share.
+
+    Args:
+        link: Has the node.
+        types: Finds the types.
+        subscriptions: The clients' that subscribe to the same topics.
+        now_ns: The wall clock, in nanoseconds.
+    """
+
+    def __init__(
+        self, link: NodeLink, types: TypeLibrary, subscriptions: HubTopics, now_ns: Callable[[], int]
+    ) -> None:
+        self._link = link
+        self._types = types
+        self._subscriptions = subscriptions
+        self._now_ns = now_ns
+        self._topics: dict[str, _Publisher] = {}
+
+    @property
+    def names(self) -> KeysView[str]:
+        """The published topics, those included that wait for their withdrawal."""
+        return self._topics.keys()
+
+    def latched(self, topic: str) -> ReceivedMessage | None:
+        """The last message of a latching topic."""
+        there = self._topics.get(topic)
+        return there.latched if there is not None else None
+
+    def advertise(
+        self,
+        topic: str,
+        type_: str,
+        failed: Callable[[RmpaError], None],
+        *,
+        latch: bool,
+        accepts: Callable[[str], bool] = lambda _: True,
+    ) -> ClientPublication:
+        """Publish a topic, or join its publisher.
+
+        Args:
+            topic: The global name.
+            type_: Its type.
+            failed: Called where the master refuses the publisher, which has then ended.
+            latch: Whether its last message is kept for newcomers.
+            accepts: ``(topic)``: whether a message may be published now.
+
+        Raises:
+            PeerRefused: The rules deny it, other clients publish it with another type, or there are too many topics.
+        """
+        self._link.rules.check(Access.PUBLISH, topic)
+        there = self._topics.get(topic)
+        users = there.users if there is not None else set()
+        if there is not None and users and there.type != type_:
+            problem = f"other clients publish {topic} as {there.type}, not {type_}"
+            raise PeerRefused("the web server", problem, "publish it with that type, or under another name")
+        # TCPROS says at the connection whether a publisher latches.
+        if there is not None and (there.type != type_ or there.latch != latch) and (latch or not users):
+            self._end(there)
+            there = None
+        if there is None:
+            there = self._begin(topic, type_, users, latch=latch)
+        if there.linger is not None:
+            there.linger.cancel()
+            there.linger = None
+        made = ClientPublication(self, topic, failed, accepts)
+        there.users.add(made)
+        return made
+
+    def unadvertise(self, publication: ClientPublication) -> None:
+        """End a publication, once."""
+        there = self._topics.get(publication.topic)
+        if there is not None and publication in there.users:
+            there.users.remove(publication)
+            if not there.users:
+                there.linger = asyncio.get_running_loop().call_later(limits.UNADVERTISE_DELAY, self._end, there)
+
+    def publish(self, publication: ClientPublication, payload: Payload) -> None:
+        """Publish a message of a publication that has not ended."""
+        there = self._topics.get(publication.topic)
+        if there is not None and publication in there.users:
+            self._publish(there, payload)
+
+    def close(self) -> None:
+        """End all."""
+        for there in [*self._topics.values()]:
+            self._end(there)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _publish(self, there: _Publisher, payload: Payload) -> None:
+        if there.numbers is None:
+            self._wait(there, payload)  # it is numbered and delivered when the type is known
+            return
+        payload = there.numbers.stamp(payload)
+        message = ReceivedMessage(there.topic, there.type, memoryview(payload), self._now_ns())
+        if there.latch:
+            there.latched = message
+        publisher = there.registration.value if there.registration is not None else None
+        if there.early is not None or publisher is None:
+            self._wait(there, payload)  # also while the node is made anew: the newest messages wait for it
+        else:
+            publisher.publish_raw(payload)
+        self._subscriptions.publish_own(message, latch=there.latch)
+
+    def _wait(self, there: _Publisher, payload: Payload) -> None:
+        if there.early is None:
+            there.early, there.early_bytes = deque(), 0
+        there.early.append((asyncio.get_running_loop().time(), payload))
+        there.early_bytes += len(payload)
+        while len(there.early) > limits.EARLY_MESSAGES or (
+            len(there.early) > 1 and there.early_bytes > limits.EARLY_BYTES
+        ):
+            there.early_bytes -= len(there.early.popleft()[1])
+
+    def _begin(self, topic: str, type_: str, users: set[ClientPublication], *, latch: bool) -> _Publisher:
+        if len(self._topics) >= limits.PUBLISHERS_MAX:
+            unused = next((each for each in self._topics.values() if not each.users), None)
+            if unused is None:
+                problem = f"its clients publish {len(self._topics)} topics, which is the limit"
+                raise PeerRefused("the web server", problem, "publish fewer topics")
+            self._end(unused)
+        kind = self._types.at_hand(type_)
+        numbers = HeaderNumbers(kind) if kind is not None else None
+        there = self._topics[topic] = _Publisher(topic, type_, latch, users, numbers)
+        register = functools.partial(self._register, there)
+        refused = functools.partial(self._refused, there)
+        there.registration = Registration(self._link, "publisher", topic, register, refused)
+        return there
+
+    async def _register(self, there: _Publisher, node: Node) -> Publisher:
+        kind = await self._types.find_message(there.type)
+        if there.numbers is None and self._topics.get(there.topic) is there:
+            there.numbers = HeaderNumbers(kind)
+            waiting, there.early, there.early_bytes = there.early or (), deque(), 0
+            for _, payload in waiting:
+                self._publish(there, payload)
+        publisher = await node.advertise(there.topic, kind, latch=there.latch)
+        if there.early is not None and not there.latch:
+            # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.EARLY_WAIT):
+                    await publisher.wait_for_subscriber()
+        early, there.early = there.early, None
+        oldest = asyncio.get_running_loop().time() - limits.EARLY_AGE
+        young = [payload for came, payload in early or () if came >= oldest]  # an old command must not act late
+        for payload in young:
+            publisher.publish_raw(payload)
+        if not young and there.latched is not None:
+            # A new node: its subscribers have had it, newcomers have not.
+            publisher.publish_raw(there.latched.payload)
+        return publisher
+
+    def _refused(self, there: _Publisher, error: RmpaError) -> None:
+        if self._topics.get(there.topic) is there:
+            users = [*there.users]
+            there.users.clear()
+            self._end(there)
+            for each in users:
+                each.failed(error)
+
+    def _end(self, there: _Publisher) -> None:
+        if there.linger is not None:
+            there.linger.cancel()
+        del self._topics[there.topic]
+        self._subscriptions.forget_own(there.topic)
+        if there.registration is not None:
+            there.registration.end()

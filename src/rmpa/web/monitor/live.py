@@ -17,7 +17,8 @@ from rmpa.web import limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from rmpa.web.hub.requests import Payload, ReceivedMessage
+    from rmpa.web.hub.node_link import Payload
+    from rmpa.web.hub.topics import ReceivedMessage
     from rmpa.web.monitor.messages import Watch
 
     Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.web import limits
-from rmpa.web.hub.node_link import OWN_CLIENT
 from rmpa.web.monitor.messages import LOG_TOPIC
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import ReceivedMessage
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.messages import Tree
     from rmpa.web.server.agent_watch import AgentWatch, Reading
 
@@ -153,7 +152,6 @@ _TYPE: Final = "rosgraph_msgs/Log"
 _LEVELS: Final = {1: "DEBUG", 2: "INFO", 4: "WARN", 8: "ERROR", 16: "FATAL"}
 _GATHER: Final = 0.1
 """Seconds in which lines are gathered into one message to a page."""
-_HANDLE: Final = 100
 
 
 class LogFeed:
@@ -172,18 +170,23 @@ class LogFeed:
         self._followers: dict[object, Callable[[list[dict[str, Any]]], None]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._count = 0
+        self._subscription: ClientSubscription | None = None
         self.refused: RmpaError | None = None
         """Why there is no log to show."""
 
     def start(self) -> None:
         """Begin to keep lines."""
-        self._hub.topics.subscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC, _TYPE, self._take, self._refused)
+        try:
+            self._subscription = self._hub.topics.subscribe(LOG_TOPIC, _TYPE, self._take, self._refused)
+        except RmpaError as error:
+            self._refused(error)
 
     def close(self) -> None:
         """Keep no more."""
         if self._timer is not None:
             self._timer.cancel()
-        self._hub.topics.unsubscribe((OWN_CLIENT, _HANDLE), LOG_TOPIC)
+        if self._subscription is not None:
+            self._subscription.close()
 
     def follow(self, page: object, show: Callable[[list[dict[str, Any]]], None]) -> list[dict[str, Any]]:
         """Give a page each further line, by ``show``; returns those that are kept, oldest first."""

@@ -19,7 +19,7 @@ from rmpa.core.identity import is_global_name, is_own, proxied_node, proxied_pee
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
-from rmpa.resource.run.reconfigure import SERVICE_TYPE
+from rmpa.resource.reconfigure import SERVICE_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
 from rmpa.web.monitor.state import node_key
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import NodeRules
-    from rmpa.web.hub.requests import ParamValue
+    from rmpa.web.hub.node_link import NodeRules, ParamValue
     from rmpa.web.monitor.resources import ResourceWatch
 
 
@@ -279,8 +278,8 @@ class Answers:
         return name
 
     async def _type_of(self, service: str) -> ServiceType:
-        found = await self._hub.calls.find(service)
-        return await self._hub.types.find_service(found.type)
+        type_, _ = await self._hub.calls.find(service)
+        return await self._hub.types.find_service(type_)
 
 
 async def _in_time(done: Awaitable[Any]) -> None:

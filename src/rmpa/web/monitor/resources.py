@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
+import contextlib
+import functools
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -12,21 +13,22 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.core.limits import KIB
-from rmpa.resource.run.descriptor import TOPIC as DESCRIPTOR
-from rmpa.resource.run.descriptor import Descriptor
-from rmpa.resource.run.reconfigure import CONFIG_TYPE
-from rmpa.resource.run.runtime import LEVEL_FOR
+from rmpa.resource.descriptor import TOPIC as DESCRIPTOR
+from rmpa.resource.descriptor import Descriptor
+from rmpa.resource.loop import LEVEL_FOR
+from rmpa.resource.reconfigure import CONFIG_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.web import limits
-from rmpa.web.hub.node_link import OWN_CLIENT
 from rmpa.web.monitor.messages import Tree, without_nulls
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
+    from rmpa.web.hub.graph import GraphTopic
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.requests import GraphTopic, Payload, ReceivedMessage
+    from rmpa.web.hub.node_link import Follower, Payload
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
 
 
 class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
@@ -41,7 +43,7 @@ class ResourceFacts(msgspec.Struct, kw_only=True, frozen=True):
         health: The first status of ``quality``: ``level``, ``message`` and ``values`` by attribute, with units.
         parameters: Values by name.
         clients: The statuses of ``responses``: what each client asks and is told.
-        descriptor: What it declares (``resource.run.descriptor``), as JSON values.
+        descriptor: What it declares (``resource.descriptor``), as JSON values.
         decision: The last decision, as ``rmpa profile explain --json`` gives it.
         contexts: As ``rmpa context list --json`` gives them.
     """
@@ -184,8 +186,6 @@ _TOPICS: Final = {
     "parameter_updates": (CONFIG_TYPE, _LOOKED_AT),
 }
 """The topics below each resource, with their types."""
-_FIRST_HANDLE: Final = 1000
-_GRAPH: Final = 999
 _BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
 
 
@@ -193,7 +193,8 @@ _BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
 class _Path:
     """The subscriptions below one path; several modules may have a resource of that path."""
 
-    handles: dict[str, int] = field(default_factory=dict)
+    subscriptions: dict[str, ClientSubscription | None] = field(default_factory=dict)
+    """By the last part of the topic's name; ``None``: the rules deny it."""
     publishers: frozenset[str] = frozenset()
     """The nodes that publish the descriptor."""
     looked: float = -1e9
@@ -220,7 +221,7 @@ class ResourceWatch:
         self._values = values
         self._clock = clock
         self._now = now
-        self._numbers = itertools.count(_FIRST_HANDLE)
+        self._follower: Follower | None = None
         self._paths: dict[str, _Path] = {}
         self._wanted = False
         self._since: dict[str, tuple[str, float]] = {}
@@ -234,11 +235,12 @@ class ResourceWatch:
 
     def start(self) -> None:
         """Begin to follow the graph."""
-        self._hub.graph.follow((OWN_CLIENT, _GRAPH), self._graph_changed)
+        self._follower = self._hub.graph.follow(self._graph_changed)
 
     def close(self) -> None:
         """End all subscriptions."""
-        self._hub.graph.unfollow((OWN_CLIENT, _GRAPH))
+        if self._follower is not None:
+            self._follower.close()
         for path in [*self._paths]:
             self._forget(path)
 
@@ -304,7 +306,7 @@ class ResourceWatch:
             return
         if there.publishers and publishers - there.publishers:
             # A source that is back sends the same latched messages, which a subscription has had: begin anew.
-            self._unsubscribe(path, there)
+            _unsubscribe(there)
         there.publishers = publishers
         peers = {proxied_peer(node) for node in publishers}
         for key, facts in [*self._heard.items()]:
@@ -320,25 +322,15 @@ class ResourceWatch:
         looked = self._clock() - path.looked < limits.LOOK_KEPT
         most = (_LOOKED_AT if looked else _SHOWN) if self._wanted else _ALWAYS
         wanted = {topic: type_ for topic, (type_, when) in _TOPICS.items() if when <= most}
-        for topic in path.handles.keys() - wanted.keys():
-            self._hub.topics.unsubscribe((OWN_CLIENT, path.handles.pop(topic)), f"{name}/{topic}")
-        for topic in wanted.keys() - path.handles.keys():
-            handle = path.handles[topic] = next(self._numbers)
-
-            def take(message: ReceivedMessage, topic: str = topic) -> None:
-                self._take(name, topic, message)
-
-            self._hub.topics.subscribe(
-                (OWN_CLIENT, handle), f"{name}/{topic}", wanted[topic], take, lambda _error: None
-            )
-
-    def _unsubscribe(self, name: str, path: _Path) -> None:
-        for topic, handle in path.handles.items():
-            self._hub.topics.unsubscribe((OWN_CLIENT, handle), f"{name}/{topic}")
-        path.handles.clear()
+        _unsubscribe(path, path.subscriptions.keys() - wanted.keys())
+        for topic in wanted.keys() - path.subscriptions.keys():
+            path.subscriptions[topic] = None
+            take = functools.partial(self._take, name, topic)
+            with contextlib.suppress(RmpaError):
+                path.subscriptions[topic] = self._hub.topics.subscribe(f"{name}/{topic}", wanted[topic], take)
 
     def _forget(self, name: str) -> None:
-        self._unsubscribe(name, self._paths.pop(name))
+        _unsubscribe(self._paths.pop(name))
         for key in [key for key, facts in self._heard.items() if facts.name == name]:
             del self._heard[key]
             self._since.pop(key, None)
@@ -355,6 +347,12 @@ class ResourceWatch:
                 self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
+
+
+def _unsubscribe(path: _Path, topics: Iterable[str] | None = None) -> None:
+    for topic in [*(path.subscriptions if topics is None else topics)]:
+        if (subscription := path.subscriptions.pop(topic)) is not None:
+            subscription.close()
 
 
 def _described(text: str) -> dict[str, Any]:

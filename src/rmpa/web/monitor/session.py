@@ -15,7 +15,6 @@ from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.web import limits
-from rmpa.web.hub import requests
 from rmpa.web.monitor.live import WatchState
 from rmpa.web.monitor.messages import (
     VERSION,
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.requests import ReceivedMessage
+    from rmpa.web.hub.topics import ReceivedMessage
     from rmpa.web.monitor.live import Decode
     from rmpa.web.monitor.messages import Tree, Value
 
@@ -65,6 +64,21 @@ class Speed:
 
 
 @dataclass(frozen=True, slots=True)
+class Subscribe:
+    """The messages of a topic are wanted for the watch ``id``."""
+
+    id: int
+    topic: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unsubscribe:
+    """The watch ``id`` has ended."""
+
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
 class FollowLog:
     """Whether the server is to pass lines of the log to ``MonitorSession.log``."""
 
@@ -83,7 +97,7 @@ class MonitorClose:
     refusal: str
 
 
-Output: TypeAlias = str | bytes | requests.HubRequest | Question | Speed | FollowLog | MonitorClose
+Output: TypeAlias = str | bytes | Subscribe | Unsubscribe | Question | Speed | FollowLog | MonitorClose
 
 
 class Joystick:
@@ -223,7 +237,7 @@ class MonitorSession:
             yield from self._watch(message)
         elif isinstance(message, Unwatch):
             if self._watches.pop(message.id, None):
-                yield requests.Unsubscribe(message.id)
+                yield Unsubscribe(message.id)
         elif isinstance(message, AskQuestion):
             yield from self._ask(message, now)
         elif isinstance(message, Log):
@@ -242,7 +256,7 @@ class MonitorSession:
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
         self._watches[message.id] = WatchState(message, self._decode)
-        yield requests.Subscribe(message.id, message.topic)
+        yield Subscribe(message.id, message.topic)
 
     def _ask(self, message: AskQuestion, now: float) -> Iterator[Output]:
         if message.what not in QUESTIONS:
@@ -287,7 +301,7 @@ class MonitorSession:
     def close(self) -> Iterator[Output]:
         """The connection has ended: the robot is stopped, and what was open is closed."""
         yield from self._stop()
-        yield from map(requests.Unsubscribe, self._watches)
+        yield from map(Unsubscribe, self._watches)
         self._watches.clear()
         self._questions.clear()
 
@@ -298,16 +312,16 @@ class MonitorSession:
         self._state, self._stale = state, True
         yield from self.handle_timer(now)
 
-    def receive_message(self, message: ReceivedMessage, now: float) -> Iterator[Output]:
+    def receive_message(self, handle: int, message: ReceivedMessage, now: float) -> Iterator[Output]:
         """A message for one of the watches."""
-        watch = self._watches.get(message.handle)
+        watch = self._watches.get(handle)
         if watch is None:
             return
         try:
             watch.receive(message)
         except RmpaError as error:
-            yield from self.end_watch(message.handle, str(error))
-            yield requests.Unsubscribe(message.handle)
+            yield from self.end_watch(handle, str(error))
+            yield Unsubscribe(handle)
         yield from self._flush(now)
 
     def end_watch(self, handle: int, error: str, remedy: str = "") -> Iterator[Output]:
@@ -390,7 +404,7 @@ class MonitorSession:
                 yield from watch.frames(now)
             except RmpaError as error:
                 yield from self.end_watch(handle, str(error))
-                yield requests.Unsubscribe(handle)
+                yield Unsubscribe(handle)
 
     def _failed(self, id_: int, error: str, remedy: str = "") -> str:
         return _text({"op": "failed", "id": id_, "error": error, "remedy": remedy})

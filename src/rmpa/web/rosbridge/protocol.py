@@ -1,6 +1,7 @@
-"""rosbridge's messages and their four encodings.
+"""rosbridge v2: a client's frames, and messages in JSON, JSON as a PNG, CBOR, and ROS 1 bytes in CBOR (cbor-raw).
 
-Messages for a client in the four encodings: JSON, JSON as a PNG, CBOR, and ROS 1 bytes in CBOR (cbor-raw).
+An op is a JSON object; of a binary frame, a CBOR map with the same keys. ``package/msg/Name``, as ROS 2 clients write
+it, is read as ``package/Name``.
 """
 
 from __future__ import annotations
@@ -23,18 +24,13 @@ import msgspec
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
 from rmpa.web import limits
+from rmpa.web.gateways.frame_writer import Opcode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.ros.types.codec import MessageCodec
-
-
-# The ops of rosbridge v2: reads a client's frames to ops, and writes the server's.
-#
-# An op is a JSON object; of a binary frame, a CBOR map with the same keys. Unknown keys are ignored, as
-# rosbridge_suite
-# does. ``package/msg/Name``, as ROS 2 clients write it, is read as ``package/Name``.
+    from rmpa.web.gateways.frame_writer import OutFrame
 
 
 Id: TypeAlias = str | int | None
@@ -53,157 +49,7 @@ class OpError(RemoteProtocolError):
         return f"{self.problem}; {self.remedy}" if self.remedy else self.problem
 
 
-@dataclass(frozen=True, slots=True)
-class RosbridgeFrame:
-    """One WebSocket message to the client.
-
-    Args:
-        parts: Its bytes, in pieces, so that a large payload is copied once only, by what sends it.
-        binary: CBOR; else JSON in UTF-8.
-        handle: The subscription that it belongs to; 0 for all else, which is not to be dropped.
-    """
-
-    parts: tuple[Part, ...]
-    binary: bool = False
-    handle: int = 0
-
-    @property
-    def size(self) -> int:
-        """Bytes of all parts."""
-        return sum(map(len, self.parts))
-
-    @property
-    def data(self) -> Part:
-        """All parts as one."""
-        return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
-
-
-# --- ops from the client -----------------------------------------------------------------------------------------
-
-
-class Op(msgspec.Struct, frozen=True, kw_only=True):
-    """What all ops may have."""
-
-    id: Id = None
-
-
-class RosbridgeAdvertise(Op, frozen=True, kw_only=True):
-    """The client will publish on a topic. `queue_size` has no effect: queues are bounded in bytes."""
-
-    topic: str
-    type: str
-    latch: bool | None = False
-    queue_size: int | None = None
-
-
-class RosbridgeUnadvertise(Op, frozen=True, kw_only=True):
-    """The client no longer publishes on a topic (with `id`: that of its advertisements)."""
-
-    topic: str
-
-
-class RosbridgePublish(Op, frozen=True, kw_only=True):
-    """A message for a topic."""
-
-    topic: str
-    msg: Any = None
-    latch: bool | None = False
-
-
-class RosbridgeSubscribe(Op, frozen=True, kw_only=True):
-    """The client wants a topic's messages. `throttle_rate` is in milliseconds, `fragment_size` in characters."""
-
-    topic: str
-    type: str | None = None
-    throttle_rate: float | None = 0
-    queue_length: float | None = 0
-    fragment_size: float | None = None
-    compression: str | None = "none"
-
-
-class RosbridgeUnsubscribe(Op, frozen=True, kw_only=True):
-    """The subscription with this `id` ends; without one, all of the topic."""
-
-    topic: str
-
-
-class RosbridgeCallService(Op, frozen=True, kw_only=True):
-    """A call. `args` are an object or the fields in order; `timeout` is in seconds."""
-
-    service: str
-    args: Any = None
-    type: str | None = None
-    fragment_size: float | None = None
-    compression: str | None = "none"
-    timeout: float | None = None
-
-
-class AdvertiseService(Op, frozen=True, kw_only=True):
-    """The client offers a service."""
-
-    service: str
-    type: str
-
-
-class UnadvertiseService(Op, frozen=True, kw_only=True):
-    """The client no longer offers a service."""
-
-    service: str
-
-
-class ServiceResponse(Op, frozen=True, kw_only=True):
-    """The client's answer to a call; where `result` is false, `values` may be the error's text."""
-
-    service: str
-    values: Any = None
-    result: bool = True
-
-
-class Fragment(Op, frozen=True, kw_only=True):
-    """A part of an op."""
-
-    id: str | int
-    data: str
-    num: int
-    total: int
-
-
-class Png(Op, frozen=True, kw_only=True):
-    """An op as the bytes of a picture, or a fragment of one."""
-
-    data: str
-    num: int | None = None
-    total: int | None = None
-
-
-class SetLevel(Op, frozen=True, kw_only=True):
-    """Which status messages the client wants."""
-
-    level: str
-
-
-class RosbridgeStatus(Op, frozen=True, kw_only=True):
-    """A status message of the client."""
-
-    level: str = "info"
-    msg: str = ""
-
-
-OPS: Final[Mapping[str, type[Op]]] = {
-    "advertise": RosbridgeAdvertise,
-    "unadvertise": RosbridgeUnadvertise,
-    "publish": RosbridgePublish,
-    "subscribe": RosbridgeSubscribe,
-    "unsubscribe": RosbridgeUnsubscribe,
-    "call_service": RosbridgeCallService,
-    "advertise_service": AdvertiseService,
-    "unadvertise_service": UnadvertiseService,
-    "service_response": ServiceResponse,
-    "fragment": Fragment,
-    "png": Png,
-    "set_level": SetLevel,
-    "status": RosbridgeStatus,
-}
+# --- frames from the client ------------------------------------------------------------------------------------
 
 
 def parse_frame(data: str | Part) -> dict[str, Any]:
@@ -222,8 +68,14 @@ def parse_frame(data: str | Part) -> dict[str, Any]:
     return values
 
 
-def parse_op(values: Mapping[str, Any]) -> tuple[str, Op]:
-    """The op of a frame.
+def read_op(values: Mapping[str, Any], ops: Mapping[str, type[msgspec.Struct]]) -> tuple[str, dict[str, Any]]:
+    """The op of a frame, and its fields.
+
+    Unknown keys are ignored, as rosbridge_suite does.
+
+    Args:
+        values: The frame.
+        ops: The structs of all ops, by name.
 
     Raises:
         OpError: The op is unknown, a key is missing, or a value has the wrong type.
@@ -232,19 +84,20 @@ def parse_op(values: Mapping[str, Any]) -> tuple[str, Op]:
     if not isinstance(name, str):
         if "receiver" in values:
             raise OpError("this is a message of rosbridge v1", "write it as rosbridge v2, with an 'op'")
-        raise OpError("the message has no 'op'", f"it is one of {', '.join(OPS)}")
-    kind = OPS.get(name)
+        raise OpError("the message has no 'op'", f"it is one of {', '.join(ops)}")
+    kind = ops.get(name)
     if kind is None:
-        raise OpError(f"unknown op {_short(name)}", f"it is one of {', '.join(OPS)}")
+        raise OpError(f"unknown op {_short(name)}", f"it is one of {', '.join(ops)}")
     try:
-        op = msgspec.convert(values, kind)
+        fields = msgspec.structs.asdict(msgspec.convert(values, kind))
     except (msgspec.ValidationError, RecursionError) as error:
         raise OpError(f"{name}: {str(error)[: limits.TEXT_MAX]}") from None
-    if isinstance(op.id, str) and len(op.id) > limits.ID_MAX:
-        raise LimitExceeded("id", len(op.id), limits.ID_MAX)
-    if isinstance(op.id, int) and abs(op.id) >= 1 << 63:
+    mid = fields["id_"]
+    if isinstance(mid, str) and len(mid) > limits.ID_MAX:
+        raise LimitExceeded("id", len(mid), limits.ID_MAX)
+    if isinstance(mid, int) and abs(mid) >= 1 << 63:
         raise OpError("an id that is a number has 64 bits")
-    return name, op
+    return name, fields
 
 
 def id_of(values: Mapping[str, Any]) -> Id:
@@ -298,6 +151,16 @@ def whole(value: float | None, what: str, least: int = 0) -> int:
     return int(min(value, 1 << 53))
 
 
+def check_count(count: int, limit: int, what: str) -> None:
+    """Refuse one more where `count` are there.
+
+    Raises:
+        OpError: The limit is reached.
+    """
+    if count >= limit:
+        raise OpError(f"this client has {count} {what} already", f"{limit} are allowed; end some first")
+
+
 def _short(text: str) -> str:
     return repr(text[:80].encode("utf-8", "backslashreplace").decode())
 
@@ -333,18 +196,7 @@ def _cbor(data: Part) -> object:
     return values
 
 
-# --- frames to the client ----------------------------------------------------------------------------------------
-
-
-def write_op(values: Mapping[str, Any]) -> RosbridgeFrame:
-    """A frame of JSON."""
-    return RosbridgeFrame((msgspec.json.encode(values),))
-
-
-def status(level: str, text: str, mid: Id) -> RosbridgeFrame:
-    """A status message."""
-    values = {"op": "status", "level": level, "msg": text[: limits.TEXT_MAX]}
-    return write_op(values if mid is None else values | {"id": mid})
+# --- frames to the client --------------------------------------------------------------------------------------
 
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
@@ -383,12 +235,10 @@ class PublishFrames:
     """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, RosbridgeFrame]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, OutFrame]] = OrderedDict()
         self._bytes = 0
 
-    def encode(
-        self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec
-    ) -> RosbridgeFrame:
+    def encode(self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
         """A ``publish`` in JSON, PNG or CBOR.
 
         Raises:
@@ -401,35 +251,48 @@ class PublishFrames:
             self._kept.move_to_end(key)
             return kept[1]
         frame = _encode(topic, payload, compression, codec)
-        size = frame.size + len(payload)
+        size = size_of(frame) + len(payload)
         if size <= limits.SHARED_BYTES:
             self._kept[key] = (payload, frame)
             self._bytes += size
             while self._bytes > limits.SHARED_BYTES or len(self._kept) > limits.SHARED_FRAMES:
                 _, (old, gone) = self._kept.popitem(last=False)
-                self._bytes -= gone.size + len(old)
+                self._bytes -= size_of(gone) + len(old)
         return frame
 
 
-def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> RosbridgeFrame:
+def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
     if compression is Compression.CBOR:
-        return encode_cbor({"op": "publish", "topic": topic, "msg": codec.cbor_values(payload)})
+        return encode({"op": "publish", "topic": topic, "msg": codec.cbor_values(payload)}, compression)
     head = b'{"op":"publish","topic":' + msgspec.json.encode(topic) + b',"msg":'
-    frame = RosbridgeFrame((head, codec.json(payload), b"}"))
-    return encode_png(frame.data) if compression is Compression.PNG else frame
+    frame = Opcode.TEXT, (head, codec.json(payload), b"}")
+    return encode_png(data_of(frame)) if compression is Compression.PNG else frame
 
 
-def encode_cbor(values: Mapping[str, Any]) -> RosbridgeFrame:
-    """An op in CBOR."""
-    return RosbridgeFrame((cbor2.dumps(values),), binary=True)
+def encode(values: Mapping[str, Any], compression: Compression = Compression.NONE) -> OutFrame:
+    """An op."""
+    if compression >= Compression.CBOR:
+        return Opcode.BINARY, (cbor2.dumps(values),)
+    text = msgspec.json.encode(values)
+    return encode_png(text) if compression is Compression.PNG else (Opcode.TEXT, (text,))
 
 
-def encode_cbor_raw(topic: str, payload: memoryview, stamp_ns: int) -> RosbridgeFrame:
+def size_of(frame: OutFrame) -> int:
+    """Bytes of a frame."""
+    return sum(map(len, frame[1]))
+
+
+def data_of(frame: OutFrame) -> Part:
+    """The parts of a frame as one."""
+    return frame[1][0] if len(frame[1]) == 1 else b"".join(frame[1])
+
+
+def encode_cbor_raw(topic: str, payload: memoryview, stamp_ns: int) -> OutFrame:
     """A ``publish`` of ROS 1 bytes, which are not copied: ``msg`` is ``{secs, nsecs, bytes}``."""
     secs, nsecs = divmod(max(0, stamp_ns), 1_000_000_000)
     stamp = b"".join((b"\x64secs", _cbor_length(0, secs), b"\x65nsecs", _cbor_length(0, nsecs)))
     head = b"".join((_cbor_raw_head(topic), stamp, b"\x65bytes", _cbor_length(0x40, len(payload))))
-    return RosbridgeFrame((head, payload), binary=True)
+    return Opcode.BINARY, (head, payload)
 
 
 @lru_cache(limits.SUBSCRIPTIONS_MAX)
@@ -448,10 +311,10 @@ def _cbor_length(major: int, length: int) -> bytes:
     return struct.pack(">BQ", major | 27, length)
 
 
-# --- PNG ---------------------------------------------------------------------------------------------------------
+# --- PNG -------------------------------------------------------------------------------------------------------
 
 
-def encode_png(text: bytes | bytearray | memoryview) -> RosbridgeFrame:
+def encode_png(text: Part) -> OutFrame:
     """An op ``png``: the bytes of another op as the RGB pixels of a picture that is nearly square.
 
     Newlines, which JSON allows at its end, fill the last line.
@@ -463,7 +326,7 @@ def encode_png(text: bytes | bytearray | memoryview) -> RosbridgeFrame:
     pixels = b"".join(b"\x00" + padded[at : at + row] for at in range(0, len(padded), row))
     picture = _SIGNATURE + _chunk(b"IHDR", _IHDR.pack(width, height, 8, 2, 0, 0, 0))
     picture += _chunk(b"IDAT", zlib.compress(pixels, _PNG_LEVEL)) + _chunk(b"IEND", b"")
-    return write_op({"op": "png", "data": base64.b64encode(picture).decode()})
+    return encode({"op": "png", "data": base64.b64encode(picture).decode()})
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

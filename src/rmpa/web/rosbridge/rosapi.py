@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
@@ -21,12 +20,13 @@ from rmpa.web import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     from rmpa.ros.types.definitions import Field, Specification
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.hub.graph import TypeLibrary
-    from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.requests import GraphService, GraphTopic, ParamValue
+    from rmpa.web.hub.graph import GraphService, GraphTopic, GraphWatch
+    from rmpa.web.hub.hub import HubClient
+    from rmpa.web.hub.node_link import ParamValue
 
 
 # rosapi's TypeDef: a message type as lists of names, types and examples, for clients that make forms of them.
@@ -96,6 +96,7 @@ def _time(name: str) -> dict[str, Any]:
 
 
 Values: TypeAlias = dict[str, Any]
+Answer: TypeAlias = "Values | Coroutine[Any, Any, Values | None]"
 NAMESPACE: Final = "/rosapi/"
 _NANO: Final = 1_000_000_000
 _ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
@@ -104,92 +105,24 @@ _SERVER_TOPICS: Final = ("feedback", "result", "status")
 _STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
 
 
-@dataclass(frozen=True, slots=True)
-class HubGraph:
-    """The graph as one client may see it: without parameters where it may not read them."""
-
-    hub: Hub
-    rights: Rights
-
-    @property
-    def topics(self) -> Mapping[str, GraphTopic]:
-        """By name, in order of names."""
-        return self.hub.graph.topics
-
-    @property
-    def published(self) -> Mapping[str, str]:
-        """The types of the topics that clients publish, by name: the master may not have them yet."""
-        return self.hub.publishers.topics
-
-    @property
-    def services(self) -> Mapping[str, GraphService]:
-        """By name, in order of names."""
-        return self.hub.graph.services
-
-    @property
-    def nodes(self) -> Sequence[str]:
-        """In order of names."""
-        return self.hub.graph.nodes
-
-    @property
-    def params(self) -> Mapping[str, ParamValue]:
-        """The tree of parameters."""
-        return self.hub.link.rules.visible_tree(self.hub.params.tree) if self.rights.view else {}
-
-
-@dataclass(frozen=True, slots=True)
-class SetParameter:
-    """The answer waits until the hub has set a parameter."""
-
-    name: str
-    value: ParamValue
-
-
-@dataclass(frozen=True, slots=True)
-class DeleteParameter:
-    """The answer waits until the hub has deleted a parameter."""
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class FindType:
-    """The answer is the type of this service, which the graph does not know and the hub is to find."""
-
-    service: str
-
-
-@dataclass(frozen=True, slots=True)
-class FindTypes:
-    """The answer needs the types of all services, some of which the graph does not know."""
-
-    answer: Callable[[], Values]
-
-
-Todo: TypeAlias = SetParameter | DeleteParameter | FindType | FindTypes
-
-
 class Rosapi:
     """Answers the services of rosapi.
 
     Args:
-        graph: The snapshot; always the present one.
-        types: Finds definitions.
-        ros_time_ns: The present ROS time in nanoseconds: UTC, or that of ``/clock``.
+        client: Asks.
     """
 
-    def __init__(self, graph: HubGraph, types: TypeLibrary, ros_time_ns: Callable[[], int]) -> None:
-        self._graph = graph
-        self._types = types
-        self._ros_time_ns = ros_time_ns
-        self._services: Mapping[str, tuple[str, Callable[[Any], Values | Todo]]] = {
+    def __init__(self, client: HubClient) -> None:
+        self._client = client
+        self._types = client.hub.types
+        self._services: Mapping[str, tuple[str, Callable[[Any], Answer]]] = {
             "topics": ("Topics", self._topics),
             "topics_for_type": ("TopicsForType", self._topics_for_type),
             "topics_and_raw_types": ("TopicsAndRawTypes", self._topics_and_raw_types),
             "topic_type": ("TopicType", self._topic_type),
             "publishers": ("Publishers", self._publishers),
             "subscribers": ("Subscribers", self._subscribers),
-            "services": ("Services", lambda _: {"services": list(graph.services)}),
+            "services": ("Services", lambda _: {"services": list(self._graph.services)}),
             "services_for_type": ("ServicesForType", self._services_for_type),
             "service_type": ("ServiceType", self._service_type),
             "service_node": ("ServiceNode", self._service_node),
@@ -198,7 +131,7 @@ class Rosapi:
             "service_request_details": ("ServiceRequestDetails", self._service_request_details),
             "service_response_details": ("ServiceResponseDetails", self._service_response_details),
             "message_details": ("MessageDetails", self._message_details),
-            "nodes": ("Nodes", lambda _: {"nodes": list(graph.nodes)}),
+            "nodes": ("Nodes", lambda _: {"nodes": list(self._graph.nodes)}),
             "node_details": ("NodeDetails", self._node_details),
             "action_servers": ("GetActionServers", self._action_servers),
             "get_param": ("GetParam", self._get_param),
@@ -219,7 +152,7 @@ class Rosapi:
         """Whether a global name is that of a service of rosapi."""
         return service.startswith(NAMESPACE) and service.removeprefix(NAMESPACE) in self._services
 
-    def call(self, service: str, arguments: Any) -> Values | Todo:
+    def call(self, service: str, arguments: Any) -> Answer:
         """Answer a call.
 
         Args:
@@ -227,7 +160,7 @@ class Rosapi:
             arguments: An object of the request's fields, a list of them, or None.
 
         Returns:
-            The response's fields; or what the hub has to do first: `finish` then makes the response.
+            The response's fields; or what takes time and returns them, or None where there are none.
 
         Raises:
             RmpaError: The arguments do not fit, or ask for something that is not there.
@@ -238,12 +171,9 @@ class Rosapi:
         request = codec.json_values(memoryview(codec.write_arguments(arguments, 0).payload))
         return answer(request)
 
-    @staticmethod
-    def finish(todo: Todo, found: str = "") -> Values:
-        """The response after the hub has done what was to do; `found` is the type of a service."""
-        if isinstance(todo, FindTypes):
-            return todo.answer()
-        return {"type": found} if isinstance(todo, FindType) else {}
+    @property
+    def _graph(self) -> GraphWatch:
+        return self._client.hub.graph
 
     # --- topics ---------------------------------------------------------------------------------------------------
 
@@ -303,7 +233,7 @@ class Rosapi:
 
     # --- services -------------------------------------------------------------------------------------------------
 
-    def _services_for_type(self, request: Any) -> Values | Todo:
+    def _services_for_type(self, request: Any) -> Answer:
         kind = type_name(request["type"])
 
         def answer() -> Values:
@@ -311,21 +241,29 @@ class Rosapi:
 
         return self._with_types(answer)
 
-    def _with_types(self, answer: Callable[[], Values]) -> Values | Todo:
-        unknown = any(not each.type for each in self._graph.services.values())
-        return FindTypes(answer) if unknown else answer()
+    def _with_types(self, answer: Callable[[], Values]) -> Answer:
+        async def find() -> Values:
+            await self._graph.find_all()
+            return answer()
+
+        return answer() if all(each.type for each in self._graph.services.values()) else find()
 
     def _service(self, request: Any) -> GraphService | None:
         return self._graph.services.get(graph_name(request["service"]))
 
-    def _service_type(self, request: Any) -> Values | Todo:
+    def _service_type(self, request: Any) -> Answer:
         name = graph_name(request["service"])
         if self.offers(name):
             return {"type": self.services[name]}
         service = self._graph.services.get(name)
-        if service is not None and not service.type:
-            return FindType(name)
-        return {"type": service.type if service else ""}
+
+        async def find() -> Values:
+            try:
+                return {"type": await self._graph.find(name)}
+            except RmpaError:
+                return {"type": ""}
+
+        return find() if service is not None and not service.type else {"type": service.type if service else ""}
 
     def _service_node(self, request: Any) -> Values:
         service = self._service(request)
@@ -338,7 +276,7 @@ class Rosapi:
         except ValueError:
             return {"host": ""}
 
-    def _service_providers(self, request: Any) -> Values | Todo:
+    def _service_providers(self, request: Any) -> Answer:
         # rosapi's own answer compares types, though its field is named service: both are understood.
         asked = request["service"]
 
@@ -373,14 +311,14 @@ class Rosapi:
         }
 
     def _get_time(self, _: Any) -> Values:
-        secs, nsecs = divmod(max(0, self._ros_time_ns()), _NANO)
+        secs, nsecs = divmod(max(0, self._client.hub.time.now_ns()), _NANO)
         return {"time": {"secs": secs, "nsecs": nsecs}}
 
     # --- parameters -----------------------------------------------------------------------------------------------
 
     def _parameter(self, name: str) -> tuple[bool, ParamValue]:
         """Whether a global name is there, and its value."""
-        value: ParamValue = dict(self._graph.params)
+        value: ParamValue = dict(self._client.param_tree)
         for part in filter(None, name.split("/")):
             if not isinstance(value, Mapping) or part not in value:
                 return False, None
@@ -397,7 +335,7 @@ class Rosapi:
                 value = default
         return {"value": json.dumps(value, default=_binary)}
 
-    def _set_param(self, request: Any) -> Values | Todo:
+    def _set_param(self, request: Any) -> Answer:
         try:
             value = json.loads(request["value"])
         except RecursionError:
@@ -406,7 +344,7 @@ class Rosapi:
             problem = f"the value of set_param is JSON, in a string: {error}"
             raise OpError(problem, 'a text is written with its quotes, "\\"text\\""') from None
         _check_depth(value)
-        return SetParameter(graph_name(request["name"]), value)
+        return self._client.set_param(graph_name(request["name"]), value)
 
     def _has_param(self, request: Any) -> Values:
         return {"exists": self._parameter(graph_name(request["name"]))[0]}
@@ -423,13 +361,13 @@ class Rosapi:
                 return {"global_name": graph_name(f"{namespace}{name}")}
         return {"global_name": ""}
 
-    def _delete_param(self, request: Any) -> Values | Todo:
+    def _delete_param(self, request: Any) -> Answer:
         name = graph_name(request["name"])
-        return DeleteParameter(name) if self._parameter(name)[0] else {}
+        return self._client.delete_param(name) if self._parameter(name)[0] else {}
 
     def _get_param_names(self, _: Any) -> Values:
         names: list[str] = []
-        todo: list[tuple[str, ParamValue]] = [("", dict(self._graph.params))]
+        todo: list[tuple[str, ParamValue]] = [("", dict(self._client.param_tree))]
         while todo:
             name, value = todo.pop()
             if isinstance(value, Mapping) and (value or not name):

@@ -9,20 +9,43 @@ import { Mandala } from "./mandala.js";
 import { Search, Shortcuts } from "./search.js";
 import { applyTheme, nextTheme, theme } from "./theme.js";
 
-const PAGES = [["", "Mesh", "m"], ["topics", "Topics", "t"], ["services", "Services", "s"], ["nodes", "Nodes", "n"], ["params", "Parameters", "p"], ["resources", "Resources", "r"], ["alarms", "Alarms", "a"], ["log", "Log", "l"], ["drive", "Drive", "d"]];
+const ICON = html`<img src="static/icon.svg" alt="" width="28" height="28" />`;
+const PAGES = [
+  ["", "Mesh", "m"],
+  ["topics", "Topics", "t"],
+  ["services", "Services", "s"],
+  ["nodes", "Nodes", "n"],
+  ["params", "Parameters", "p"],
+  ["resources", "Resources", "r"],
+  ["alarms", "Alarms", "a"],
+  ["log", "Log", "l"],
+  ["drive", "Drive", "d"],
+];
 const DETAILED = ["module", "topic", "service", "node", "resource"];
 // All pages but the first one are loaded when they are first opened.
 const LAZY = {
-  module: ["module.js", "ModulePage"], topics: ["topics.js", "Topics"], topic: ["topics.js", "TopicPage"],
-  services: ["services.js", "Services"], service: ["services.js", "ServicePage"], params: ["params.js", "Params"],
-  nodes: ["nodes.js", "Nodes"], node: ["nodes.js", "NodePage"],
-  resources: ["resources.js", "Resources"], resource: ["resources.js", "ResourcePage"], alarms: ["alarms.js", "Alarms"],
-  log: ["log.js", "Log"], drive: ["drive.js", "DrivePage"],
+  module: ["module.js", "ModulePage"],
+  topics: ["topics.js", "Topics"],
+  topic: ["topics.js", "TopicPage"],
+  services: ["services.js", "Services"],
+  service: ["services.js", "ServicePage"],
+  params: ["params.js", "Params"],
+  nodes: ["nodes.js", "Nodes"],
+  node: ["nodes.js", "NodePage"],
+  resources: ["resources.js", "Resources"],
+  resource: ["resources.js", "ResourcePage"],
+  alarms: ["alarms.js", "Alarms"],
+  log: ["log.js", "Log"],
+  drive: ["drive.js", "DrivePage"],
 };
 
 function address() {
   const [page = "", name] = location.hash.replace(/^#\/?/, "").split("/");
-  try { return { page, name: name === undefined ? undefined : decodeURIComponent(name) }; } catch { return { page, name }; }
+  try {
+    return { page, name: name === undefined ? undefined : decodeURIComponent(name) };
+  } catch {
+    return { page, name };
+  }
 }
 
 class App extends Component {
@@ -59,9 +82,12 @@ class App extends Component {
     this.waits = true;
     const now = () => {
       this.waits = false;
-      this.setState({}, () => { for (const each of this.drawn.splice(0)) each(); });
+      this.setState({}, () => {
+        for (const each of this.drawn.splice(0)) each();
+      });
     };
-    if (document.hidden) setTimeout(now, 200); else requestAnimationFrame(now);
+    if (document.hidden) setTimeout(now, 200);
+    else requestAnimationFrame(now);
   }
 
   look() {
@@ -75,10 +101,16 @@ class App extends Component {
     if (field || event.ctrlKey || event.metaKey || event.altKey || this.state.overlay) {
       if (!(event.key === "k" && (event.ctrlKey || event.metaKey))) return;
     }
-    if (event.key === "/" || event.key === "k") { event.preventDefault(); return this.setState({ overlay: "search" }); }
+    if (event.key === "/" || event.key === "k") {
+      event.preventDefault();
+      return this.setState({ overlay: "search" });
+    }
     if (event.key === "?") return this.setState({ overlay: "keys" });
     if (event.key === "c") return this.turn();
-    if (event.key === "w") { [...document.querySelectorAll(".question button")].find((each) => each.textContent === "Why?")?.click(); return; }
+    if (event.key === "w") {
+      [...document.querySelectorAll(".question button")].find((each) => each.textContent === "Why?")?.click();
+      return;
+    }
     if (this.prefix) {
       this.prefix = false;
       const found = PAGES.find(([, , key]) => key === event.key);
@@ -89,7 +121,10 @@ class App extends Component {
     }
   }
 
-  turn() { nextTheme(); this.setState({}); }
+  turn() {
+    nextTheme();
+    this.setState({});
+  }
 
   page() {
     const { page, name } = this.state;
@@ -99,11 +134,23 @@ class App extends Component {
     if (!lazy) return html`<p class="empty">There is no page <code>${page}</code>. <a href="#/">The mesh</a></p>`;
     const loaded = this.loaded?.[lazy[0]];
     if (!loaded) {
-      import(`./pages/${lazy[0]}`).then((module) => { this.loaded = { ...this.loaded, [lazy[0]]: module }; this.setState({}); },
-        () => this.setState({ broken: true }));
-      return html`<p class="empty">${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}</p>`;
+      import(`./pages/${lazy[0]}`).then(
+        (module) => {
+          this.loaded = { ...this.loaded, [lazy[0]]: module };
+          this.setState({});
+        },
+        () => this.setState({ broken: true }),
+      );
+      return html`<p class="empty">
+        ${this.state.broken ? "This page cannot be loaded: rmpa web does not answer." : "Loading …"}
+      </p>`;
     }
-    return html`<${loaded[lazy[1]]} key=${`${page} ${name}`} name=${name} state=${connection.state} connection=${connection} />`;
+    return html`<${loaded[lazy[1]]}
+      key=${`${page} ${name}`}
+      name=${name}
+      state=${connection.state}
+      connection=${connection}
+    />`;
   }
 
   banner() {
@@ -114,14 +161,26 @@ class App extends Component {
       const known = connection.state ? "What is shown, and what you have typed, stays; nothing can be sent." : "";
       return html`<${Banner} mark="refused" action="Try now" act=${() => connection.retry()}>
         <strong>No connection to <code>rmpa web</code></strong> for <${Since} moment=${connection.lostAt / 1000} />.
-        ${" "}${sentence(connection.reason)} ${known} The page connects again by itself.<//>`;
+        ${" "}${sentence(connection.reason)} ${known} The page connects again by itself.<//
+      >`;
     }
     if (reach.ok === false)
-      return html`<${Banner} mark="refused"><strong>The agent has not answered</strong> for <${Since} moment=${reach.since} />.
-        ${" "}${sentence(reach.error)} ${sentence(reach.remedy)} What is shown is what was last known. This page comes back by itself.<//>`;
+      return html`<${Banner} mark="refused"
+        ><strong>The agent has not answered</strong> for <${Since} moment=${reach.since} />.
+        ${" "}${sentence(reach.error)} ${sentence(reach.remedy)} What is shown is what was last known. This page comes
+        back by itself.<//
+      >`;
     if (notice)
-      return html`<${Banner} mark="WARN" action="Close" act=${() => { connection.notice = null; this.setState({}); }}>
-        ${sentence(notice.error)} ${sentence(notice.remedy)}<//>`;
+      return html`<${Banner}
+        mark="WARN"
+        action="Close"
+        act=${() => {
+          connection.notice = null;
+          this.setState({});
+        }}
+      >
+        ${sentence(notice.error)} ${sentence(notice.remedy)}<//
+      >`;
     return null;
   }
 
@@ -132,28 +191,91 @@ class App extends Component {
     const agent = section(state, "agent").name || connection.hello.agent;
     const alarms = Object.keys(section(state, "alarms")).length;
     const gone = connection.phase === "lost" || section(state, "reach").ok === false;
-    const current = { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" }[page] ?? page;
+    const current =
+      { topic: "topics", service: "services", node: "nodes", resource: "resources", module: "" }[page] ?? page;
     const dark = theme() === "dark";
-    return html`
-      <a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); document.querySelector("h1")?.focus(); }}>To the content</a>
+    return html`<a
+        class="skip"
+        href="#main"
+        onClick=${(event) => {
+          event.preventDefault();
+          document.querySelector("h1")?.focus();
+        }}
+        >To the content</a
+      >
       <header class="top">
-        <a class="brand" href="#/"><img src="static/icon.svg" alt="" width="28" height="28" /><span>RMPA<small>${agent || "…"}</small></span></a>
-        <nav aria-label="Pages">${PAGES.filter(([each]) => each !== "drive" || connection.hello.may.includes("drive") || page === "drive").map(([each, title]) => html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}>${title}${each === "alarms" && alarms > 0 ? html`<b class="badge">${alarms}<span class="unseen"> ${alarms > 1 ? "alarms stand" : "alarm stands"}</span></b>` : ""}</a>`)}</nav>
+        <a class="brand" href="#/"
+          >${ICON}<span>RMPA<small>${agent || "…"}</small></span></a
+        >
+        <nav aria-label="Pages">
+          ${PAGES.filter(
+            ([each]) => each !== "drive" || connection.hello.may.includes("drive") || page === "drive",
+          ).map(
+            ([each, title]) =>
+              html`<a key=${each} href=${`#/${each}`} aria-current=${each === current ? "page" : undefined}
+                >${title}${each === "alarms" && alarms > 0
+                  ? html`<b class="badge"
+                      >${alarms}<span class="unseen"> ${alarms > 1 ? "alarms stand" : "alarm stands"}</span></b
+                    >`
+                  : ""}</a
+              >`,
+          )}
+        </nav>
         <div class="tools">
-          <button type="button" class="icon" aria-label="Search (/)" title="Search (/)" onClick=${() => this.setState({ overlay: "search" })}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="8.5" cy="8.5" r="5.5" /><path d="m12.5 12.5 5 5" /></svg></button>
-          <button type="button" class="icon" aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"} title="Colours (c)" onClick=${() => this.turn()}><svg viewBox="0 0 20 20" aria-hidden="true"><circle cx="10" cy="10" r="7" /><path class="fill" d="M10 3a7 7 0 0 1 0 14Z" /></svg></button>
-          <button type="button" class="icon help" aria-label="Keys (?)" title="Keys (?)" onClick=${() => this.setState({ overlay: "keys" })}><svg viewBox="0 0 20 20" aria-hidden="true"><path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" /></svg></button>
+          <button
+            type="button"
+            class="icon"
+            aria-label="Search (/)"
+            title="Search (/)"
+            onClick=${() => this.setState({ overlay: "search" })}
+          >
+            <svg viewBox="0 0 20 20" aria-hidden="true">
+              <circle cx="8.5" cy="8.5" r="5.5" />
+              <path d="m12.5 12.5 5 5" />
+            </svg>
+          </button>
+          <button
+            type="button"
+            class="icon"
+            aria-label=${dark ? "Light colours (c)" : "Dark colours (c)"}
+            title="Colours (c)"
+            onClick=${() => this.turn()}
+          >
+            <svg viewBox="0 0 20 20" aria-hidden="true">
+              <circle cx="10" cy="10" r="7" />
+              <path class="fill" d="M10 3a7 7 0 0 1 0 14Z" />
+            </svg>
+          </button>
+          <button
+            type="button"
+            class="icon help"
+            aria-label="Keys (?)"
+            title="Keys (?)"
+            onClick=${() => this.setState({ overlay: "keys" })}
+          >
+            <svg viewBox="0 0 20 20" aria-hidden="true">
+              <path d="M7 7.5a3 3 0 1 1 4.5 2.6c-1 .6-1.5 1.1-1.5 2.4M10 15.5v.5" />
+            </svg>
+          </button>
         </div>
       </header>
       ${this.banner()}
-      <main id="main" class=${gone ? "gone" : ""}>${state ? this.page() : html`<p class="loading">${connection.phase === "lost" ? "Nothing is known yet." : "Connecting …"}</p>`}</main>
-      ${overlay === "search" && html`<${Search} state=${state} connection=${connection} onClose=${() => this.setState({ overlay: "" })} />`}
+      <main id="main" class=${gone ? "gone" : ""}>
+        ${state
+          ? this.page()
+          : html`<p class="loading">${connection.phase === "lost" ? "Nothing is known yet." : "Connecting …"}</p>`}
+      </main>
+      ${overlay === "search" &&
+      html`<${Search} state=${state} connection=${connection} onClose=${() => this.setState({ overlay: "" })} />`}
       ${overlay === "keys" && html`<${Shortcuts} pages=${PAGES} onClose=${() => this.setState({ overlay: "" })} />`}`;
   }
 }
 
-const Banner = ({ mark, action, act, children }) => html`<div class="banner ${mark === "WARN" ? "warn" : "bad"}" role="status">
-  <${Mark} state=${mark} word="" /><span>${children}</span>${act && html`<button type="button" onClick=${act}>${action}</button>`}</div>`;
+const Banner = ({ mark, action, act, children }) =>
+  html`<div class="banner ${mark === "WARN" ? "warn" : "bad"}" role="status">
+    <${Mark} state=${mark} word="" /><span>${children}</span>${act &&
+    html`<button type="button" onClick=${act}>${action}</button>`}
+  </div>`;
 
 applyTheme();
 const root = document.getElementById("app");

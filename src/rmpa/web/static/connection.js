@@ -6,7 +6,7 @@ const FIRST_WAIT = 300; // milliseconds until the next attempt, doubled up to LA
 const LAST_WAIT = 5000;
 const ANSWER_WAIT = 30000;
 const TICKS = 10; // of which the fastest counts: over 20 s two clocks do not drift apart
-const SILENT = 7000; // milliseconds without a word after which the connection is lost; the server says something every 2 s
+const SILENT = 7000; // milliseconds without a word after which the connection is lost; a tick comes every 2 s
 
 export class Connection {
   constructor(changed) {
@@ -32,7 +32,9 @@ export class Connection {
   }
 
   // What this page may do; a lost connection takes nothing from it but the joystick.
-  may(right) { return this.hello.may.includes(right) && (right !== "drive" || this.phase === "open"); }
+  may(right) {
+    return this.hello.may.includes(right) && (right !== "drive" || this.phase === "open");
+  }
 
   retry() {
     if (this.phase !== "lost") return;
@@ -70,7 +72,10 @@ export class Connection {
     this.reason = event.reason;
     if (!opened) this.explain();
     const failure = { error: "the connection was lost before the answer came", remedy: "Look whether it was done." };
-    for (const question of this.questions.values()) { clearTimeout(question.timer); question.reject(failure); }
+    for (const question of this.questions.values()) {
+      clearTimeout(question.timer);
+      question.reject(failure);
+    }
     this.questions.clear();
     this.timer = setTimeout(() => this.open(), this.wait * (0.75 + Math.random() / 2));
     this.wait = Math.min(LAST_WAIT, this.wait * 2);
@@ -87,8 +92,17 @@ export class Connection {
 
   // A browser does not tell why a WebSocket was refused, as for a wrong token: the same question over HTTP does.
   explain() {
-    fetch(new URL("api/v1/agent", document.baseURI)).then((response) => (response.ok || response.status === 503 ? null : response.json()))
-      .then((problem) => { if (problem && this.phase === "lost") { this.reason = problem.detail; this.changed(); } }, () => {});
+    fetch(new URL("api/v1/agent", document.baseURI))
+      .then((response) => (response.ok || response.status === 503 ? null : response.json()))
+      .then(
+        (problem) => {
+          if (problem && this.phase === "lost") {
+            this.reason = problem.detail;
+            this.changed();
+          }
+        },
+        () => {},
+      );
   }
 
   send(message) {
@@ -138,12 +152,14 @@ export class Connection {
     this.ticks = [...this.ticks.slice(-TICKS + 1), performance.now() / 1000 - at];
   }
 
-  // The server's clock, behind by what the fastest of the last ticks took: a command that says it is at most as old as it seems.
+  // The server's clock, behind by what the fastest of the last ticks took: a command that says it is at most as old as
+  // it seems.
   serverTime() {
     return this.ticks.length ? performance.now() / 1000 - Math.min(...this.ticks) : 0;
   }
 
-  // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one further patch.
+  // The acknowledgement is sent when the browser has drawn: the server waits for it before it sends more than one
+  // further patch.
   shown(n) {
     this.changed(() => this.send({ op: "ack", n }));
   }
@@ -152,9 +168,15 @@ export class Connection {
     const view = new DataView(buffer);
     if (buffer.byteLength < 20 || view.getUint8(0) !== 1) return;
     const format = ["", "jpeg", "png", "rgb8", "mono8"][view.getUint8(1)];
-    const width = view.getUint16(2, true), height = view.getUint16(4, true);
+    const width = view.getUint16(2, true),
+      height = view.getUint16(4, true);
     this.watches.get(view.getUint32(8, true))?.sink({
-      op: "image", format, width, height, stamp: Number(view.getBigUint64(12, true)) / 1e9, bytes: new Uint8Array(buffer, 20),
+      op: "image",
+      format,
+      width,
+      height,
+      stamp: Number(view.getBigUint64(12, true)) / 1e9,
+      bytes: new Uint8Array(buffer, 20),
     });
   }
 
@@ -162,7 +184,10 @@ export class Connection {
     const question = this.settle(message.id);
     if (question) question.reject(message);
     else if (this.watches.has(message.id)) this.watches.get(message.id).sink(message);
-    else { this.notice = message; this.changed(); }
+    else {
+      this.notice = message;
+      this.changed();
+    }
   }
 
   settle(id) {
@@ -183,14 +208,21 @@ export class Connection {
     const id = ++this.counter;
     this.watches.set(id, { wanted, sink });
     this.send({ op: "watch", id, ...wanted });
-    return () => { this.watches.delete(id); this.send({ op: "unwatch", id }); };
+    return () => {
+      this.watches.delete(id);
+      this.send({ op: "unwatch", id });
+    };
   }
 
   ask(what, args = {}) {
     const id = ++this.counter;
     return new Promise((resolve, reject) => {
-      if (this.phase !== "open") return reject({ error: "there is no connection to rmpa web", remedy: "Nothing was sent." });
-      const timer = setTimeout(() => this.settle(id)?.reject({ error: "no answer came within 30 s", remedy: "" }), ANSWER_WAIT);
+      if (this.phase !== "open")
+        return reject({ error: "there is no connection to rmpa web", remedy: "Nothing was sent." });
+      const timer = setTimeout(
+        () => this.settle(id)?.reject({ error: "no answer came within 30 s", remedy: "" }),
+        ANSWER_WAIT,
+      );
       this.questions.set(id, { resolve, reject, timer });
       this.send({ op: "ask", id, what, args, at: this.serverTime() });
     });
@@ -199,6 +231,9 @@ export class Connection {
   followLog(sink) {
     this.logSinks.add(sink);
     if (this.logSinks.size === 1) this.send({ op: "log", on: true });
-    return () => { this.logSinks.delete(sink); if (!this.logSinks.size) this.send({ op: "log", on: false }); };
+    return () => {
+      this.logSinks.delete(sink);
+      if (!this.logSinks.size) this.send({ op: "log", on: false });
+    };
   }
 }

@@ -1,52 +1,20 @@
-// The first page: all modules on a ring, their links, and what flows. A module keeps its place for as long as it is known.
+// The first page: all modules on a ring, their links, and what flows.
 
 import { html, useEffect, useRef, useState } from "./markup.js";
 import { bandwidth, hertz, seconds } from "./format.js";
 import { entries, section } from "./state.js";
+import { CENTRE, SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./ring.js";
 import { Link, Mark, Page, Panel, Since, Table, href, known, memo, shape } from "./parts.js";
 
-const SIZE = 1000;
-const CENTRE = SIZE / 2;
-const SPEEDS = [[0, "still"], [0.5, "slow"], [5, "medium"], [30, "fast"]];
+const SPEEDS = [
+  [0, "still"],
+  [0.5, "slow"],
+  [5, "medium"],
+  [30, "fast"],
+];
 const PERIODS = { slow: 2.4, medium: 1.4, fast: 0.8 }; // seconds in which a dot comes to the place of the next one
 const DOTS = 20.1; // from one dot to the next
 const STEP = 125; // milliseconds between two positions of the dots: without a GPU each costs a drawing
-
-function geometry(slots, compact) {
-  const node = compact ? (slots <= 8 ? 104 : 62) : slots <= 8 ? 78 : slots <= 16 ? 62 : slots <= 32 ? 40 : 22;
-  const small = node < 45; // then names stand outside of the ring
-  return { node, ring: CENTRE - node - (small ? 130 : 26), slots, small };
-}
-
-// Where a name stands outside of a small node, and how it is aligned.
-function outside(at, { node, ring }) {
-  const x = (at.x - CENTRE) / ring, y = (at.y - CENTRE) / ring;
-  return { x: at.x + x * (node + 18), y: at.y + y * (node + 22) + 7, anchor: x > 0.25 ? "start" : x < -0.25 ? "end" : "middle" };
-}
-
-const angle = (slot, slots) => (slot / slots) * 2 * Math.PI - Math.PI / 2;
-
-export function place(slot, { ring, slots }) {
-  const at = angle(slot, slots);
-  return { x: CENTRE + ring * Math.cos(at), y: CENTRE + ring * Math.sin(at) };
-}
-
-// A chord from edge to edge of two modules, bent towards the centre; `aside` shifts it, so that both directions are seen.
-export function chord(a, b, node, aside) {
-  const bend = { x: (a.x + b.x) / 2 + (CENTRE - (a.x + b.x) / 2) * 0.4, y: (a.y + b.y) / 2 + (CENTRE - (a.y + b.y) / 2) * 0.4 };
-  const dx = b.x - a.x, dy = b.y - a.y, far = Math.hypot(dx, dy) || 1;
-  const nx = (-dy / far) * aside, ny = (dx / far) * aside;
-  const edge = (from) => {
-    const ex = bend.x - from.x, ey = bend.y - from.y, length = Math.hypot(ex, ey) || 1;
-    return { x: from.x + (ex / length) * (node + 10) + nx, y: from.y + (ey / length) * (node + 10) + ny };
-  };
-  const start = edge(a), end = edge(b), middle = { x: bend.x + nx, y: bend.y + ny };
-  const at = (t) => ({
-    x: (1 - t) ** 2 * start.x + 2 * t * (1 - t) * middle.x + t * t * end.x,
-    y: (1 - t) ** 2 * start.y + 2 * t * (1 - t) * middle.y + t * t * end.y,
-  });
-  return { d: `M${start.x.toFixed(1)} ${start.y.toFixed(1)}Q${middle.x.toFixed(1)} ${middle.y.toFixed(1)} ${end.x.toFixed(1)} ${end.y.toFixed(1)}`, at };
-}
 
 const speedOf = (rate) => SPEEDS.reduce((found, [least, word]) => (rate > least ? word : found), "");
 const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 100)) * 1.4);
@@ -54,7 +22,11 @@ const width = (bytes) => Math.min(9, 2 + Math.max(0, Math.log10((bytes || 0) / 1
 // What moves is a picture of its own beneath the others, which are not drawn again with it.
 const Stream = memo(({ flow, a, b, geo, both }) => {
   const line = chord(a, b, geo.node, both ? 9 : 0);
-  return html`<path class="stream ${flow.by === "resource" ? "declared" : ""}" d=${line.d} stroke-width=${width(flow.bandwidth)} />`;
+  return html`<path
+    class="stream ${flow.by === "resource" ? "declared" : ""}"
+    d=${line.d}
+    stroke-width=${width(flow.bandwidth)}
+  />`;
 });
 
 const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
@@ -67,7 +39,12 @@ const Flow = memo(({ flow, from, to, a, b, geo, both, labelled, compact }) => {
     <title>${from} to ${to}: ${text || "rate not known"}, ${flow.topics.join(", ")}</title>
     <path class="pipe" d=${line.d} stroke-width=${width(flow.bandwidth) + 4} marker-end="url(#arrow)" />
     ${labelled && text && html`<text class="rate" x=${label.x} y=${label.y + 6}>${text}</text>`}
-    ${labelled && !compact && text && geo.slots <= 8 && flow.bandwidth && html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
+    ${labelled &&
+    !compact &&
+    text &&
+    geo.slots <= 8 &&
+    flow.bandwidth &&
+    html`<text class="minor" x=${label.x} y=${label.y + 30}>${bandwidth(flow.bandwidth)}</text>`}
   </g>`;
 });
 
@@ -84,20 +61,37 @@ const Streams = ({ flows, at, both, geo, moves }) => {
     const timer = setInterval(move, STEP);
     return () => clearInterval(timer);
   }, [moves]);
-  const of = (speed) => flows.filter(([, , flow]) => speedOf(flow.rate || 0) === speed).map(([from, to, flow]) =>
-    html`<${Stream} key=${`${from}>${to}`} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} both=${both(from, to)} />`);
+  const of = (speed) =>
+    flows
+      .filter(([, , flow]) => speedOf(flow.rate || 0) === speed)
+      .map(
+        ([from, to, flow]) =>
+          html`<${Stream}
+            key=${`${from}>${to}`}
+            flow=${flow}
+            a=${at(from)}
+            b=${at(to)}
+            geo=${geo}
+            both=${both(from, to)}
+          />`,
+      );
   return html`<svg ref=${picture} class="streams" viewBox="0 0 ${SIZE} ${SIZE}" aria-hidden="true">
-    ${SPEEDS.map(([, speed]) => html`<g key=${speed} class=${speed}>${of(speed)}</g>`)}</svg>`;
+    ${SPEEDS.map(([, speed]) => html`<g key=${speed} class=${speed}>${of(speed)}</g>`)}
+  </svg>`;
 };
 
-const Wire = memo(({ name, module, a, b, geo, labelled }) => {
+const Wire = memo(({ module, a, b, geo, labelled }) => {
   const line = chord(a, b, geo.node, 0);
   const middle = line.at(0.5);
   const about = known(module.state);
   const quiet = module.state === "up" || module.state === "relayed";
-  return html`<g class="wire ${module.state} ${about.tone}"><path d=${line.d} />
-    ${!quiet && html`<g class="seal" transform="translate(${middle.x} ${middle.y})"><circle r="19" /><svg x="-11" y="-11" width="22" height="22" viewBox="0 0 16 16">${shape(module.state)}</svg></g>`}
-    ${!quiet && labelled && html`<text class="word" x=${middle.x} y=${middle.y + 42}>${about.word}</text>`}</g>`;
+  return html`<g class="wire ${module.state} ${about.tone}"
+    ><path d=${line.d} />${!quiet &&
+    html`<g class="seal" transform="translate(${middle.x} ${middle.y})"
+      ><circle r="19" /><svg x="-11" y="-11" width="22" height="22" viewBox="0 0 16 16">${shape(module.state)}</svg></g
+    >`}
+    ${!quiet && labelled && html`<text class="word" x=${middle.x} y=${middle.y + 42}>${about.word}</text>`}</g
+  >`;
 });
 
 function arc(x, y, radius, from, to) {
@@ -109,8 +103,14 @@ function arc(x, y, radius, from, to) {
 const Arcs = ({ at, geo, resources }) => {
   const part = (2 * Math.PI) / resources.length;
   const gap = 0.09;
-  return resources.map(([key, one], index) => html`<path key=${key} class="quality ${known(one.level).tone} level-${(one.level || "none").toLowerCase()}"
-    d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)} />`);
+  return resources.map(
+    ([key, one], index) =>
+      html`<path
+        key=${key}
+        class="quality ${known(one.level).tone} level-${(one.level || "none").toLowerCase()}"
+        d=${arc(at.x, at.y, geo.node + 8, -Math.PI / 2 + index * part + gap, -Math.PI / 2 + (index + 1) * part - gap)}
+      />`,
+  );
 };
 
 const LEVELS = ["ERROR", "STALE", "WARN", "OK"]; // the worst first
@@ -118,24 +118,59 @@ const worst = (resources) => LEVELS.find((level) => resources.some(([, one]) => 
 
 const Module = memo(({ name, module, at, geo, resources, alarms, compact }) => {
   const about = known(module.state);
-  const profile = resources.length === 1 ? resources[0][1].profile : resources.length ? `${resources.length} resources` : "";
+  const profile =
+    resources.length === 1 ? resources[0][1].profile : resources.length ? `${resources.length} resources` : "";
   const { small } = geo;
   const level = worst(resources);
   const label = small ? outside(at, geo) : { x: at.x, y: at.y - (compact ? 22 : 16), anchor: "middle" };
   const mark = small ? (geo.node > 30 ? 24 : 18) : compact ? 32 : 20;
   const limit = compact ? 9 : small ? 12 : geo.slots > 8 ? 9 : 11;
   const short = name.length > limit ? `${name.slice(0, limit - 1)}…` : name;
-  const word = small ? "" : profile && module.state !== "away" && module.state !== "linking" ? profile.slice(0, limit) : compact && module.state === "here" ? "here" : about.word;
+  const word = small
+    ? ""
+    : profile && module.state !== "away" && module.state !== "linking"
+      ? profile.slice(0, limit)
+      : compact && module.state === "here"
+        ? "here"
+        : about.word;
   // The name begins with the text that is seen, so that a user can say what they see.
-  const said = [short, word, alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`, short !== name && name, `link ${about.word}`, profile && `profile ${profile}`, level && `quality ${known(level).word}`].filter(Boolean).join(", ");
-  return html`<a class="module ${module.state} ${about.tone}" href=${href("module", name)} aria-label=${said} data-module=${name}>
+  const said = [
+    short,
+    word,
+    alarms && `${alarms} alarm${alarms > 1 ? "s" : ""}`,
+    short !== name && name,
+    `link ${about.word}`,
+    profile && `profile ${profile}`,
+    level && `quality ${known(level).word}`,
+  ]
+    .filter(Boolean)
+    .join(", ");
+  return html`<a
+    class="module ${module.state} ${about.tone}"
+    href=${href("module", name)}
+    aria-label=${said}
+    data-module=${name}
+  >
     <circle class="halo" cx=${at.x} cy=${at.y} r=${geo.node + 16} />
     <circle class="body" cx=${at.x} cy=${at.y} r=${geo.node} />
     ${resources.length > 0 && html`<${Arcs} at=${at} geo=${geo} resources=${resources} />`}
     <text class="name" x=${label.x} y=${label.y} text-anchor=${label.anchor}>${short}</text>
-    <g class="state"><svg x=${at.x - mark / 2} y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)} width=${mark} height=${mark} viewBox="0 0 16 16">${shape(module.state)}</svg></g>
+    <g class="state"
+      ><svg
+        x=${at.x - mark / 2}
+        y=${at.y - mark / 2 + (small ? 0 : compact ? 18 : 13)}
+        width=${mark}
+        height=${mark}
+        viewBox="0 0 16 16"
+      >
+        ${shape(module.state)}
+      </svg></g
+    >
     ${" "}${!small && html`<text class="word" x=${at.x} y=${at.y + (compact ? 66 : 46)}>${word}</text>`}
-    ${" "}${alarms > 0 && html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"><circle r="20" /><text y="8">${alarms}</text></g>`}
+    ${" "}${alarms > 0 &&
+    html`<g class="bell" transform="translate(${at.x + geo.node * 0.72} ${at.y - geo.node * 0.72})"
+      ><circle r="20" /><text y="8">${alarms}</text></g
+    >`}
   </a>`;
 });
 
@@ -176,117 +211,294 @@ function sizes(slots, compact) {
 const lists = new Map();
 function same(key, list) {
   const before = lists.get(key);
-  if (before && before.length === list.length && before.every((each, at) => each[0] === list[at][0] && each[1] === list[at][1])) return before;
+  if (
+    before &&
+    before.length === list.length &&
+    before.every((each, at) => each[0] === list[at][0] && each[1] === list[at][1])
+  )
+    return before;
   lists.set(key, list);
   return list;
 }
 
-// The slot of each module: a module that has one keeps it, and a new one takes the free slot that is farthest from all others.
-// When all are taken the ring gets more; the order around it stays. Slot 0, at the top, is this module's.
-const SLOTS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
-const around = { slots: SLOTS[0], places: new Map() };
-function arrange(state) {
-  const modules = entries(state, "modules"), own = section(state, "agent").name;
-  const names = modules.map(([name]) => name).sort();
-  if (!around.places.has(own)) around.places = new Map([[own, 0]]);
-  for (const name of [...around.places.keys()]) if (name !== own && !names.includes(name)) around.places.delete(name);
-  for (const name of names.filter((each) => !around.places.has(each))) {
-    if (around.places.size === around.slots) {
-      const order = [...around.places].sort(([, a], [, b]) => a - b);
-      around.slots = SLOTS.find((size) => size > order.length) ?? order.length + 1;
-      around.places = new Map(order.map(([each], at) => [each, Math.floor((at * around.slots) / order.length)]));
-    }
-    const taken = [...around.places.values()];
-    const room = (slot) => Math.min(...taken.map((each) => Math.min((slot - each + around.slots) % around.slots, (each - slot + around.slots) % around.slots)));
-    const best = Array.from({ length: around.slots }, (_, slot) => slot).reduce((found, slot) => (room(slot) > room(found) ? slot : found));
-    around.places.set(name, best);
-  }
-  return { slots: around.slots, places: Object.fromEntries(around.places) };
-}
+const around = emptyRing();
+const arranged = (state) => arrange(around, section(state, "agent").name, Object.keys(section(state, "modules")));
 
 export function Ring({ state, current }) {
   const compact = useQuery("(max-width: 640px)");
   const still = useQuery("(prefers-reduced-motion: reduce)");
-  const { slots, places } = arrange(state);
+  const { slots, places } = arranged(state);
   const geo = sizes(slots, compact);
   const modules = section(state, "modules");
-  const names = Object.keys(modules).filter((name) => name in places).sort((a, b) => places[a] - places[b]);
+  const names = Object.keys(modules)
+    .filter((name) => name in places)
+    .sort((a, b) => places[a] - places[b]);
   const at = (name) => point(places[name], geo);
   const own = section(state, "agent").name;
-  const flows = entries(state, "flows").map(([key, flow]) => [...key.split(">"), flow]).filter(([from, to]) => from in places && to in places);
+  const flows = entries(state, "flows")
+    .map(([key, flow]) => [...key.split(">"), flow])
+    .filter(([from, to]) => from in places && to in places);
   const resources = entries(state, "resources");
   const alarms = entries(state, "alarms");
   const labelled = names.length <= 16;
   const taken = new Set(names.map((name) => places[name]));
   const both = (from, to) => `${to}>${from}` in section(state, "flows");
-  return html`<div class="ring"><${Streams} flows=${flows} at=${at} both=${both} geo=${geo} moves=${current && !still && flows.length > 0} />
-  <svg class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}" viewBox="0 0 ${SIZE} ${SIZE}" role="group" aria-label="Modules, their links, and what flows between them" onKeyDown=${(event) => step(event, names)}>
-    <defs><marker id="arrow" viewBox="0 0 8 8" refX="6.5" refY="4" markerWidth="14" markerHeight="14" markerUnits="userSpaceOnUse" orient="auto"><path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" /></marker></defs>
-    <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
-    ${Array.from({ length: geo.slots }, (_, slot) => slot).filter((slot) => !taken.has(slot)).map((slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`)}
-    <g>${names.filter((name) => name !== own).map((name) => html`<${Wire} key=${name} name=${name} module=${modules[name]} a=${at(own)} b=${at(name)} geo=${geo} labelled=${labelled && !compact} />`)}</g>
-    <g>${flows.map(([from, to, flow]) => html`<${Flow} key=${`${from}>${to}`} from=${from} to=${to} flow=${flow} a=${at(from)} b=${at(to)} geo=${geo} labelled=${labelled} compact=${compact} both=${both(from, to)} />`)}</g>
-    <g>${names.map((name) => html`<${Module} key=${name} name=${name} module=${modules[name]} at=${at(name)} geo=${geo} compact=${compact}
-      resources=${same(name, resources.filter(([, one]) => one.module === name))} alarms=${alarms.filter(([, one]) => one.module === name).length} />`)}</g>
-  </svg></div>`;
+  return html`<div class="ring">
+    <${Streams} flows=${flows} at=${at} both=${both} geo=${geo} moves=${current && !still && flows.length > 0} />
+    <svg
+      class="mandala ${compact ? "compact" : ""} ${geo.slots > 8 ? "many" : ""}"
+      viewBox="0 0 ${SIZE} ${SIZE}"
+      role="group"
+      aria-label="Modules, their links, and what flows between them"
+      onKeyDown=${(event) => step(event, names)}
+    >
+      <defs>
+        <marker
+          id="arrow"
+          viewBox="0 0 8 8"
+          refX="6.5"
+          refY="4"
+          markerWidth="14"
+          markerHeight="14"
+          markerUnits="userSpaceOnUse"
+          orient="auto"
+        >
+          <path class="head" d="M.8.8 7 4 .8 7.2 2.6 4Z" />
+        </marker>
+      </defs>
+      <circle class="dial" cx=${CENTRE} cy=${CENTRE} r=${geo.ring} />
+      ${Array.from({ length: geo.slots }, (_, slot) => slot)
+        .filter((slot) => !taken.has(slot))
+        .map(
+          (slot) => html`<circle key=${slot} class="vacant" cx=${point(slot, geo).x} cy=${point(slot, geo).y} r="5" />`,
+        )}
+      <g>
+        ${names
+          .filter((name) => name !== own)
+          .map(
+            (name) =>
+              html`<${Wire}
+                key=${name}
+                module=${modules[name]}
+                a=${at(own)}
+                b=${at(name)}
+                geo=${geo}
+                labelled=${labelled && !compact}
+              />`,
+          )}
+      </g>
+      <g>
+        ${flows.map(
+          ([from, to, flow]) =>
+            html`<${Flow}
+              key=${`${from}>${to}`}
+              from=${from}
+              to=${to}
+              flow=${flow}
+              a=${at(from)}
+              b=${at(to)}
+              geo=${geo}
+              labelled=${labelled}
+              compact=${compact}
+              both=${both(from, to)}
+            />`,
+        )}
+      </g>
+      <g>
+        ${names.map(
+          (name) =>
+            html`<${Module}
+              key=${name}
+              name=${name}
+              module=${modules[name]}
+              at=${at(name)}
+              geo=${geo}
+              compact=${compact}
+              resources=${same(
+                name,
+                resources.filter(([, one]) => one.module === name),
+              )}
+              alarms=${alarms.filter(([, one]) => one.module === name).length}
+            />`,
+        )}
+      </g>
+    </svg>
+  </div>`;
 }
 
 function concerns(state) {
   const found = [];
-  for (const [id, alarm] of entries(state, "alarms")) found.push({ id, level: alarm.level, text: alarm.text, who: alarm.resource || alarm.module, to: alarm.resource ? href("resource", alarm.resource) : href("alarms"), since: alarm.at });
+  for (const [id, alarm] of entries(state, "alarms"))
+    found.push({
+      id,
+      level: alarm.level,
+      text: alarm.text,
+      who: alarm.resource || alarm.module,
+      to: alarm.resource ? href("resource", alarm.resource) : href("alarms"),
+      since: alarm.at,
+    });
   for (const [name, module] of entries(state, "modules")) {
     if (module.state !== "up" && module.state !== "here" && module.state !== "relayed")
-      found.push({ id: `m${name}`, level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN", text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`, who: name, to: href("module", name), since: module.since });
-    else if (module.error) found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
+      found.push({
+        id: `m${name}`,
+        level: { refused: "ERROR", away: "STALE" }[module.state] || "WARN",
+        text: `${known(module.state).word}${module.error ? `: ${module.error}` : ""}`,
+        who: name,
+        to: href("module", name),
+        since: module.since,
+      });
+    else if (module.error)
+      found.push({ id: `m${name}`, level: "WARN", text: module.error, who: name, to: href("module", name) });
   }
   const troubled = new Map(); // many topics have one trouble when a module is lost: that is one line
-  for (const [name, topic] of entries(state, "topics")) if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
+  for (const [name, topic] of entries(state, "topics"))
+    if (topic.problem) troubled.set(topic.problem, [...(troubled.get(topic.problem) || []), name]);
   for (const [text, names] of troubled) {
     const several = names.length > 1;
-    found.push({ id: `t${text}`, level: "WARN", text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text, who: several ? `${names.length} topics` : names[0], to: several ? href("topics") : href("topic", names[0]) });
+    found.push({
+      id: `t${text}`,
+      level: "WARN",
+      text: several ? `${text}: ${names.slice(0, 3).join(", ")}${names.length > 3 ? " …" : ""}` : text,
+      who: several ? `${names.length} topics` : names[0],
+      to: several ? href("topics") : href("topic", names[0]),
+    });
   }
-  for (const note of state.notes || []) found.push({ id: `n${note}`, level: "WARN", text: note, who: "the agent", to: href("module", section(state, "agent").name) });
-  return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level)); // of one level: what causes, then what follows
+  for (const note of state.notes || [])
+    found.push({
+      id: `n${note}`,
+      level: "WARN",
+      text: note,
+      who: "the agent",
+      to: href("module", section(state, "agent").name),
+    });
+  return found.sort((a, b) => LEVELS.indexOf(a.level) - LEVELS.indexOf(b.level)); // of one level: causes first
 }
 
 export function Concerns({ state, connection }) {
   const found = concerns(state);
   const reach = section(state, "reach");
-  if (connection.phase === "lost") found.unshift({ id: "lost", level: "ERROR", who: "rmpa web", text: "no connection: what is shown is as it was last known", to: location.hash || "#/", since: connection.lostAt / 1000 });
-  else if (reach.ok === false) found.unshift({ id: "mute", level: "ERROR", who: "the agent", text: `does not answer: ${reach.error}`, to: location.hash || "#/", since: reach.since });
+  if (connection.phase === "lost")
+    found.unshift({
+      id: "lost",
+      level: "ERROR",
+      who: "rmpa web",
+      text: "no connection: what is shown is as it was last known",
+      to: location.hash || "#/",
+      since: connection.lostAt / 1000,
+    });
+  else if (reach.ok === false)
+    found.unshift({
+      id: "mute",
+      level: "ERROR",
+      who: "the agent",
+      text: `does not answer: ${reach.error}`,
+      to: location.hash || "#/",
+      since: reach.since,
+    });
   if (!found.length) return html`<p class="well"><${Mark} state="OK" word="Nothing is wrong." /></p>`;
-  return html`<ul class="concerns">${found.slice(0, 50).map((one) => html`<li key=${one.id}><a href=${one.to}><${Mark} state=${one.level} word="" /><span><strong>${one.who}</strong><span>${one.text}</span></span>${one.since && html`<span class="muted"><${Since} moment=${one.since} /></span>`}</a></li>`)}</ul>`;
+  return html`<ul class="concerns">
+    ${found.slice(0, 50).map(
+      (one) =>
+        html`<li key=${one.id}>
+          <a href=${one.to}
+            ><${Mark} state=${one.level} word="" /><span><strong>${one.who}</strong><span>${one.text}</span></span
+            >${one.since && html`<span class="muted"><${Since} moment=${one.since} /></span>`}</a
+          >
+        </li>`,
+    )}
+  </ul>`;
 }
 
-const Row = memo(({ name, module, resources }) => html`<tr>
-  <th scope="row"><${Link} page="module" name=${name} /></th>
-  <td><${Mark} state=${module.state} /></td>
-  <td class="number">${seconds(module.rtt)}</td>
-  <td class="number">${bandwidth(module.bytes_in)}</td>
-  <td class="number">${bandwidth(module.bytes_out)}</td>
-  <td>${resources.map(([key, one]) => html`<div key=${key}><a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a></div>`)}</td></tr>`);
+const Row = memo(
+  ({ name, module, resources }) =>
+    html`<tr>
+      <th scope="row"><${Link} page="module" name=${name} /></th>
+      <td><${Mark} state=${module.state} /></td>
+      <td class="number">${seconds(module.rtt)}</td>
+      <td class="number">${bandwidth(module.bytes_in)}</td>
+      <td class="number">${bandwidth(module.bytes_out)}</td>
+      <td>
+        ${resources.map(
+          ([key, one]) =>
+            html`<div key=${key}>
+              <a href=${href("resource", key)}><${Mark} state=${one.level} word=${one.profile || "no profile"} /></a>
+            </div>`,
+        )}
+      </td>
+    </tr>`,
+);
 
-const FlowRow = memo(({ from, to, flow }) => html`<tr><th scope="row">${from} → ${to}</th><td class="number">${hertz(flow.rate)}</td><td class="number">${bandwidth(flow.bandwidth)}</td>
-  <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td></tr>`);
+const FlowRow = memo(
+  ({ from, to, flow }) =>
+    html`<tr>
+      <th scope="row">${from} → ${to}</th>
+      <td class="number">${hertz(flow.rate)}</td>
+      <td class="number">${bandwidth(flow.bandwidth)}</td>
+      <td>${flow.topics.map((topic, at) => html`${at > 0 && ", "}<a href=${href("topic", topic)}>${topic}</a>`)}</td>
+    </tr>`,
+);
 
 export function Mandala({ state, connection }) {
   const current = connection.phase !== "lost" && section(state, "reach").ok !== false;
-  const modules = entries(state, "modules"), resources = entries(state, "resources");
+  const modules = entries(state, "modules"),
+    resources = entries(state, "resources");
   const up = modules.filter(([, one]) => one.state === "up" || one.state === "here").length;
+  const domain = section(state, "agent").domain ?? "–";
   const total = modules.length + (section(state, "hidden").modules || 0);
-  const marks = ["up", "relayed", "silent", "linking", "refused", "away"].filter((each) => each !== "relayed" || modules.some(([, one]) => one.state === each));
-  const { places } = arrange(state);
+  const marks = ["up", "relayed", "silent", "linking", "refused", "away"].filter(
+    (each) => each !== "relayed" || modules.some(([, one]) => one.state === each),
+  );
+  const { places } = arranged(state);
   const ordered = modules.sort(([a], [b]) => (places[a] ?? 1e9) - (places[b] ?? 1e9));
-  return html`<${Page} title="Mesh" kind=${`Domain ${section(state, "agent").domain ?? "–"} · ${up} of ${total} modules up${current ? "" : " when last heard of"}`}>
-    <div class="overview"><div class="stage-area"><${Ring} state=${state} current=${current} />
-      <p class="legend" aria-hidden="true">${marks.map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span></p></div>
-    <div class="beside">
-      <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
-      <${Panel} title="Modules"><${Table} caption="Modules" columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]} list=${ordered}>
-        ${([name, module]) => html`<${Row} key=${name} name=${name} module=${module} resources=${same(`row ${name}`, resources.filter(([, one]) => one.module === name))} />`}<//>
-        ${total > modules.length && html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//>
-      <${Panel} title="Flows"><${Table} caption="Flows between modules" columns=${["From → to", "#Messages", "#Bytes", "Topics"]} empty="No messages cross at present." list=${entries(state, "flows")}>
-        ${([key, flow]) => { const [from, to] = key.split(">"); return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`; }}<//><//>
-    </div></div><//>`;
+  return html`<${Page}
+    title="Mesh"
+    kind=${`Domain ${domain} · ${up} of ${total} modules up${current ? "" : " when last heard of"}`}
+  >
+    <div class="overview">
+      <div class="stage-area">
+        <${Ring} state=${state} current=${current} />
+        <p class="legend" aria-hidden="true">
+          ${marks.map((each) => html`<${Mark} key=${each} state=${each} />`)}<span class="mark flowkey"
+            ><svg viewBox="0 0 26 16"><path d="M1 8h22" /></svg>messages</span
+          >
+        </p>
+      </div>
+      <div class="beside">
+        <${Panel} title="What is wrong"><${Concerns} state=${state} connection=${connection} /><//>
+        <${Panel} title="Modules"
+          ><${Table}
+            caption="Modules"
+            columns=${["Module", "Link", "#Round trip", "#In", "#Out", "Profile"]}
+            list=${ordered}
+          >
+            ${([name, module]) =>
+              html`<${Row}
+                key=${name}
+                name=${name}
+                module=${module}
+                resources=${same(
+                  `row ${name}`,
+                  resources.filter(([, one]) => one.module === name),
+                )}
+              />`}<//
+          >
+          ${total > modules.length &&
+          html`<p class="empty">The server leaves out ${total - modules.length} further modules.</p>`}<//
+        >
+        <${Panel} title="Flows"
+          ><${Table}
+            caption="Flows between modules"
+            columns=${["From → to", "#Messages", "#Bytes", "Topics"]}
+            empty="No messages cross at present."
+            list=${entries(state, "flows")}
+          >
+            ${([key, flow]) => {
+              const [from, to] = key.split(">");
+              return html`<${FlowRow} key=${key} from=${from} to=${to} flow=${flow} />`;
+            }}<//
+          ><//
+        >
+      </div>
+    </div><//
+  >`;
 }
-

@@ -3,7 +3,7 @@
 import { Component, html, useEffect, useLayoutEffect, useRef, useState } from "./markup.js";
 import { ago, count, plain } from "./format.js";
 
-// Each state and level has a word, a colour (by its class) and a shape, so that none of them is needed to tell them apart.
+// Each state and level has a word, a colour (by its class) and a shape: none of them is needed to tell them apart.
 export const STATES = {
   here: { word: "this module", tone: "accent" },
   up: { word: "up", tone: "good" },
@@ -39,7 +39,9 @@ export const known = (state) => STATES[state] || STATES[""];
 
 export function Mark({ state, word }) {
   const about = known(state);
-  return html`<span class="mark ${about.tone}"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(state)}</svg>${word === undefined ? about.word : word}</span>`;
+  return html`<span class="mark ${about.tone}"
+    ><svg viewBox="0 0 16 16" aria-hidden="true">${shape(state)}</svg>${word === undefined ? about.word : word}</span
+  >`;
 }
 
 // Draws again only when one of its properties is another object.
@@ -48,9 +50,14 @@ export function memo(draw) {
     shouldComponentUpdate(next) {
       const before = this.props;
       const keys = Object.keys(next);
-      return keys.length !== Object.keys(before).length || keys.some((key) => key !== "children" && next[key] !== before[key]);
+      return (
+        keys.length !== Object.keys(before).length ||
+        keys.some((key) => key !== "children" && next[key] !== before[key])
+      );
     }
-    render(props) { return draw(props); }
+    render(props) {
+      return draw(props);
+    }
   };
 }
 
@@ -59,7 +66,15 @@ export const Link = ({ page, name, children }) => html`<a href=${href(page, name
 
 export function Facts({ rows }) {
   const shown = rows.filter(([, value]) => value !== undefined && value !== null && value !== "" && value !== "–");
-  return html`<dl class="facts">${shown.map(([name, value]) => html`<div key=${name}><dt>${name}</dt><dd>${value}</dd></div>`)}</dl>`;
+  return html`<dl class="facts">
+    ${shown.map(
+      ([name, value]) =>
+        html`<div key=${name}>
+          <dt>${name}</dt>
+          <dd>${value}</dd>
+        </div>`,
+    )}
+  </dl>`;
 }
 
 const MOST = 200; // entries of a list that are drawn at first, and more with each press of a button
@@ -68,8 +83,13 @@ const MOST = 200; // entries of a list that are drawn at first, and more with ea
 export function useFirst(list) {
   const [most, setMost] = useState(MOST);
   const left = list.length - most;
-  const more = left > 0 && html`<p class="more"><button type="button" onClick=${() => setMost(most + MOST)}>
-    Show ${Math.min(MOST, left)} more of ${count(left)}</button></p>`;
+  const more =
+    left > 0 &&
+    html`<p class="more">
+      <button type="button" onClick=${() => setMost(most + MOST)}>
+        Show ${Math.min(MOST, left)} more of ${count(left)}
+      </button>
+    </p>`;
   return [left > 0 ? list.slice(0, most) : list, more];
 }
 
@@ -78,65 +98,135 @@ export function Table({ caption, columns, list, children, empty }) {
   const [first, more] = useFirst(list || [children].flat());
   const rows = list ? first.map(children) : first;
   if (!rows.filter(Boolean).length) return html`<p class="empty">${empty || "Nothing here."}</p>`;
-  return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}><table>
-    <caption class="unseen">${caption}</caption>
-    <thead><tr>${columns.map((column) => html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>${column.replace("#", "") || html`<span class="unseen">Action</span>`}</th>`)}</tr></thead>
-    <tbody>${rows}</tbody></table>${more}</div>`;
+  return html`<div class="scroll" tabindex="0" role="region" aria-label=${caption}>
+    <table>
+      <caption class="unseen">
+        ${caption}
+      </caption>
+      <thead>
+        <tr>
+          ${columns.map(
+            (column) =>
+              html`<th key=${column} scope="col" class=${column.startsWith("#") ? "number" : ""}>
+                ${column.replace("#", "") || html`<span class="unseen">Action</span>`}
+              </th>`,
+          )}
+        </tr>
+      </thead>
+      <tbody>
+        ${rows}
+      </tbody>
+    </table>
+    ${more}
+  </div>`;
 }
 
-export const Panel = ({ title, children, aside, wide }) => html`<section class=${wide ? "panel wide" : "panel"}>
-  ${title && html`<header><h2>${title}</h2>${aside}</header>`}${children}</section>`;
+export const Panel = ({ title, children, aside, wide }) =>
+  html`<section class=${wide ? "panel wide" : "panel"}>
+    ${title &&
+    html`<header>
+      <h2>${title}</h2>
+      ${aside}
+    </header>`}${children}
+  </section>`;
 
 export const Page = ({ title, kind, aside, children }) => {
   const heading = useRef();
-  useEffect(() => { document.title = `${plain(title)} · RMPA`; }, [title]);
-  return html`<div class="page"><header class="title"><div>${kind && html`<p class="kind">${kind}</p>`}<h1 ref=${heading} tabindex="-1">${title}</h1></div><div class="actions">${aside}</div></header>${children}</div>`;
+  useEffect(() => {
+    document.title = `${plain(title)} · RMPA`;
+  }, [title]);
+  return html`<div class="page">
+    <header class="title">
+      <div>
+        ${kind && html`<p class="kind">${kind}</p>`}
+        <h1 ref=${heading} tabindex="-1">${title}</h1>
+      </div>
+      <div class="actions">${aside}</div>
+    </header>
+    ${children}
+  </div>`;
 };
 
-export const Gone = ({ kind, name }) => html`<p class="empty">There is no ${kind} <code>${name}</code> at present. It is shown here as soon as there is one.</p>`;
+export const Gone = ({ kind, name }) =>
+  html`<p class="empty">
+    There is no ${kind} <code>${name}</code> at present. It is shown here as soon as there is one.
+  </p>`;
 
-export const Failure = ({ failure }) => failure && html`<p class="failure" role="alert"><${Mark} state="ERROR" word="" /> ${failure.error}${failure.remedy && html`<br /><span class="muted">${failure.remedy}</span>`}</p>`;
+export const Failure = ({ failure }) =>
+  failure &&
+  html`<p class="failure" role="alert">
+    <${Mark} state="ERROR" word="" /> ${failure.error}${failure.remedy &&
+    html`<br /><span class="muted">${failure.remedy}</span>`}
+  </p>`;
 
 // A time that has passed; it counts by itself, once a second.
 export function Since({ moment, text }) {
   const [, tick] = useState(0);
-  useEffect(() => { const timer = setInterval(() => tick((n) => n + 1), 1000); return () => clearInterval(timer); }, []);
+  useEffect(() => {
+    const timer = setInterval(() => tick((n) => n + 1), 1000);
+    return () => clearInterval(timer);
+  }, []);
   return html`<time datetime=${new Date(moment * 1000).toISOString()}>${text ? text(ago(moment)) : ago(moment)}</time>`;
 }
 
 export const Uptime = ({ since }) => html`<${Since} moment=${since} text=${(shown) => shown} />`;
 
-// A value that can be changed: a button, and once it is pressed a field, which has the cursor. Escape or a button leaves
-// it, and the first button has the focus again. `save` gets the text and returns a promise: of `{ failure }`, and then
-// the draft stays; else of `{ said }`, what has become of it.
+// A value that can be changed: a button, and once it is pressed a field, which has the cursor. Escape or a button
+// leaves it, and the first button has the focus again. `save` gets the text and returns a promise: of `{ failure }`,
+// and then the draft stays; else of `{ said }`, what has become of it.
 export function Editable({ label, shown, begin, save, choices, children }) {
   const [draft, setDraft] = useState(null);
   const [state, set] = useState({});
-  const place = useRef(), was = useRef(false);
+  const place = useRef(),
+    was = useRef(false);
   const open = draft !== null;
   useLayoutEffect(() => {
     if (open || was.current) place.current?.focus();
     if (open) place.current?.select?.();
     was.current = open;
   }, [open]);
-  const leave = (next = {}) => { setDraft(null); set(next); };
+  const leave = (next = {}) => {
+    setDraft(null);
+    set(next);
+  };
   const submit = (event) => {
     event.preventDefault();
     set({ waits: true });
     save(place.current.value).then((done) => (done.failure ? set(done) : leave(done)));
   };
   if (!open)
-    return html`<button ref=${place} type="button" class="field" aria-label=${`Change ${label}, now ${shown}`}
-      onClick=${() => { setDraft(begin); set({}); }}>${shown}</button>
+    return html`<button
+        ref=${place}
+        type="button"
+        class="field"
+        aria-label=${`Change ${label}, now ${shown}`}
+        onClick=${() => {
+          setDraft(begin);
+          set({});
+        }}
+      >
+        ${shown}
+      </button>
       <span role="status" class="muted said">${state.said}</span>`;
   const field = { ref: place, value: draft, onInput: (event) => setDraft(event.target.value) };
   const input = choices
-    ? html`<select ...${field}>${choices.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}</select>`
+    ? html`<select ...${field}>
+        ${choices.map((each) => html`<option key=${each} value=${each}>${each}</option>`)}
+      </select>`
     : html`<input ...${field} />`;
-  return html`<form class="row edit" onSubmit=${submit}
-    onKeyDown=${(event) => { if (event.key === "Escape") { event.stopPropagation(); leave(); } }}>
+  return html`<form
+    class="row edit"
+    onSubmit=${submit}
+    onKeyDown=${(event) => {
+      if (event.key === "Escape") {
+        event.stopPropagation();
+        leave();
+      }
+    }}
+  >
     <label><span>${label}</span>${input}</label><button class="primary" disabled=${state.waits}>Set</button>
-    <button type="button" onClick=${() => leave()}>Leave</button>${children}<${Failure} failure=${state.failure} /></form>`;
+    <button type="button" onClick=${() => leave()}>Leave</button>${children}<${Failure} failure=${state.failure} />
+  </form>`;
 }
 
 // One question to the server, asked by a button or at once; `show` draws the answer.
@@ -144,44 +234,66 @@ export function Question({ connection, what, args, label, show, now }) {
   const [state, set] = useState({});
   const ask = () => {
     set({ waits: true });
-    connection.ask(what, args).then((value) => set({ value }), (failure) => set({ failure }));
+    connection.ask(what, args).then(
+      (value) => set({ value }),
+      (failure) => set({ failure }),
+    );
   };
-  useEffect(() => { if (now) ask(); else set({}); }, [what, JSON.stringify(args)]);
+  useEffect(() => {
+    if (now) ask();
+    else set({});
+  }, [what, JSON.stringify(args)]);
   return html`<div class="question">
     <button type="button" onClick=${ask} disabled=${state.waits}>${state.waits ? "Asking …" : label}</button>
-    <div aria-live="polite"><${Failure} failure=${state.failure} />${state.value !== undefined && show(state.value)}</div></div>`;
+    <div aria-live="polite">
+      <${Failure} failure=${state.failure} />${state.value !== undefined && show(state.value)}
+    </div>
+  </div>`;
 }
 
-// The answer to a question, asked again every `period` seconds while the page is seen; 0: once. Another `key` asks anew.
-// The first time it is asked in any case: a page may have been opened in the background.
+// The answer to a question, asked again every `period` seconds while the page is seen; 0: once. Another `key` asks
+// anew. The first time it is asked in any case: a page may have been opened in the background.
 export function useAnswer(connection, what, args, period = 0, key = "") {
   const [state, set] = useState({});
   const open = connection.phase === "open";
   useEffect(() => {
     if (!open) return undefined;
-    let ended = false, timer;
+    let ended = false,
+      timer;
     const ask = async (first) => {
       if (first || !document.hidden) {
-        const next = await connection.ask(what, args).then((value) => ({ value }), (failure) => ({ failure }));
+        const next = await connection.ask(what, args).then(
+          (value) => ({ value }),
+          (failure) => ({ failure }),
+        );
         if (ended) return;
         set(next);
       }
       if (period && !ended) timer = setTimeout(ask, period * 1000);
     };
     ask(true);
-    return () => { ended = true; clearTimeout(timer); };
+    return () => {
+      ended = true;
+      clearTimeout(timer);
+    };
   }, [what, JSON.stringify(args), key, open]);
   return state;
 }
 
 // A node as it is named in the state: `MODULE:/name` for a peer's.
 export const nodeKey = (module, node) => (module ? `${module}:${node}` : node);
-export const NodeLink = ({ name, children }) => html`<a class="mono" href=${href("node", name)}>${children?.length ? children : name}</a>`;
-export const NodeLinks = ({ names }) => names.map((name, at) => html`${at > 0 && ", "}<${NodeLink} key=${name} name=${name} />`);
+export const NodeLink = ({ name, children }) =>
+  html`<a class="mono" href=${href("node", name)}>${children?.length ? children : name}</a>`;
+export const NodeLinks = ({ names }) =>
+  names.map((name, at) => html`${at > 0 && ", "}<${NodeLink} key=${name} name=${name} />`);
 export const ModuleLink = ({ name }) => html`<a class="whole" href=${href("module", name)}>${name}</a>`;
 
 const VERDICTS = { ok: "OK", warn: "WARN", fail: "ERROR", unknown: "STALE" };
-const WORDS = { topic: ["It flows", "It does not flow"], service: ["It can be called", "It cannot be called"], module: ["It is reached", "It is not reached"] };
+const WORDS = {
+  topic: ["It flows", "It does not flow"],
+  service: ["It can be called", "It cannot be called"],
+  module: ["It is reached", "It is not reached"],
+};
 const NO_DEMAND = "demand"; // the last stage where nothing is in the way, and no node wants it
 function verdict({ kind, flows, stages }) {
   if (flows && stages?.at(-1)?.name === NO_DEMAND) return ["STALE", "Nothing is in its way, and no node subscribes"];
@@ -191,25 +303,66 @@ function verdict({ kind, flows, stages }) {
 
 export function Diagnosis({ value }) {
   if (!Array.isArray(value) || !value.length) return html`<p class="empty">There is nothing to say.</p>`;
-  return value.map((one) => html`<div class="diagnosis"><p><${Mark} state=${verdict(one)[0]} word=${verdict(one)[1]} />
-    ${one.kind !== "module" && one.node && html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}</p>
-    <ol class="stages">${(one.stages || []).map((stage) => html`<li class=${known(VERDICTS[stage.verdict]).tone}>
-      <span class="stage"><svg viewBox="0 0 16 16" aria-hidden="true">${shape(VERDICTS[stage.verdict])}</svg>${stage.name}</span>
-      <span><span class="unseen">${stage.verdict}: </span>${stage.text}${stage.remedy && html`<br /><span class="remedy">${stage.remedy}</span>`}</span></li>`)}</ol></div>`);
+  return value.map(
+    (one) =>
+      html`<div class="diagnosis">
+        <p>
+          <${Mark} state=${verdict(one)[0]} word=${verdict(one)[1]} /> ${one.kind !== "module" &&
+          one.node &&
+          html` <span class="muted">from ${one.node}${one.peer && ` of ${one.peer}`} to ${one.to}</span>`}
+        </p>
+        <ol class="stages">
+          ${(one.stages || []).map(
+            (stage) =>
+              html`<li class=${known(VERDICTS[stage.verdict]).tone}>
+                <span class="stage"
+                  ><svg viewBox="0 0 16 16" aria-hidden="true">${shape(VERDICTS[stage.verdict])}</svg
+                  >${stage.name}</span
+                >
+                <span
+                  ><span class="unseen">${stage.verdict}: </span>${stage.text}${stage.remedy &&
+                  html`<br /><span class="remedy">${stage.remedy}</span>`}</span
+                >
+              </li>`,
+          )}
+        </ol>
+      </div>`,
+  );
 }
 
-export const Why = ({ connection, kind, name, peer, now }) => html`<${Question} connection=${connection} what="why" args=${{ kind, name, ...(peer ? { peer } : {}) }}
-  label="Why?" now=${now} show=${(value) => html`<${Diagnosis} value=${value} />`} />`;
+export const Why = ({ connection, kind, name, peer, now }) =>
+  html`<${Question}
+    connection=${connection}
+    what="why"
+    args=${{ kind, name, ...(peer ? { peer } : {}) }}
+    label="Why?"
+    now=${now}
+    show=${(value) => html`<${Diagnosis} value=${value} />`}
+  />`;
 
 // A switch between few choices.
-export const Choice = ({ label, value, options, onChoose, disabled }) => html`<div class="choice" role="radiogroup" aria-label=${label}>${options.map(([key, text]) => html`<button type="button" role="radio"
-  aria-checked=${String(key === value)} tabindex=${key === value ? 0 : -1} disabled=${disabled} key=${key} onClick=${() => onChoose(key)}
-  onKeyDown=${(event) => {
-    const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
-    if (!step) return;
-    event.preventDefault();
-    const at = (options.findIndex(([each]) => each === key) + step + options.length) % options.length;
-    event.currentTarget.parentNode.children[at].focus();
-    onChoose(options[at][0]);
-  }}>${text}</button>`)}</div>`;
-
+export const Choice = ({ label, value, options, onChoose, disabled }) =>
+  html`<div class="choice" role="radiogroup" aria-label=${label}>
+    ${options.map(
+      ([key, text]) =>
+        html`<button
+          type="button"
+          role="radio"
+          aria-checked=${String(key === value)}
+          tabindex=${key === value ? 0 : -1}
+          disabled=${disabled}
+          key=${key}
+          onClick=${() => onChoose(key)}
+          onKeyDown=${(event) => {
+            const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+            if (!step) return;
+            event.preventDefault();
+            const at = (options.findIndex(([each]) => each === key) + step + options.length) % options.length;
+            event.currentTarget.parentNode.children[at].focus();
+            onChoose(options[at][0]);
+          }}
+        >
+          ${text}
+        </button>`,
+    )}
+  </div>`;

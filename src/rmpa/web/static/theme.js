@@ -2,7 +2,13 @@
 
 const KEY = "rmpa.theme";
 const system = () => (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
-function stored() { try { return localStorage.getItem(KEY); } catch { return null; } }
+function stored() {
+  try {
+    return localStorage.getItem(KEY);
+  } catch {
+    return null;
+  }
+}
 
 export const theme = () => document.documentElement.dataset.theme || stored() || system();
 
@@ -14,5 +20,9 @@ export function applyTheme() {
 export function nextTheme() {
   const next = theme() === "dark" ? "light" : "dark";
   document.documentElement.dataset.theme = next;
-  try { localStorage.setItem(KEY, next); } catch { /* a private window: the choice lasts as long as the page */ }
+  try {
+    localStorage.setItem(KEY, next);
+  } catch {
+    /* a private window: the choice lasts as long as the page */
+  }
 }

@@ -25,7 +25,10 @@ export function truth(text) {
 // JSON whose whole numbers a browser has as they were typed: beyond 2^53 they would be sent as others.
 export function json(text) {
   let beyond = false;
-  const keep = (_, value) => { beyond ||= Number.isInteger(value) && !Number.isSafeInteger(value); return value; };
+  const keep = (_, value) => {
+    beyond ||= Number.isInteger(value) && !Number.isSafeInteger(value);
+    return value;
+  };
   try {
     const value = JSON.parse(text, keep);
     return beyond ? { error: "A number in it is beyond what a browser counts exactly." } : { value };
@@ -36,9 +39,11 @@ export function json(text) {
 
 // The value of a Smart Resource's parameter: of its type, one of its choices, within its bounds.
 export function setting(text, about) {
-  const typed = about.type === "str" ? { value: text } : about.type === "bool" ? truth(text) : number(text, about.type === "int");
+  const typed =
+    about.type === "str" ? { value: text } : about.type === "bool" ? truth(text) : number(text, about.type === "int");
   if (typed.error) return typed;
-  const { value } = typed, { low, high, choices } = about;
+  const { value } = typed,
+    { low, high, choices } = about;
   if (choices?.length && !choices.includes(value)) return { error: `${text} is none of ${choices.join(", ")}.` };
   if ((typeof low === "number" && value < low) || (typeof high === "number" && value > high))
     return { error: `${text.trim()} is not within ${low ?? "−∞"} … ${high ?? "∞"}.` };
@@ -63,4 +68,5 @@ export function fresh(text) {
   return typed.error?.startsWith("That is not JSON") ? { value: text } : typed;
 }
 
-export const kind = (value) => (Array.isArray(value) ? "list" : { string: "text", object: "namespace" }[typeof value] || typeof value);
+export const kind = (value) =>
+  Array.isArray(value) ? "list" : { string: "text", object: "namespace" }[typeof value] || typeof value;

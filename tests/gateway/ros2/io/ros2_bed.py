@@ -138,9 +138,6 @@ class Ros2TopicBed:
     def problems(self) -> dict[str, str]:
         return self.neighbour.context.problems
 
-    def rows(self, direction: str) -> list[dict[str, Any]]:
-        return [row for row in self.neighbour.topics.rows() if row["direction"] == direction]
-
 
 @contextlib.asynccontextmanager
 async def topic_bed(**more: Any) -> AsyncIterator[Ros2TopicBed]:

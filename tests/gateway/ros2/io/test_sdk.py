@@ -145,8 +145,8 @@ async def test_a_topic_of_an_sdk_program_is_heard_here() -> None:
         topic = graph.topics["/from_ros2", "/talker"]
         assert topic.source.type == "std_msgs/String"
         topic.on_demand(True)
-        rows = list(neighbour.topics.rows())
-        assert rows[0]["problem"] == ""
+        (imported,) = neighbour.topics.imports.values()
+        assert imported.problem == ""
         # The subscription reaches the program some milliseconds later: a volatile topic promises nothing before.
         number = 0
         while not topic.messages:

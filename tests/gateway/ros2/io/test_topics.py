@@ -281,9 +281,9 @@ async def test_losses_are_counted_by_the_numbers() -> None:
         talker.say("a")
         talker.say("b", skip=3)
         talker.put(b"\0\1\0\0\xff")
-        await eventually(lambda: bed.rows("in")[0]["unconverted"])
-        (row,) = bed.rows("in")
-        assert (row["received"], row["lost"], row["unconverted"]) == (2, 3, 1)
+        (imported,) = bed.neighbour.topics.imports.values()
+        await eventually(lambda: imported.unconverted)
+        assert (imported.publishers["/bot"].received, imported.sequences.lost, imported.unconverted) == (2, 3, 1)
         (way,) = bed.neighbour.ways("/chatter", "ros2")
         assert way.flows
         assert "3 were lost" in way.stages[-1].text
@@ -381,7 +381,7 @@ async def test_a_type_that_no_one_describes_is_told_with_what_to_do() -> None:
         texts = sorted(bed.problems.values())
         assert "start_type_description_service" in texts[1]
         assert "gateway.ros2.distribution" in texts[0] + texts[1]
-        assert all(row["problem"] for row in bed.rows("in"))
+        assert all(each.problem for each in bed.neighbour.topics.imports.values())
 
 
 async def test_a_type_that_is_learnt_later_makes_the_topic_known() -> None:
@@ -438,9 +438,9 @@ async def test_a_rate_limit_is_kept_and_counted() -> None:
         await eventually(lambda: bed.graph.taps)
         for _ in range(50):
             bed.graph.send(source, string("x"))
-        (row,) = bed.rows("out")
-        assert row["sent"] + row["limited"] == 50
-        assert row["limited"] >= 40
+        ((export, _),) = bed.neighbour.topics.exports()
+        assert export.messages + export.limited == 50
+        assert export.limited >= 40
 
 
 async def test_hostile_tokens_are_ignored_and_counted() -> None:

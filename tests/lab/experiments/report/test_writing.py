@@ -34,7 +34,6 @@ def test_the_page_has_claims_figures_tables_and_the_manifest(tmp_path: Path) -> 
     assert "| cpu | Some \\| CPU |" in page
     assert "short run" not in page
     assert "from node to node" not in page
-    assert "On loopback" not in page
     assert "Incomplete" not in page
     assert written.missing == ""
     assert [path.name for path in written.figures] == ["fig-10-rates.png", "fig-10-rates.svg"]
@@ -53,7 +52,7 @@ def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("plan", "said"),
-    [(Plan(size="short"), "short run"), (Plan(bed="loopback", clients=("own",), link=""), "On loopback")],
+    [(Plan(size="short"), "short run")],
 )
 def test_the_page_warns_of_what_cannot_be_quoted(tmp_path: Path, plan: Plan, said: str) -> None:
     written = write_report(make_run(tmp_path / "run", plan=plan), Known())

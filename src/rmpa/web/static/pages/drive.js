@@ -8,25 +8,83 @@ const PERIOD = 100; // milliseconds between two commands
 const TYPE = "geometry_msgs/Twist";
 const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
 
+const HELD =
+  "It drives only while the stick is held. " +
+  "Let go, lose the connection or leave the page, and it is stopped within 0.3 s.";
+const DENIED = "This page may not drive. Start rmpa web with --drive, and open the address that it prints.";
+
 export function DrivePage({ state, connection }) {
-  const topics = entries(state, "topics").filter(([, one]) => one.type === TYPE).map(([name]) => name);
+  const topics = entries(state, "topics")
+    .filter(([, one]) => one.type === TYPE)
+    .map(([name]) => name);
   const [topic, setTopic] = useState("/cmd_vel");
   const [armed, arm] = useState(false);
   const [share, setShare] = useState(0.15);
   const fastest = connection.hello.fastest || { linear: 0, angular: 0 };
   const allowed = connection.may("drive");
   const hold = useRef(0); // the server drops old commands, and those of an earlier hold
-  return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"><div class="grid">
-    <${Panel} title="What is driven"><div class="form"><label>Topic<input class="mono" list="twists" value=${topic} onInput=${(event) => { arm(false); setTopic(event.target.value); }} /></label><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
-      <label>Fastest: ${(share * fastest.linear).toFixed(2)} m/s, ${(share * fastest.angular).toFixed(2)} rad/s<input type="range" min="0.05" max="1" step="0.05" value=${share} onInput=${(event) => setShare(Number(event.target.value))} /></label>
-      <label class="row"><span><input type="checkbox" checked=${armed} disabled=${!allowed} onChange=${(event) => arm(event.target.checked)} /> The robot may move: I see it</span></label>
-      <p class="muted">${allowed ? "It drives only while the stick is held. Let go, lose the connection or leave the page, and it is stopped within 0.3 s." : "This page may not drive. Start rmpa web with --drive, and open the address that it prints."}</p></div><//>
-    <${Panel} title="Joystick"><${Stick} on=${allowed && armed} take=${() => { hold.current = ++connection.counter; }} send=${(linear, angular) => connection.send({ op: "drive", topic, linear: linear * share, angular: angular * share, hold: hold.current, n: ++connection.counter, at: connection.serverTime() })} release=${() => connection.send({ op: "release", hold: hold.current })} /><//></div><//>`;
+  return html`<${Page} title="Drive" kind="A joystick for geometry_msgs/Twist"
+    ><div class="grid">
+      <${Panel} title="What is driven"
+        ><div class="form">
+          <label
+            >Topic<input
+              class="mono"
+              list="twists"
+              value=${topic}
+              onInput=${(event) => {
+                arm(false);
+                setTopic(event.target.value);
+              }} /></label
+          ><datalist id="twists">${topics.map((each) => html`<option key=${each} value=${each} />`)}</datalist>
+          <label
+            >Fastest: ${(share * fastest.linear).toFixed(2)} m/s, ${(share * fastest.angular).toFixed(2)} rad/s<input
+              type="range"
+              min="0.05"
+              max="1"
+              step="0.05"
+              value=${share}
+              onInput=${(event) => setShare(Number(event.target.value))}
+          /></label>
+          <label class="row"
+            ><span
+              ><input
+                type="checkbox"
+                checked=${armed}
+                disabled=${!allowed}
+                onChange=${(event) => arm(event.target.checked)}
+              />${" "}The robot may move: I see it</span
+            ></label
+          >
+          <p class="muted">${allowed ? HELD : DENIED}</p>
+        </div><//
+      >
+      <${Panel} title="Joystick"
+        ><${Stick}
+          on=${allowed && armed}
+          take=${() => {
+            hold.current = ++connection.counter;
+          }}
+          send=${(linear, angular) =>
+            connection.send({
+              op: "drive",
+              topic,
+              linear: linear * share,
+              angular: angular * share,
+              hold: hold.current,
+              n: ++connection.counter,
+              at: connection.serverTime(),
+            })}
+          release=${() => connection.send({ op: "release", hold: hold.current })}
+      /><//></div
+  ><//>`;
 }
 
 function Stick({ on, take, send, release }) {
   const [at, setAt] = useState({ x: 0, y: 0 });
-  const held = useRef(null), pad = useRef(), pressed = useRef(new Set());
+  const held = useRef(null),
+    pad = useRef(),
+    pressed = useRef(new Set());
   const stop = () => {
     if (!held.current) return;
     clearInterval(held.current.timer);
@@ -39,7 +97,8 @@ function Stick({ on, take, send, release }) {
     const far = Math.max(1, Math.hypot(x, y));
     const next = { x: x / far, y: y / far };
     setAt(next);
-    if (held.current) return void Object.assign(held.current, next); // the timer sends it: pointers move 60 times a second
+    // The timer sends it: pointers move 60 times a second.
+    if (held.current) return void Object.assign(held.current, next);
     held.current = { ...next, timer: setInterval(() => command.current(held.current.y, -held.current.x), PERIOD) };
     take();
     send(next.y, -next.x);
@@ -52,19 +111,61 @@ function Stick({ on, take, send, release }) {
     const leave = () => end.current();
     addEventListener("blur", leave);
     document.addEventListener("visibilitychange", leave);
-    return () => { leave(); removeEventListener("blur", leave); document.removeEventListener("visibilitychange", leave); };
+    return () => {
+      leave();
+      removeEventListener("blur", leave);
+      document.removeEventListener("visibilitychange", leave);
+    };
   }, []);
-  useEffect(() => { if (!on) end.current(); }, [on]);
+  useEffect(() => {
+    if (!on) end.current();
+  }, [on]);
   const point = (event) => {
     const box = pad.current.getBoundingClientRect();
     go(((event.clientX - box.left) / box.width - 0.5) * 2.6, -((event.clientY - box.top) / box.height - 0.5) * 2.6);
   };
-  const keys = () => [...pressed.current].reduce(([x, y], key) => [x + KEYS[key][0] * 0.6, y + KEYS[key][1] * 0.6], [0, 0]);
-  return html`<svg ref=${pad} class="stick ${on ? "" : "off"}" viewBox="-130 -130 260 260" tabindex=${on ? 0 : -1} role="application" aria-label=${on ? "Joystick: hold, or press the arrow keys" : "Joystick, off"} aria-disabled=${String(!on)}
-    onPointerDown=${(event) => { if (on) { event.preventDefault(); pad.current.focus(); pad.current.setPointerCapture(event.pointerId); point(event); } }}
-    onPointerMove=${(event) => held.current && event.buttons && point(event)} onPointerUp=${stop} onPointerCancel=${stop} onLostPointerCapture=${stop} onBlur=${stop}
-    onKeyDown=${(event) => { if (on && KEYS[event.key]) { event.preventDefault(); if (!event.repeat) { pressed.current.add(event.key); go(...keys()); } } }}
-    onKeyUp=${(event) => { if (pressed.current.delete(event.key)) { if (pressed.current.size) go(...keys()); else stop(); } }}>
-    <circle class="base" r="100" /><path class="cross" d="M-100 0H100M0-100V100" /><circle class="knob" cx=${at.x * 70} cy=${-at.y * 70} r="34" /></svg>
+  const keys = () =>
+    [...pressed.current].reduce(([x, y], key) => [x + KEYS[key][0] * 0.6, y + KEYS[key][1] * 0.6], [0, 0]);
+  return html`<svg
+      ref=${pad}
+      class="stick ${on ? "" : "off"}"
+      viewBox="-130 -130 260 260"
+      tabindex=${on ? 0 : -1}
+      role="application"
+      aria-label=${on ? "Joystick: hold, or press the arrow keys" : "Joystick, off"}
+      aria-disabled=${String(!on)}
+      onPointerDown=${(event) => {
+        if (on) {
+          event.preventDefault();
+          pad.current.focus();
+          pad.current.setPointerCapture(event.pointerId);
+          point(event);
+        }
+      }}
+      onPointerMove=${(event) => held.current && event.buttons && point(event)}
+      onPointerUp=${stop}
+      onPointerCancel=${stop}
+      onLostPointerCapture=${stop}
+      onBlur=${stop}
+      onKeyDown=${(event) => {
+        if (on && KEYS[event.key]) {
+          event.preventDefault();
+          if (!event.repeat) {
+            pressed.current.add(event.key);
+            go(...keys());
+          }
+        }
+      }}
+      onKeyUp=${(event) => {
+        if (pressed.current.delete(event.key)) {
+          if (pressed.current.size) go(...keys());
+          else stop();
+        }
+      }}
+    >
+      <circle class="base" r="100" />
+      <path class="cross" d="M-100 0H100M0-100V100" />
+      <circle class="knob" cx=${at.x * 70} cy=${-at.y * 70} r="34" />
+    </svg>
     <p class="muted mono" aria-live="off">forward ${(at.y * 100).toFixed(0)} %, turn ${(-at.x * 100).toFixed(0)} %</p>`;
 }

@@ -5,7 +5,12 @@ import { section } from "../state.js";
 import { Choice, Page, Panel } from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
-const LEVELS = [["DEBUG", "All"], ["INFO", "Info"], ["WARN", "Warnings"], ["ERROR", "Errors"]];
+const LEVELS = [
+  ["DEBUG", "All"],
+  ["INFO", "Info"],
+  ["WARN", "Warnings"],
+  ["ERROR", "Errors"],
+];
 const RANK = { DEBUG: 0, INFO: 1, WARN: 2, ERROR: 3, FATAL: 4 };
 
 export function Log({ state, connection }) {
@@ -14,8 +19,31 @@ export function Log({ state, connection }) {
   const [held, hold] = useState(false);
   const own = section(state, "agent").name;
   const lines = useLog(connection, held);
-  const shown = lines.filter((line) => RANK[line.level] >= RANK[level] && `${line.node} ${line.text}`.toLowerCase().includes(text.toLowerCase()));
-  return html`<${Page} title="Log" kind=${`Of the nodes of ${own}, newest first. The log of other modules stays there: their own rmpa web shows it.`} aside=${html`<button type="button" aria-pressed=${String(held)} onClick=${() => hold(!held)}>${held ? "Go on" : "Hold"}</button>`}>
-    <div class="row filter-row"><${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} /><input class="filter" type="search" placeholder="Filter by text or node" aria-label="Filter by text or node" value=${text} onInput=${(event) => setText(event.target.value)} /></div>
-    <${Panel}><${Lines} lines=${shown} empty=${lines.length ? `No line is like that; ${lines.length} others are hidden.` : "No node of this module has written a line since rmpa web started."} /><//><//>`;
+  const shown = lines.filter(
+    (line) => RANK[line.level] >= RANK[level] && `${line.node} ${line.text}`.toLowerCase().includes(text.toLowerCase()),
+  );
+  return html`<${Page}
+    title="Log"
+    kind=${`Of the nodes of ${own}, newest first. The log of other modules stays there: their own rmpa web shows it.`}
+    aside=${html`<button type="button" aria-pressed=${String(held)} onClick=${() => hold(!held)}>
+      ${held ? "Go on" : "Hold"}
+    </button>`}
+  >
+    <div class="row filter-row">
+      <${Choice} label="Least level" value=${level} onChoose=${setLevel} options=${LEVELS} /><input
+        class="filter"
+        type="search"
+        placeholder="Filter by text or node"
+        aria-label="Filter by text or node"
+        value=${text}
+        onInput=${(event) => setText(event.target.value)}
+      />
+    </div>
+    <${Panel}
+      ><${Lines}
+        lines=${shown}
+        empty=${lines.length
+          ? `No line is like that; ${lines.length} others are hidden.`
+          : "No node of this module has written a line since rmpa web started."} /><//
+  ><//>`;
 }

@@ -8,7 +8,10 @@ import { NODE_COLUMNS, NodeRow } from "./nodes.js";
 import { TOPIC_COLUMNS, TopicRow, isData } from "./topics.js";
 import { Lines } from "../plot.js";
 
-const DIRECTIONS = [["bytes_in", "received"], ["bytes_out", "sent"]];
+const DIRECTIONS = [
+  ["bytes_in", "received"],
+  ["bytes_out", "sent"],
+];
 
 export function ModulePage({ name, state, connection }) {
   const module = section(state, "modules")[name];
@@ -19,37 +22,95 @@ export function ModulePage({ name, state, connection }) {
   const topics = all.filter(([topic]) => isData(topic, state));
   const resources = entries(state, "resources").filter(([, one]) => one.module === name);
   const nodes = entries(state, "nodes").filter(([, one]) => (one.module || section(state, "agent").name) === name);
-  return html`<${Page} title=${name} kind="Module" aside=${html`<${Mark} state=${module.state} />`}><div class="grid">
-    ${own ? html`<${Agent} agent=${section(state, "agent")} detail=${detail} />` : html`<${LinkPanel} module=${module} detail=${detail} />`}
-    ${!own && html`<${PeerAgent} name=${name} up=${module.state === "up" || module.state === "silent"} connection=${connection} version=${section(state, "agent").version} />
-    <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>
-    <${Panel} title="Way to it"><${Why} connection=${connection} kind="module" name=${name} /><//>`}
-    ${(module.error || (module.hidden || []).length > 0) && html`<${Panel} title="What is wrong">
-      ${module.error && html`<p class="failure">${module.error}</p>`}
-      ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//>`}
-    ${!own && html`<${Panel} title="Bytes a second on the link" wide><${Lines} label="Bytes a second" series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))} format=${bandwidth} /><//>`}
-    ${resources.length > 0 && html`<${Panel} title="Smart Resources"><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}>${resources.map(([key, one]) => html`<tr key=${key}><th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th><td><${Mark} state=${one.level} /></td><td>${one.profile || "none"}</td><td>${one.message}</td></tr>`)}<//><//>`}
-    ${nodes.length > 0 && html`<${Panel} title=${`Nodes of ${name}`}><${Table} caption="Nodes" columns=${NODE_COLUMNS} list=${nodes}>
-      ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//><//>`}
-    ${own && html`<${Counters} state=${state} connection=${connection} />`}
-    <${Panel} title=${`Topics of ${name}`} wide><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
-      ${all.length > topics.length && html`<details><summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary>
-        <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} /></details>`}<//>
-  </div><//>`;
+  return html`<${Page} title=${name} kind="Module" aside=${html`<${Mark} state=${module.state} />`}
+    ><div class="grid">
+      ${own
+        ? html`<${Agent} agent=${section(state, "agent")} detail=${detail} />`
+        : html`<${LinkPanel} module=${module} detail=${detail} />`}
+      ${!own &&
+      html`<${PeerAgent}
+          name=${name}
+          up=${module.state === "up" || module.state === "silent"}
+          connection=${connection}
+          version=${section(state, "agent").version}
+        />
+        <${Panel} title="Lanes"><${Lanes} lanes=${section(detail, "link").lanes} linked=${Boolean(detail.link)} /><//>
+        <${Panel} title="Way to it"><${Why} connection=${connection} kind="module" name=${name} /><//>`}
+      ${(module.error || (module.hidden || []).length > 0) &&
+      html`<${Panel} title="What is wrong">
+        ${module.error && html`<p class="failure">${module.error}</p>`}
+        ${(module.hidden || []).map((text) => html`<p class="failure" key=${text}>${text}</p>`)}<//
+      >`}
+      ${!own &&
+      html`<${Panel} title="Bytes a second on the link" wide
+        ><${Lines}
+          label="Bytes a second"
+          series=${DIRECTIONS.map(([key, text]) => ({ label: text, value: module[key] }))}
+          format=${bandwidth}
+      /><//>`}
+      ${resources.length > 0 &&
+      html`<${Panel} title="Smart Resources"
+        ><${Table} caption="Smart Resources" columns=${["Resource", "Quality", "Profile", "Says"]}
+          >${resources.map(
+            ([key, one]) =>
+              html`<tr key=${key}>
+                <th scope="row"><${Link} page="resource" name=${key}>${one.name}<//></th>
+                <td><${Mark} state=${one.level} /></td>
+                <td>${one.profile || "none"}</td>
+                <td>${one.message}</td>
+              </tr>`,
+          )}<//
+        ><//
+      >`}
+      ${nodes.length > 0 &&
+      html`<${Panel} title=${`Nodes of ${name}`}
+        ><${Table} caption="Nodes" columns=${NODE_COLUMNS} list=${nodes}>
+          ${([key, one]) => html`<${NodeRow} key=${key} name=${key} node=${one} />`}<//
+        ><//
+      >`}
+      ${own && html`<${Counters} state=${state} connection=${connection} />`}
+      <${Panel} title=${`Topics of ${name}`} wide
+        ><${TopicTable} list=${topics} empty=${all.length ? "It publishes no data." : "It publishes no topic."} />
+        ${all.length > topics.length &&
+        html`<details>
+          <summary>${all.length - topics.length} of its Smart Resources, about themselves, and of the log</summary>
+          <${TopicTable} list=${all.filter(([topic]) => !isData(topic, state))} />
+        </details>`}<//
+      >
+    </div><//
+  >`;
 }
 
-const TopicTable = ({ list, empty }) => html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
-  ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//>`;
+const TopicTable = ({ list, empty }) =>
+  html`<${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty=${empty} list=${list}>
+    ${([topic, one]) => html`<${TopicRow} key=${topic} name=${topic} topic=${one} />`}<//
+  >`;
 
 const LinkPanel = ({ module, detail }) => {
   const link = section(detail, "link");
-  return html`<${Panel} title="Link"><${Facts} rows=${[
-    ["State", html`<${Mark} state=${module.state} />`], ["For", module.since && html`<${Uptime} since=${module.since} />`], ["Address", module.remote],
-    ["Round trip", seconds(module.rtt)], ["Clock offset", bounded(module.offset, module.offset_error)], ["In", bandwidth(module.bytes_in)], ["Out", bandwidth(module.bytes_out)],
-    ["Waiting to be sent", module.queued ? bytes(module.queued) : undefined], ["Dropped, link too slow", module.dropped ? count(module.dropped) : undefined],
-    ["Topics that it offers", count(module.topics_in)], ["Topics that it is offered", count(module.topics_out)], ["Direct subscribers here", module.direct_in || undefined],
-    ["Direct subscribers there", module.direct_out || undefined], ["Relayed by", module.via], ["Found by", module.source],
-    ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"], ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined], ["GUID", html`<code>${module.guid}</code>`]]} /><//>`;
+  return html`<${Panel} title="Link"
+    ><${Facts}
+      rows=${[
+        ["State", html`<${Mark} state=${module.state} />`],
+        ["For", module.since && html`<${Uptime} since=${module.since} />`],
+        ["Address", module.remote],
+        ["Round trip", seconds(module.rtt)],
+        ["Clock offset", bounded(module.offset, module.offset_error)],
+        ["In", bandwidth(module.bytes_in)],
+        ["Out", bandwidth(module.bytes_out)],
+        ["Waiting to be sent", module.queued ? bytes(module.queued) : undefined],
+        ["Dropped, link too slow", module.dropped ? count(module.dropped) : undefined],
+        ["Topics that it offers", count(module.topics_in)],
+        ["Topics that it is offered", count(module.topics_out)],
+        ["Direct subscribers here", module.direct_in || undefined],
+        ["Direct subscribers there", module.direct_out || undefined],
+        ["Relayed by", module.via],
+        ["Found by", module.source],
+        ["Dialled by", link.dialled === undefined ? undefined : link.dialled ? "this module" : "the peer"],
+        ["Next attempt in", detail.next_attempt !== undefined ? seconds(detail.next_attempt) : undefined],
+        ["GUID", html`<code>${module.guid}</code>`],
+      ]}
+  /><//>`;
 };
 
 const PEER_PERIOD = 2; // seconds between two questions to a peer's agent while its page is open
@@ -57,24 +118,102 @@ const PEER_PERIOD = 2; // seconds between two questions to a peer's agent while 
 // What a peer's agent tells of itself. One of an earlier release does not know the question.
 function PeerAgent({ name, up, connection, version }) {
   const { value, failure } = useAnswer(connection, "agent", { peer: name }, PEER_PERIOD, String(up));
-  return html`<${Panel} title="Agent">${value ? html`<${Facts} rows=${[["Version", value.version === version ? value.version : html`<${Mark} state="WARN" word=${`${value.version || "not told"}, here ${version}`} />`], ["Runs for", duration(value.uptime)],
-      ["CPU", value.cpu != null ? html`${percent(value.cpu)} of a core` : "not told by this peer"], ["Memory", value.rss != null ? bytes(value.rss) : "not told by this peer"], ["Open files", value.files_open != null && value.files_limit != null ? `${count(value.files_open)} of ${count(value.files_limit)}` : undefined], ["Proxies", value.proxies != null ? count(value.proxies) : undefined], ["Core", html`<code>${value.core_uri}</code>`]]} />`
-    : html`<p class="empty">${!failure ? "Asking …" : !up ? "Not known without a link." : `Version and CPU are not told by this peer: ${failure.error}`}</p>`}<//>`;
+  return html`<${Panel} title="Agent"
+    >${value
+      ? html`<${Facts}
+          rows=${[
+            [
+              "Version",
+              value.version === version
+                ? value.version
+                : html`<${Mark} state="WARN" word=${`${value.version || "not told"}, here ${version}`} />`,
+            ],
+            ["Runs for", duration(value.uptime)],
+            ["CPU", value.cpu != null ? html`${percent(value.cpu)} of a core` : "not told by this peer"],
+            ["Memory", value.rss != null ? bytes(value.rss) : "not told by this peer"],
+            [
+              "Open files",
+              value.files_open != null && value.files_limit != null
+                ? `${count(value.files_open)} of ${count(value.files_limit)}`
+                : undefined,
+            ],
+            ["Proxies", value.proxies != null ? count(value.proxies) : undefined],
+            ["Core", html`<code>${value.core_uri}</code>`],
+          ]}
+        />`
+      : html`<p class="empty">
+          ${!failure
+            ? "Asking …"
+            : !up
+              ? "Not known without a link."
+              : `Version and CPU are not told by this peer: ${failure.error}`}
+        </p>`}<//
+  >`;
 }
 
 const PURPOSE = { express: "control, small messages", bulk: "large messages" };
-const Lanes = ({ lanes, linked }) => linked && !(lanes || []).length ? html`<p class="empty">The agent does not tell of lanes.</p>` : html`<${Table} caption="Lanes" columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]} empty="It has no link.">${(lanes || []).map((lane) => html`<tr key=${lane.name}><th scope="row">${lane.name}<div class="muted">${PURPOSE[lane.name] || ""}</div></th>
-  <td><${Mark} state=${lane.connected ? "up" : lane.unneeded ? "away" : "linking"} word=${lane.connected ? "connected" : lane.unneeded ? "not needed now" : "no connection"} /></td><td class="number">${bytes(lane.bytes_in)}</td><td class="number">${bytes(lane.bytes_out)}</td><td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td><td class="number">${count(lane.dropped)}</td></tr>`)}<//>`;
+const Lanes = ({ lanes, linked }) =>
+  linked && !(lanes || []).length
+    ? html`<p class="empty">The agent does not tell of lanes.</p>`
+    : html`<${Table}
+        caption="Lanes"
+        columns=${["Lane", "State", "#In", "#Out", "#Waiting", "#Dropped"]}
+        empty="It has no link."
+        >${(lanes || []).map(
+          (lane) =>
+            html`<tr key=${lane.name}>
+              <th scope="row">
+                ${lane.name}
+                <div class="muted">${PURPOSE[lane.name] || ""}</div>
+              </th>
+              <td>
+                <${Mark}
+                  state=${lane.connected ? "up" : lane.unneeded ? "away" : "linking"}
+                  word=${lane.connected ? "connected" : lane.unneeded ? "not needed now" : "no connection"}
+                />
+              </td>
+              <td class="number">${bytes(lane.bytes_in)}</td>
+              <td class="number">${bytes(lane.bytes_out)}</td>
+              <td class="number">${lane.queued ? bytes(lane.queued) : "–"}</td>
+              <td class="number">${count(lane.dropped)}</td>
+            </tr>`,
+        )}<//
+      >`;
 
-const Agent = ({ agent, detail }) => html`<${Panel} title="Agent"><${Facts} rows=${[
-  ["Version", agent.version], ["Runs for", html`<${Since} moment=${agent.started} />`], ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined], ["Memory", bytes(agent.rss)],
-  ["Open files", agent.files_limit && `${count(agent.files_open)} of ${count(agent.files_limit)}`], ["Proxies", count(agent.proxies)], ["Domain", agent.domain], ["Core", html`<code>${agent.core_uri}</code>`],
-  ["Addresses", (agent.addresses || []).join(", ")], ["Settings", agent.config_file], ["Process", agent.pid], ["Core's memory", agent.core_memory], ["Connections of vanished hosts", detail.end_connections || undefined], ["Real time", (agent.realtime || []).join("; ")], ["GUID", html`<code>${agent.guid}</code>`]]} />
-  ${agent.files_problem && html`<p class="failure">${agent.files_problem}</p>`}<//>`;
+const Agent = ({ agent, detail }) =>
+  html`<${Panel} title="Agent"
+    ><${Facts}
+      rows=${[
+        ["Version", agent.version],
+        ["Runs for", html`<${Since} moment=${agent.started} />`],
+        ["CPU", agent.cpu !== undefined ? html`${percent(agent.cpu)} of a core` : undefined],
+        ["Memory", bytes(agent.rss)],
+        ["Open files", agent.files_limit && `${count(agent.files_open)} of ${count(agent.files_limit)}`],
+        ["Proxies", count(agent.proxies)],
+        ["Domain", agent.domain],
+        ["Core", html`<code>${agent.core_uri}</code>`],
+        ["Addresses", (agent.addresses || []).join(", ")],
+        ["Settings", agent.config_file],
+        ["Process", agent.pid],
+        ["Core's memory", agent.core_memory],
+        ["Connections of vanished hosts", detail.end_connections || undefined],
+        ["Real time", (agent.realtime || []).join("; ")],
+        ["GUID", html`<code>${agent.guid}</code>`],
+      ]}
+    />
+    ${agent.files_problem && html`<p class="failure">${agent.files_problem}</p>`}<//
+  >`;
 
 const Counters = ({ state, connection }) => {
   const counters = entries(section(state, "detail"), "counters:");
   connection.look([...new Map([...connection.looks, ["counters", ""]].map((each) => [each.join(), each])).values()]);
-  return html`<${Panel} title="Counted by the agent"><${Table} caption="Counters" columns=${["Reason", "#Count"]} list=${counters}>
-    ${([name, value]) => html`<tr key=${name}><th scope="row"><code>${name}</code></th><td class="number">${count(value)}</td></tr>`}<//><//>`;
+  return html`<${Panel} title="Counted by the agent"
+    ><${Table} caption="Counters" columns=${["Reason", "#Count"]} list=${counters}>
+      ${([name, value]) =>
+        html`<tr key=${name}>
+          <th scope="row"><code>${name}</code></th>
+          <td class="number">${count(value)}</td>
+        </tr>`}<//
+    ><//
+  >`;
 };

@@ -3,14 +3,39 @@
 import { html, useState } from "../markup.js";
 import { count, hertz } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Link, Mark, ModuleLink, NodeLink, Page, Panel, Table, memo, useAnswer } from "../parts.js";
+import {
+  Facts,
+  Failure,
+  Gone,
+  Link,
+  Mark,
+  ModuleLink,
+  NodeLink,
+  Page,
+  Panel,
+  Table,
+  memo,
+  useAnswer,
+} from "../parts.js";
 import { Lines, useLog } from "../loglines.js";
 
 const NODE_PERIOD = 5; // seconds after which the node that is shown is asked again
 
-export const NodeRow = memo(({ name, node, own }) => html`<tr><th scope="row"><${NodeLink} name=${name}>${node.name}<//>${node.problem && html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}</th>
-  ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}<td class="number">${node.publishes || 0}</td><td class="number">${node.module ? "–" : node.subscribes || 0}</td><td class="number">${node.serves || 0}</td></tr>`);
-export const NODE_COLUMNS = ["Node", "#Publishes", "#Subscribes", "#Services"]; // where the module is clear; `own` is left out then
+export const NodeRow = memo(
+  ({ name, node, own }) =>
+    html`<tr>
+      <th scope="row">
+        <${NodeLink} name=${name}>${node.name}<//>${node.problem &&
+        html`<div class="muted"><${Mark} state="WARN" word="" />${node.problem}</div>`}
+      </th>
+      ${own && html`<td><${ModuleLink} name=${node.module || own} /></td>`}
+      <td class="number">${node.publishes || 0}</td>
+      <td class="number">${node.module ? "–" : node.subscribes || 0}</td>
+      <td class="number">${node.serves || 0}</td>
+    </tr>`,
+);
+// Where the module is clear; `own` is left out then.
+export const NODE_COLUMNS = ["Node", "#Publishes", "#Subscribes", "#Services"];
 
 export function Nodes({ state }) {
   const [text, setText] = useState("");
@@ -19,48 +44,162 @@ export function Nodes({ state }) {
   const shown = all.filter(([name, one]) => `${name} ${one.module || own}`.toLowerCase().includes(text.toLowerCase()));
   const hidden = section(state, "hidden").nodes;
   return html`<${Page} title="Nodes" kind=${`${all.length} in all modules`}>
-    <input class="filter" type="search" placeholder="Filter by name or module" aria-label="Filter by name or module" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Nodes" columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]} empty="No node is like that." list=${shown}>
-      ${([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`}<//>
-    <p class="empty">${hidden ? `The server leaves out ${hidden} further nodes. ` : ""}Of peers, the nodes that offer something to this module.</p><//><//>`;
+    <input
+      class="filter"
+      type="search"
+      placeholder="Filter by name or module"
+      aria-label="Filter by name or module"
+      value=${text}
+      onInput=${(event) => setText(event.target.value)}
+    />
+    <${Panel}
+      ><${Table}
+        caption="Nodes"
+        columns=${["Node", "Module", ...NODE_COLUMNS.slice(1)]}
+        empty="No node is like that."
+        list=${shown}
+      >
+        ${([name, one]) => html`<${NodeRow} key=${name} name=${name} node=${one} own=${own} />`}<//
+      >
+      <p class="empty">
+        ${hidden ? `The server leaves out ${hidden} further nodes. ` : ""}Of peers, the nodes that offer something to
+        this module.
+      </p><//
+    ><//
+  >`;
 }
 
 export function NodePage({ name, state, connection }) {
   const own = section(state, "agent").name;
   const at = name.indexOf(":");
-  const peer = at > 0 ? name.slice(0, at) : "", node = name.slice(at + 1);
+  const peer = at > 0 ? name.slice(0, at) : "",
+    node = name.slice(at + 1);
   const known = section(state, "nodes")[name];
   const detail = section(section(state, "detail"), `node:${name}`);
   const { value: facts, failure } = useAnswer(connection, "node", { name: node, peer }, NODE_PERIOD);
   const topics = section(state, "topics");
   // What its own module knows is more: a node of a peer has topics that do not cross.
   const list = (kind, told) => [...new Set([...(detail[kind] || []), ...(told || [])])].sort();
-  const publishes = list("publishes", facts && Object.keys(facts.publications)), subscribes = list("subscribes", facts && Object.keys(facts.subscriptions));
+  const publishes = list("publishes", facts && Object.keys(facts.publications)),
+    subscribes = list("subscribes", facts && Object.keys(facts.subscriptions));
   const services = list("services", facts && facts.services.map((each) => (peer ? `${peer}:${each}` : each)));
-  if (!known && !facts) return html`<${Page} title=${node} kind=${`Node of ${peer || own}`}>${failure ? html`<${Failure} failure=${failure} />` : html`<${Gone} kind="node" name=${name} />`}<//>`;
+  if (!known && !facts)
+    return html`<${Page} title=${node} kind=${`Node of ${peer || own}`}
+      >${failure ? html`<${Failure} failure=${failure} />` : html`<${Gone} kind="node" name=${name} />`}<//
+    >`;
   const problem = detail.problem || facts?.problem;
-  return html`<${Page} title=${node} kind=${html`Node of <${ModuleLink} name=${peer || own} />`} aside=${facts && html`<${Mark} state=${facts.problem ? "ERROR" : "OK"} word=${facts.problem ? "does not answer" : "answers"} />`}><div class="grid">
-    <${Panel} title="Node"><${Facts} rows=${[["Module", html`<${ModuleLink} name=${peer || own} />`], ["Process", facts?.pid], ["Address of its API", facts && html`<code>${facts.uri}</code>`],
-      ["Publishes", count(publishes.length)], ["Subscribes", facts || !peer ? count(subscribes.length) : undefined], ["Services", count(services.length)]]} />
-      ${problem && html`<p class="failure">${problem}</p>`}
-      ${failure && html`<p class="empty">The node cannot be asked: ${failure.error}. ${failure.remedy}</p>`}<//>
-    <${Panel} title="Services"><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service." list=${services}>${(each) => { const service = section(state, "services")[each]; return html`<tr key=${each}><th scope="row">${service ? html`<${Link} page="service" name=${each}>${service.name}<//>` : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}</th><td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td></tr>`; }}<//><//>
-    ${[["Publishes", publishes, facts?.publications, "It publishes nothing."], ["Subscribes", subscribes, facts?.subscriptions, peer && !facts ? "Not known: only its own module knows what it subscribes to." : "It subscribes to nothing."]].map(([title, names, types, empty]) => html`<${Panel} key=${title} title=${title}>
-      <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty} list=${names}>${(each) => html`<tr key=${each}><th scope="row">${topics[each] ? html`<${Link} page="topic" name=${each} />` : html`<span class="mono">${each}</span>`}</th><td class="muted">${topics[each]?.type || types?.[each] || ""}</td><td class="number">${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}</td></tr>`}<//><//>`)}
-    <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
-    <${NodeLog} node=${node} peer=${peer} connection=${connection} />
-  </div><//>`;
+  return html`<${Page}
+    title=${node}
+    kind=${html`Node of <${ModuleLink} name=${peer || own} />`}
+    aside=${facts &&
+    html`<${Mark} state=${facts.problem ? "ERROR" : "OK"} word=${facts.problem ? "does not answer" : "answers"} />`}
+    ><div class="grid">
+      <${Panel} title="Node"
+        ><${Facts}
+          rows=${[
+            ["Module", html`<${ModuleLink} name=${peer || own} />`],
+            ["Process", facts?.pid],
+            ["Address of its API", facts && html`<code>${facts.uri}</code>`],
+            ["Publishes", count(publishes.length)],
+            ["Subscribes", facts || !peer ? count(subscribes.length) : undefined],
+            ["Services", count(services.length)],
+          ]}
+        />
+        ${problem && html`<p class="failure">${problem}</p>`}
+        ${failure && html`<p class="empty">The node cannot be asked: ${failure.error}. ${failure.remedy}</p>`}<//
+      >
+      <${Panel} title="Services"
+        ><${Table} caption="Services" columns=${["Service", "Type"]} empty="It offers no service." list=${services}
+          >${(each) => {
+            const service = section(state, "services")[each];
+            return html`<tr key=${each}>
+              <th scope="row">
+                ${service
+                  ? html`<${Link} page="service" name=${each}>${service.name}<//>`
+                  : html`<span class="mono">${each.slice(each.indexOf(":") + 1)}</span>`}
+              </th>
+              <td class="muted">${service ? service.type || "not asked yet" : "not known here"}</td>
+            </tr>`;
+          }}<//
+        ><//
+      >
+      ${[
+        ["Publishes", publishes, facts?.publications, "It publishes nothing."],
+        [
+          "Subscribes",
+          subscribes,
+          facts?.subscriptions,
+          peer && !facts ? "Not known: only its own module knows what it subscribes to." : "It subscribes to nothing.",
+        ],
+      ].map(
+        ([title, names, types, empty]) =>
+          html`<${Panel} key=${title} title=${title}>
+            <${Table} caption=${title} columns=${["Topic", "Type", "#Rate"]} empty=${empty} list=${names}
+              >${(each) =>
+                html`<tr key=${each}>
+                  <th scope="row">
+                    ${topics[each]
+                      ? html`<${Link} page="topic" name=${each} />`
+                      : html`<span class="mono">${each}</span>`}
+                  </th>
+                  <td class="muted">${topics[each]?.type || types?.[each] || ""}</td>
+                  <td class="number">
+                    ${topics[each] ? hertz(topics[each].rate) : html`<span class="muted">not known here</span>`}
+                  </td>
+                </tr>`}<//
+            ><//
+          >`,
+      )}
+      <${Connections} facts=${facts} failure=${failure} module=${peer || own} own=${own} />
+      <${NodeLog} node=${node} peer=${peer} connection=${connection} /></div
+  ><//>`;
 }
 
 // The agent of a module is a node of its graph: it takes messages to and from peers.
-const OtherEnd = ({ name, module, own }) => (name === "/rmpa" || name.endsWith(":/rmpa") ? html`the agent of <${ModuleLink} name=${module} />` : name.includes("://") ? html`<code>${name}</code>` : html`<${NodeLink} name=${name.startsWith(`${own}:`) ? name.slice(own.length + 1) : name} />`);
+const OtherEnd = ({ name, module, own }) =>
+  name === "/rmpa" || name.endsWith(":/rmpa")
+    ? html`the agent of <${ModuleLink} name=${module} />`
+    : name.includes("://")
+      ? html`<code>${name}</code>`
+      : html`<${NodeLink} name=${name.startsWith(`${own}:`) ? name.slice(own.length + 1) : name} />`;
 
-const Connections = ({ facts, failure, module, own }) => html`<${Panel} title="Connections" wide>${facts && !facts.connections
-  ? html`<p class="empty">${facts.problem ? "Not known: the node does not answer." : "Not told by this peer: its agent is of an earlier release."}</p>`
-  : html`<${Table} caption="Connections" columns=${["Topic", "Way", "Other end", "State"]} empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"} list=${facts?.connections || []}>${(one, at) => html`<tr key=${at}><th scope="row"><${Link} page="topic" name=${one.topic} /></th><td class="muted">${one.inbound ? "← from" : "→ to"}</td>
-    <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td><td><${Mark} state=${one.connected ? "up" : "silent"} word=${one.connected ? "connected" : "not connected"} /></td></tr>`}<//>`}<//>`;
+const Connections = ({ facts, failure, module, own }) =>
+  html`<${Panel} title="Connections" wide
+    >${facts && !facts.connections
+      ? html`<p class="empty">
+          ${facts.problem
+            ? "Not known: the node does not answer."
+            : "Not told by this peer: its agent is of an earlier release."}
+        </p>`
+      : html`<${Table}
+          caption="Connections"
+          columns=${["Topic", "Way", "Other end", "State"]}
+          empty=${facts ? "It has no connection." : failure ? "Not known: the node cannot be asked." : "Asking …"}
+          list=${facts?.connections || []}
+          >${(one, at) =>
+            html`<tr key=${at}>
+              <th scope="row"><${Link} page="topic" name=${one.topic} /></th>
+              <td class="muted">${one.inbound ? "← from" : "→ to"}</td>
+              <td><${OtherEnd} name=${one.other} module=${module} own=${own} /></td>
+              <td>
+                <${Mark}
+                  state=${one.connected ? "up" : "silent"}
+                  word=${one.connected ? "connected" : "not connected"}
+                />
+              </td>
+            </tr>`}<//
+        >`}<//
+  >`;
 
 function NodeLog({ node, peer, connection }) {
   const lines = useLog(connection, false).filter((line) => line.node === node);
-  return html`<${Panel} title="Log" wide>${peer ? html`<p class="empty">Lines of the log stay in their module: ask <code>rmpa web</code> of ${peer}.</p>` : html`<${Lines} lines=${lines.slice(0, 100)} empty="It has written no line since rmpa web started." bare=${true} />`}<//>`;
+  return html`<${Panel} title="Log" wide
+    >${peer
+      ? html`<p class="empty">Lines of the log stay in their module: ask <code>rmpa web</code> of ${peer}.</p>`
+      : html`<${Lines}
+          lines=${lines.slice(0, 100)}
+          empty="It has written no line since rmpa web started."
+          bare=${true}
+        />`}<//
+  >`;
 }

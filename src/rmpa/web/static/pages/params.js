@@ -12,13 +12,18 @@ export function grow(values) {
   for (const [name, value] of Object.entries(values)) {
     const steps = name.split("/").filter(Boolean);
     let at = root;
-    for (const step of steps.slice(0, -1)) at = at[step] && typeof at[step] === "object" && !Array.isArray(at[step]) ? at[step] : (at[step] = Object.create(null));
+    for (const step of steps.slice(0, -1))
+      at =
+        at[step] && typeof at[step] === "object" && !Array.isArray(at[step])
+          ? at[step]
+          : (at[step] = Object.create(null));
     at[steps[steps.length - 1]] = value;
   }
   return root;
 }
 
-const PEER_PERIOD = 3000; // milliseconds after which a peer's parameters are read again; this module's core tells its changes
+// Milliseconds after which a peer's parameters are read again; this module's core tells its changes.
+const PEER_PERIOD = 3000;
 
 export function Params({ name, state, connection }) {
   const own = section(state, "agent").name;
@@ -35,36 +40,89 @@ export function Params({ name, state, connection }) {
     setFailure(null);
   };
   const open = connection.phase === "open";
-  const ask = (what, args = {}) => connection.ask(what, { peer, ...args }).then((answer) => { take(answer); return answer; });
+  const ask = (what, args = {}) =>
+    connection.ask(what, { peer, ...args }).then((answer) => {
+      take(answer);
+      return answer;
+    });
   const read = (args) => ask("params", args).catch(setFailure);
-  useEffect(() => { shown.current = { peer }; setValues(null); }, [module]);
-  useEffect(() => { if (open) read(); }, [module, open]); // what was read stays while there is no connection
+  useEffect(() => {
+    shown.current = { peer };
+    setValues(null);
+  }, [module]);
+  useEffect(() => {
+    if (open) read();
+  }, [module, open]); // what was read stays while there is no connection
   // Changes by others: this module's core tells them, a peer is asked while the page is seen.
-  useEffect(() => { if (open && !peer && shown.current.digest) read({ has: shown.current.digest }); }, [state.parameters]);
+  useEffect(() => {
+    if (open && !peer && shown.current.digest) read({ has: shown.current.digest });
+  }, [state.parameters]);
   useEffect(() => {
     if (!peer || !open) return undefined;
-    const timer = setInterval(() => document.hidden || !shown.current.digest || read({ has: shown.current.digest }), PEER_PERIOD);
+    const timer = setInterval(
+      () => document.hidden || !shown.current.digest || read({ has: shown.current.digest }),
+      PEER_PERIOD,
+    );
     return () => clearInterval(timer);
   }, [module, open]);
-  const choices = entries(state, "modules").filter(([, one]) => one.state === "up" || one.state === "here").map(([name]) => [name, name]);
+  const choices = entries(state, "modules")
+    .filter(([, one]) => one.state === "up" || one.state === "here")
+    .map(([each]) => [each, each]);
   return html`<${Page} title="Parameters" kind=${`Of the core of ${module}`}>
-    <div class="row filter-row"><${Choice} label="Module" value=${module} onChoose=${setModule} options=${choices} /></div>
+    <div class="row filter-row">
+      <${Choice} label="Module" value=${module} onChoose=${setModule} options=${choices} />
+    </div>
     <${Failure} failure=${failure} />
-    <${Panel}><input class="filter" type="search" placeholder="Filter by name" aria-label="Filter by name" value=${text} onInput=${(event) => setText(event.target.value)} />
-      ${values ? html`<div class="tree"><${Namespace} tree=${grow(values)} path="" text=${text.toLowerCase()} may=${connection.may("control")} ask=${ask} /></div>` : !failure && html`<p class="empty">Reading …</p>`}<//>
-    ${connection.may("control") && html`<${Panel} title="Set a parameter"><${Setter} ask=${ask} /><//>`}<//>`;
+    <${Panel}
+      ><input
+        class="filter"
+        type="search"
+        placeholder="Filter by name"
+        aria-label="Filter by name"
+        value=${text}
+        onInput=${(event) => setText(event.target.value)}
+      />
+      ${values
+        ? html`<div class="tree">
+            <${Namespace}
+              tree=${grow(values)}
+              path=""
+              text=${text.toLowerCase()}
+              may=${connection.may("control")}
+              ask=${ask}
+            />
+          </div>`
+        : !failure && html`<p class="empty">Reading …</p>`}<//
+    >
+    ${connection.may("control") && html`<${Panel} title="Set a parameter"><${Setter} ask=${ask} /><//>`}<//
+  >`;
 }
 
-const holds = (value, path, text) => path.toLowerCase().includes(text) || (isTree(value) && Object.entries(value).some(([key, inner]) => holds(inner, `${path}/${key}`, text)));
+const holds = (value, path, text) =>
+  path.toLowerCase().includes(text) ||
+  (isTree(value) && Object.entries(value).some(([key, inner]) => holds(inner, `${path}/${key}`, text)));
 const isTree = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
 
 function Namespace({ tree, path, text, may, ask }) {
-  const rows = Object.entries(tree).filter(([key, value]) => holds(value, `${path}/${key}`, text)).sort(([a], [b]) => a.localeCompare(b));
+  const rows = Object.entries(tree)
+    .filter(([key, value]) => holds(value, `${path}/${key}`, text))
+    .sort(([a], [b]) => a.localeCompare(b));
   const [first, more] = useFirst(rows);
   if (!rows.length) return html`<p class="empty">No parameter is like that.</p>`;
-  return html`<ul>${first.map(([key, value]) => html`<li key=${key}>${isTree(value)
-    ? html`<details open><summary><span class="key">${key}/</span></summary><${Namespace} tree=${value} path=${`${path}/${key}`} text=${text} may=${may} ask=${ask} /></details>`
-    : html`<${Leaf} name=${`${path}/${key}`} short=${key} value=${value} may=${may} ask=${ask} />`}</li>`)}</ul>${more}`;
+  return html`<ul>
+      ${first.map(
+        ([key, value]) =>
+          html`<li key=${key}>
+            ${isTree(value)
+              ? html`<details open>
+                  <summary><span class="key">${key}/</span></summary>
+                  <${Namespace} tree=${value} path=${`${path}/${key}`} text=${text} may=${may} ask=${ask} />
+                </details>`
+              : html`<${Leaf} name=${`${path}/${key}`} short=${key} value=${value} may=${may} ask=${ask} />`}
+          </li>`,
+      )}
+    </ul>
+    ${more}`;
 }
 
 function Leaf({ name, short, value, may, ask }) {
@@ -74,12 +132,22 @@ function Leaf({ name, short, value, may, ask }) {
   const save = (draft) => {
     const typed = another(draft, value);
     if (typed.error) return Promise.resolve({ failure: typed });
-    return ask("set_param", { name, value: typed.value }).then(() => ({}), (failure) => ({ failure }));
+    return ask("set_param", { name, value: typed.value }).then(
+      () => ({}),
+      (refused) => ({ failure: refused }),
+    );
   };
   const remove = () => (sure ? ask("delete_param", { name }).catch(setFailure) : setSure(true));
   if (!may) return html`<span class="key">${short}:</span> ${written}`;
-  return html`<span class="key">${short}:</span> <${Editable} label=${name} shown=${written} begin=${written} save=${save}>
-    <button type="button" onClick=${remove}>${sure ? "Really delete it" : "Delete"}</button><${Failure} failure=${failure} /><//>`;
+  return html`<span class="key">${short}:</span>${" "}<${Editable}
+      label=${name}
+      shown=${written}
+      begin=${written}
+      save=${save}
+    >
+      <button type="button" onClick=${remove}>${sure ? "Really delete it" : "Delete"}</button
+      ><${Failure} failure=${failure}
+    /><//>`;
 }
 
 function Setter({ ask }) {
@@ -91,13 +159,22 @@ function Setter({ ask }) {
     event.preventDefault();
     if (typed.error) return set({ failure: typed });
     const said = `${name} is the ${kind(typed.value)} ${JSON.stringify(typed.value)}`;
-    ask("set_param", { name, value: typed.value }).then(() => set({ said }), (failure) => set({ failure }));
+    ask("set_param", { name, value: typed.value }).then(
+      () => set({ said }),
+      (failure) => set({ failure }),
+    );
   };
-  const edit = (take) => (event) => { take(event.target.value); set({}); };
+  const edit = (take) => (event) => {
+    take(event.target.value);
+    set({});
+  };
   return html`<form class="row" onSubmit=${save}>
     <label>Name<input class="mono" value=${name} onInput=${edit(setName)} /></label>
     <label>Value: JSON, or text<input class="mono" value=${text} onInput=${edit(setText)} /></label>
     <button class="primary">Set</button>
-    <p role="status" class="muted said">${state.said || (text && !typed.error && `It is sent as a ${kind(typed.value)}.`)}</p>
-    <${Failure} failure=${state.failure} /></form>`;
+    <p role="status" class="muted said">
+      ${state.said || (text && !typed.error && `It is sent as a ${kind(typed.value)}.`)}
+    </p>
+    <${Failure} failure=${state.failure} />
+  </form>`;
 }

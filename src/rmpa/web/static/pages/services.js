@@ -3,13 +3,40 @@
 import { html, useState } from "../markup.js";
 import { count, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Facts, Failure, Gone, Link, ModuleLink, NodeLink, Page, Panel, Question, Table, Why, memo, nodeKey } from "../parts.js";
+import {
+  Facts,
+  Failure,
+  Gone,
+  Link,
+  ModuleLink,
+  NodeLink,
+  Page,
+  Panel,
+  Question,
+  Table,
+  Why,
+  memo,
+  nodeKey,
+} from "../parts.js";
 import { json } from "../typed.js";
 
 const STATES = { home: "stays in its module", hidden: "hidden here", idle: "not in use", open: "in use" };
 
-const Row = memo(({ name, service, own }) => html`<tr><th scope="row"><${Link} page="service" name=${name}>${service.name}<//>${service.problem && html`<div class="muted">${service.problem}</div>`}</th>
-  <td><${ModuleLink} name=${service.module || own} /></td><td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td><td>${service.type || html`<span class="muted">not asked yet</span>`}</td><td>${STATES[service.state] || service.state}</td><td class="number">${count(service.calls || 0)}</td><td class="number">${count(service.failed || 0)}</td></tr>`);
+const Row = memo(
+  ({ name, service, own }) =>
+    html`<tr>
+      <th scope="row">
+        <${Link} page="service" name=${name}>${service.name}<//>${service.problem &&
+        html`<div class="muted">${service.problem}</div>`}
+      </th>
+      <td><${ModuleLink} name=${service.module || own} /></td>
+      <td><${NodeLink} name=${nodeKey(service.module, service.node)}>${service.node}<//></td>
+      <td>${service.type || html`<span class="muted">not asked yet</span>`}</td>
+      <td>${STATES[service.state] || service.state}</td>
+      <td class="number">${count(service.calls || 0)}</td>
+      <td class="number">${count(service.failed || 0)}</td>
+    </tr>`,
+);
 
 export function Services({ state }) {
   const [text, setText] = useState("");
@@ -17,10 +44,29 @@ export function Services({ state }) {
   const hidden = section(state, "hidden").services;
   const shown = all.filter(([name, one]) => `${name} ${one.type || ""}`.toLowerCase().includes(text.toLowerCase()));
   return html`<${Page} title="Services" kind=${`${all.length} in all modules`}>
-    <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Services" columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]} empty="No service is like that." list=${shown}>
-      ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//>
-    ${hidden && html`<p class="empty">${count(hidden)} more services are not listed: <code>rmpa service list</code> has them.</p>`}<//><//>`;
+    <input
+      class="filter"
+      type="search"
+      placeholder="Filter by name or type"
+      aria-label="Filter by name or type"
+      value=${text}
+      onInput=${(event) => setText(event.target.value)}
+    />
+    <${Panel}
+      ><${Table}
+        caption="Services"
+        columns=${["Service", "Module", "Node", "Type", "State", "#Calls", "#Failed"]}
+        empty="No service is like that."
+        list=${shown}
+      >
+        ${([key, one]) => html`<${Row} key=${key} name=${key} service=${one} own=${section(state, "agent").name} />`}<//
+      >
+      ${hidden &&
+      html`<p class="empty">
+        ${count(hidden)} more services are not listed: <code>rmpa service list</code> has them.
+      </p>`}<//
+    ><//
+  >`;
 }
 
 export function ServicePage({ name, state, connection }) {
@@ -28,13 +74,43 @@ export function ServicePage({ name, state, connection }) {
   const service = section(state, "services")[name];
   if (!service) return html`<${Page} title=${name} kind="Service"><${Gone} kind="service" name=${name} /><//>`;
   const latency = section(detail, "latency");
-  return html`<${Page} title=${service.name} kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}><div class="grid">
-    <${Panel} title="Service"><${Facts} rows=${[["Node", html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`], ["State", STATES[service.state] || service.state], ["Transport", service.transport], ["Relayed because", detail.relayed_because], ["Address", detail.address], ["Calls across the mesh", count(service.calls || 0)],
-      ["Failed", service.failed ? count(service.failed) : undefined], ["Under way", detail.active || undefined], ["Latency, median", latency.p50 !== undefined ? seconds(latency.p50) : undefined], ["Latency, 99th percentile", latency.p99 !== undefined ? seconds(latency.p99) : undefined], ["Crosses", detail.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} />
-      ${service.problem && html`<p class="failure">${service.problem}</p>`}<//>
-    <${Panel} title="Way of a call"><${Why} connection=${connection} kind="service" name=${service.name} peer=${service.module} /><//>
-    <${Panel} title="Types and call" wide><${Question} connection=${connection} what="describe" args=${{ service: service.name, peer: service.module || "" }} label="Show its types" now=${true}
-      show=${(value) => html`<${Call} connection=${connection} service=${service} about=${value} />`} /><//></div><//>`;
+  return html`<${Page}
+    title=${service.name}
+    kind=${`Service of ${service.module || section(state, "agent").name}${service.type ? ` · ${service.type}` : ""}`}
+    ><div class="grid">
+      <${Panel} title="Service"
+        ><${Facts}
+          rows=${[
+            ["Node", html`<${NodeLink} name=${nodeKey(service.module, service.node)} />`],
+            ["State", STATES[service.state] || service.state],
+            ["Transport", service.transport],
+            ["Relayed because", detail.relayed_because],
+            ["Address", detail.address],
+            ["Calls across the mesh", count(service.calls || 0)],
+            ["Failed", service.failed ? count(service.failed) : undefined],
+            ["Under way", detail.active || undefined],
+            ["Latency, median", latency.p50 !== undefined ? seconds(latency.p50) : undefined],
+            ["Latency, 99th percentile", latency.p99 !== undefined ? seconds(latency.p99) : undefined],
+            ["Crosses", detail.crosses ? "yes" : "no"],
+            ["Because", detail.policy],
+            ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
+          ]}
+        />
+        ${service.problem && html`<p class="failure">${service.problem}</p>`}<//
+      >
+      <${Panel} title="Way of a call"
+        ><${Why} connection=${connection} kind="service" name=${service.name} peer=${service.module}
+      /><//>
+      <${Panel} title="Types and call" wide
+        ><${Question}
+          connection=${connection}
+          what="describe"
+          args=${{ service: service.name, peer: service.module || "" }}
+          label="Show its types"
+          now=${true}
+          show=${(value) => html`<${Call} connection=${connection} service=${service} about=${value} />`}
+      /><//></div
+  ><//>`;
 }
 
 function Call({ connection, service, about }) {
@@ -46,10 +122,35 @@ function Call({ connection, service, about }) {
     const { value: request, error } = json(text.trim() || "{}");
     if (error) return set({ failure: { error } });
     set({ waits: true });
-    connection.ask("call", { service: service.name, peer: service.module || "", request }).then((answer) => set({ answer }), (failure) => set({ failure }));
+    connection.ask("call", { service: service.name, peer: service.module || "", request }).then(
+      (answer) => set({ answer }),
+      (failure) => set({ failure }),
+    );
   };
-  return html`<div class="grid"><div><h3>${about.type}</h3><pre class="tree">${about.text}</pre></div>
-    <form class="form" onSubmit=${call}><label>Request as JSON<textarea spellcheck="false" value=${text} onInput=${(event) => setText(event.target.value)} disabled=${!allowed}></textarea></label>
-    <div class="row"><button class="primary" disabled=${!allowed || state.waits}>${state.waits ? "Waiting for the response …" : "Call it"}</button>${!allowed && html`<span class="muted">This page may only look: start rmpa web with --control.</span>`}</div>
-    <div aria-live="polite"><${Failure} failure=${state.failure} />${state.answer && html`<p class="muted">Response after ${seconds(state.answer.seconds)}</p><pre class="tree">${JSON.stringify(state.answer.response, null, 2)}</pre>`}</div></form></div>`;
+  return html`<div class="grid">
+    <div>
+      <h3>${about.type}</h3>
+      <pre class="tree">${about.text}</pre>
+    </div>
+    <form class="form" onSubmit=${call}>
+      <label
+        >Request as JSON<textarea
+          spellcheck="false"
+          value=${text}
+          onInput=${(event) => setText(event.target.value)}
+          disabled=${!allowed}
+        ></textarea>
+      </label>
+      <div class="row">
+        <button class="primary" disabled=${!allowed || state.waits}>
+          ${state.waits ? "Waiting for the response …" : "Call it"}</button
+        >${!allowed && html`<span class="muted">This page may only look: start rmpa web with --control.</span>`}
+      </div>
+      <div aria-live="polite">
+        <${Failure} failure=${state.failure} />${state.answer &&
+        html`<p class="muted">Response after ${seconds(state.answer.seconds)}</p>
+          <pre class="tree">${JSON.stringify(state.answer.response, null, 2)}</pre>`}
+      </div>
+    </form>
+  </div>`;
 }

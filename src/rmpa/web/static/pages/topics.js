@@ -3,20 +3,55 @@
 import { html, useState } from "../markup.js";
 import { bandwidth, clock, count, hertz, seconds } from "../format.js";
 import { entries, section } from "../state.js";
-import { Choice, Facts, Failure, Gone, Link, Mark, NodeLink, NodeLinks, Page, Panel, Table, Why, memo, nodeKey, useAnswer } from "../parts.js";
+import {
+  Choice,
+  Facts,
+  Failure,
+  Gone,
+  Link,
+  Mark,
+  NodeLink,
+  NodeLinks,
+  Page,
+  Panel,
+  Table,
+  Why,
+  memo,
+  nodeKey,
+  useAnswer,
+} from "../parts.js";
 import { Lines } from "../plot.js";
 import { Live } from "../live.js";
 
 export const TOPIC_COLUMNS = ["Topic", "Type", "#Rate", "#Bytes", "#Latency", "#Lost", "From → to"];
 
-export const TopicRow = memo(({ name, topic }) => html`<tr>
-  <th scope="row"><${Link} page="topic" name=${name} />${topic.problem && html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}</th>
-  <td><span class="muted">${topic.type}</span></td><td class="number">${hertz(topic.rate)}</td><td class="number">${bandwidth(topic.bandwidth)}</td>
-  <td class="number">${seconds(topic.latency)}</td><td class="number">${topic.lost || topic.dropped ? count((topic.lost || 0) + (topic.dropped || 0)) : "–"}</td>
-  <td>${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`} → ${(topic.to || []).join(", ") || html`<span class="muted">no subscriber here</span>`}${topic.crosses ? "" : html` <span class="muted">stays here</span>`}</td></tr>`);
+export const TopicRow = memo(
+  ({ name, topic }) =>
+    html`<tr>
+      <th scope="row">
+        <${Link} page="topic" name=${name} />${topic.problem &&
+        html`<div class="muted"><${Mark} state="WARN" word=${""} />${topic.problem}</div>`}
+      </th>
+      <td><span class="muted">${topic.type}</span></td>
+      <td class="number">${hertz(topic.rate)}</td>
+      <td class="number">${bandwidth(topic.bandwidth)}</td>
+      <td class="number">${seconds(topic.latency)}</td>
+      <td class="number">${topic.lost || topic.dropped ? count((topic.lost || 0) + (topic.dropped || 0)) : "–"}</td>
+      <td>
+        ${(topic.from || []).join(", ") || html`<span class="muted">no publisher</span>`}
+        ${" "}→${" "}${(topic.to || []).join(", ") ||
+        html`<span class="muted">no subscriber here</span>`}${topic.crosses
+          ? ""
+          : html` <span class="muted">stays here</span>`}
+      </td>
+    </tr>`,
+);
 
 // What Smart Resources and the log publish about themselves, next to the topics that carry data.
-const ABOUT = /\/(alarms|context|decision|descriptor|observed|parameter_descriptions|parameter_updates|profile|quality|requirements|responses|set_context|state)$/;
+const ABOUT = new RegExp(
+  "/(alarms|context|decision|descriptor|observed|parameter_descriptions|parameter_updates|profile|quality|" +
+    "requirements|responses|set_context|state)$",
+);
 export function isData(name, state) {
   if (name === "/rosout" || name === "/rosout_agg" || name === "/diagnostics") return false;
   const owner = name.replace(ABOUT, "");
@@ -24,7 +59,9 @@ export function isData(name, state) {
 }
 
 const FILTERS = {
-  data: ["Data", (one, name, state) => isData(name, state)], flowing: ["Flowing", (one) => one.rate !== undefined], all: ["All", () => true],
+  data: ["Data", (one, name, state) => isData(name, state)],
+  flowing: ["Flowing", (one) => one.rate !== undefined],
+  all: ["All", () => true],
   wrong: ["With a problem", (one) => one.problem || one.lost || one.dropped],
 };
 export function Topics({ state }) {
@@ -32,84 +69,280 @@ export function Topics({ state }) {
   const [text, setText] = useState("");
   const all = entries(state, "topics");
   const fits = FILTERS[filter === "data" && text ? "all" : filter][1]; // what is typed is looked for among all
-  const shown = all.filter(([name, one]) => fits(one, name, state) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()));
+  const shown = all.filter(
+    ([name, one]) => fits(one, name, state) && `${name} ${one.type}`.toLowerCase().includes(text.toLowerCase()),
+  );
   const hidden = section(state, "hidden").topics;
-  return html`<${Page} title="Topics" kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`} aside=${html`<${Choice} label="Which topics" value=${filter} onChoose=${setFilter} options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])} />`}>
-    <input class="filter" type="search" placeholder="Filter by name or type" aria-label="Filter by name or type" value=${text} onInput=${(event) => setText(event.target.value)} />
-    <${Panel}><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic is like that." list=${shown}>
-      ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//>
-    ${filter === "data" && all.length > shown.length && !text && html`<p class="empty">${all.length - shown.length} topics of the log and of Smart Resources about themselves are left out. <button type="button" onClick=${() => setFilter("all")}>Show all</button></p>`}
-    ${hidden && html`<p class="empty">${count(hidden)} more topics are not listed: <code>rmpa topic list</code> has them.</p>`}<//><//>`;
+  return html`<${Page}
+    title="Topics"
+    kind=${`${all.filter(([, one]) => one.rate !== undefined).length} of ${all.length} flow between modules`}
+    aside=${html`<${Choice}
+      label="Which topics"
+      value=${filter}
+      onChoose=${setFilter}
+      options=${Object.entries(FILTERS).map(([key, [word]]) => [key, word])}
+    />`}
+  >
+    <input
+      class="filter"
+      type="search"
+      placeholder="Filter by name or type"
+      aria-label="Filter by name or type"
+      value=${text}
+      onInput=${(event) => setText(event.target.value)}
+    />
+    <${Panel}
+      ><${Table} caption="Topics" columns=${TOPIC_COLUMNS} empty="No topic is like that." list=${shown}>
+        ${([name, one]) => html`<${TopicRow} key=${name} name=${name} topic=${one} />`}<//
+      >
+      ${filter === "data" &&
+      all.length > shown.length &&
+      !text &&
+      html`<p class="empty">
+        ${all.length - shown.length} topics of the log and of Smart Resources about themselves are left
+        out.${" "}<button type="button" onClick=${() => setFilter("all")}>Show all</button>
+      </p>`}
+      ${hidden &&
+      html`<p class="empty">${count(hidden)} more topics are not listed: <code>rmpa topic list</code> has them.</p>`}<//
+    ><//
+  >`;
 }
 
-const FIGURES = [["rate", "Rate", hertz], ["p50", "Latency, median", seconds], ["p99", "Latency, 99th percentile", seconds], ["jitter", "Jitter", seconds], ["bandwidth", "Bytes", bandwidth], ["lost", "Lost", count]];
+const FIGURES = [
+  ["rate", "Rate", hertz],
+  ["p50", "Latency, median", seconds],
+  ["p99", "Latency, 99th percentile", seconds],
+  ["jitter", "Jitter", seconds],
+  ["bandwidth", "Bytes", bandwidth],
+  ["lost", "Lost", count],
+];
 const LOSSES = ["lost", "expired", "dropped", "oversized", "late"];
-const figureOf = (route, key) => (key === "p50" || key === "p99" ? section(route, "latency")[key] : key === "lost" ? LOSSES.reduce((sum, each) => sum + (route[each] || 0), 0) : route[key]);
+const figureOf = (route, key) =>
+  key === "p50" || key === "p99"
+    ? section(route, "latency")[key]
+    : key === "lost"
+      ? LOSSES.reduce((sum, each) => sum + (route[each] || 0), 0)
+      : route[key];
 
 export function TopicPage({ name, state, connection }) {
   const [figure, setFigure] = useState("rate");
   const detail = section(section(state, "detail"), `topic:${name}`);
   const topic = section(state, "topics")[name];
-  if (!topic) return html`<${Page} title=${name} kind="Topic"><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"><${Why} connection=${connection} kind="topic" name=${name} /><//><//>`;
+  if (!topic)
+    return html`<${Page} title=${name} kind="Topic"
+      ><${Gone} kind="topic" name=${name} /><${Panel} title="Why?"
+        ><${Why} connection=${connection} kind="topic" name=${name} /><//
+    ><//>`;
   const routes = entries(detail, "routes");
   const own = section(state, "agent").name;
   const format = FIGURES.find(([key]) => key === figure)[2];
   const flowing = routes.filter(([, route]) => route.rate !== undefined);
-  return html`<${Page} title=${name} kind=${`Topic · ${topic.type || "type not known"}`}><div class="grid">
-    ${topic.problem && html`<${Panel} title="What is wrong" wide><p class="failure">${topic.problem}</p><//>`}
-    <${Panel} title="Who sends it, who gets it"><${Facts} rows=${[
-      ["Published in", (topic.from || []).join(", ")], ["Subscribed in", (topic.to || []).join(", ")], [`Publishers in ${own}`, (detail.publishers || []).length > 0 ? html`<${NodeLinks} names=${detail.publishers} />` : ""], [`Subscribers in ${own}`, (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : ""],
-      ["Crosses", topic.crosses ? "yes" : "no"], ["Because", detail.policy], ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`]]} /><//>
-    <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
-    <${Live} connection=${connection} topic=${name} type=${topic.type} />
-    ${flowing.length > 0 && html`<${Panel} wide title="Figures" aside=${html`<${Choice} label="Figure" value=${figure} onChoose=${setFigure} options=${FIGURES.map(([key, word]) => [key, word])} />`}>
-      <${Lines} key=${figure} label=${figure} format=${format} series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))} /><//>`}
-    <${Panel} title="Routes" wide><${Table} caption="Routes" columns=${["Source", "State", "#Rate", "#Jitter p99", "#Latency p50, p99", "#Lost", "#Dropped", "Transport", "Contract"]} empty="It has no route to or from a peer." list=${routes}>
-      ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//><//>
-    <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
-    <${Events} routes=${routes} />
-  </div><//>`;
+  return html`<${Page} title=${name} kind=${`Topic · ${topic.type || "type not known"}`}
+    ><div class="grid">
+      ${topic.problem && html`<${Panel} title="What is wrong" wide><p class="failure">${topic.problem}</p><//>`}
+      <${Panel} title="Who sends it, who gets it"
+        ><${Facts}
+          rows=${[
+            ["Published in", (topic.from || []).join(", ")],
+            ["Subscribed in", (topic.to || []).join(", ")],
+            [
+              `Publishers in ${own}`,
+              (detail.publishers || []).length > 0 ? html`<${NodeLinks} names=${detail.publishers} />` : "",
+            ],
+            [
+              `Subscribers in ${own}`,
+              (detail.subscribers || []).length > 0 ? html`<${NodeLinks} names=${detail.subscribers} />` : "",
+            ],
+            ["Crosses", topic.crosses ? "yes" : "no"],
+            ["Because", detail.policy],
+            ["MD5 sum", detail.md5 && html`<code>${detail.md5}</code>`],
+          ]}
+      /><//>
+      <${Panel} title="Way of a message"><${Why} connection=${connection} kind="topic" name=${name} /><//>
+      <${Live} connection=${connection} topic=${name} type=${topic.type} />
+      ${flowing.length > 0 &&
+      html`<${Panel}
+        wide
+        title="Figures"
+        aside=${html`<${Choice}
+          label="Figure"
+          value=${figure}
+          onChoose=${setFigure}
+          options=${FIGURES.map(([key, word]) => [key, word])}
+        />`}
+      >
+        <${Lines}
+          key=${figure}
+          label=${figure}
+          format=${format}
+          series=${flowing.map(([key, route]) => ({ label: key, value: figureOf(route, figure) }))}
+      /><//>`}
+      <${Panel} title="Routes" wide
+        ><${Table}
+          caption="Routes"
+          columns=${[
+            "Source",
+            "State",
+            "#Rate",
+            "#Jitter p99",
+            "#Latency p50, p99",
+            "#Lost",
+            "#Dropped",
+            "Transport",
+            "Contract",
+          ]}
+          empty="It has no route to or from a peer."
+          list=${routes}
+        >
+          ${([key, route]) => html`<${Route} key=${key} route=${route} own=${own} />`}<//
+        ><//
+      >
+      <${ContractPanel} connection=${connection} topic=${name} type=${topic.type} own=${own} routes=${routes.length} />
+      <${Events} routes=${routes} /></div
+  ><//>`;
 }
 
 const Route = memo(({ route, own }) => {
   const latency = section(route, "latency");
-  const contract = Object.entries(route.contract || {}).map(([key, value]) => `${key} ${value}`).join(", ");
-  return html`<tr><th scope="row"><${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} /><div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div></th>
-    <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td><td class="number">${hertz(route.rate)}<div class="muted">${bandwidth(route.bandwidth)}</div></td><td class="number">${seconds(route.jitter)}</td>
-    <td class="number">${seconds(latency.p50)}, ${seconds(latency.p99)}<div class="muted">± ${seconds(latency.error)}</div></td>
-    <td class="number">${(route.events || {}).loss_unknown ? "unknown, ≥ " : ""}${count((route.lost || 0) + (route.expired || 0))}</td><td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
-    <td>${route.transport || "–"}${route.lane && html`<div class="muted">${route.lane} lane</div>`}${route.condition_text && html`<div class="muted">${route.condition_text}</div>`}</td><td>${contract || "default"}${Object.entries(route.events || {}).map(([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`)}</td></tr>
+  const contract = Object.entries(route.contract || {})
+    .map(([key, value]) => `${key} ${value}`)
+    .join(", ");
+  return html`<tr>
+      <th scope="row">
+        <${NodeLink} name=${nodeKey(route.direction === "in" ? route.peer : "", route.node)} />
+        <div class="muted">${route.direction === "in" ? `${route.peer} → ${own}` : `${own} → ${route.peer}`}</div>
+      </th>
+      <td>${route.state}${route.problem && html`<div class="muted">${route.problem}</div>`}</td>
+      <td class="number">
+        ${hertz(route.rate)}
+        <div class="muted">${bandwidth(route.bandwidth)}</div>
+      </td>
+      <td class="number">${seconds(route.jitter)}</td>
+      <td class="number">
+        ${seconds(latency.p50)}, ${seconds(latency.p99)}
+        <div class="muted">± ${seconds(latency.error)}</div>
+      </td>
+      <td class="number">
+        ${(route.events || {}).loss_unknown ? "unknown, ≥ " : ""}${count((route.lost || 0) + (route.expired || 0))}
+      </td>
+      <td class="number">${count((route.dropped || 0) + (route.oversized || 0))}</td>
+      <td>
+        ${route.transport || "–"}${route.lane &&
+        html`<div class="muted">${route.lane} lane</div>`}${route.condition_text &&
+        html`<div class="muted">${route.condition_text}</div>`}
+      </td>
+      <td>
+        ${contract || "default"}${Object.entries(route.events || {}).map(
+          ([kind, times]) => html`<div class="muted" key=${kind}>${kind.replaceAll("_", " ")}: ${count(times)}</div>`,
+        )}
+      </td>
+    </tr>
     ${(route.subscribers || []).map((one) => html`<${Subscriber} key=${one.node} one=${one} />`)}`;
 });
 
 // A subscriber of a route where its transport is known: the agents see no message of direct ones.
 const Subscriber = ({ one }) => {
-  const said = [one.condition && one.text, one.transport === "direct" && "not measured: the nodes are connected directly", one.interruptions && `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: what is lost of that time is not counted`].filter(Boolean).join("; ");
-  return html`<tr><th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th><td>${one.state}${said && html`<div class="muted">${said}</div>`}</td><td class="number">–</td>
-    <td class="number">–</td><td class="number">–</td><td class="number">–</td><td class="number">–</td><td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td><td>${one.wanted || ""}</td></tr>`;
+  const said = [
+    one.condition && one.text,
+    one.transport === "direct" && "not measured: the nodes are connected directly",
+    one.interruptions &&
+      `interrupted ${count(one.interruptions)} times, the last for ${seconds(one.interrupted)}: ` +
+        "what is lost of that time is not counted",
+  ]
+    .filter(Boolean)
+    .join("; ");
+  return html`<tr>
+    <th scope="row" class="inner"><span class="mono">→ ${one.node}</span></th>
+    <td>${one.state}${said && html`<div class="muted">${said}</div>`}</td>
+    <td class="number">–</td>
+    <td class="number">–</td>
+    <td class="number">–</td>
+    <td class="number">–</td>
+    <td class="number">–</td>
+    <td>${one.transport || "–"}${one.endpoint && html`<div class="muted">${one.endpoint}</div>`}</td>
+    <td>${one.wanted || ""}</td>
+  </tr>`;
 };
 
 const MEANINGS = {
-  reliability: "whether messages survive the loss of a link", durability: "whether a late subscriber gets the last ones", history: "what a full queue keeps", depth: "messages that wait for a slow receiver", deadline: "longest time between two messages",
-  lifespan: "older messages are dropped", liveliness: "what shows that a source is alive", liveliness_lease: "silence after which a source counts as dead", priority: "the lane: high is express, low is bulk", max_rate: "messages a second at most", outage: "how long it is kept without a link", transport: "through the agents, or from node to node",
+  reliability: "whether messages survive the loss of a link",
+  durability: "whether a late subscriber gets the last ones",
+  history: "what a full queue keeps",
+  depth: "messages that wait for a slow receiver",
+  deadline: "longest time between two messages",
+  lifespan: "older messages are dropped",
+  liveliness: "what shows that a source is alive",
+  liveliness_lease: "silence after which a source counts as dead",
+  priority: "the lane: high is express, low is bulk",
+  max_rate: "messages a second at most",
+  outage: "how long it is kept without a link",
+  transport: "through the agents, or from node to node",
 };
 const SECONDS = ["deadline", "lifespan", "liveliness_lease", "outage"];
-const term = (key, value) => (value === null || value === undefined ? "none" : SECONDS.includes(key) ? seconds(value) : key === "max_rate" ? hertz(value) : String(value).replaceAll("_", " "));
+const term = (key, value) =>
+  value === null || value === undefined
+    ? "none"
+    : SECONDS.includes(key)
+      ? seconds(value)
+      : key === "max_rate"
+        ? hertz(value)
+        : String(value).replaceAll("_", " ");
 
 // What the settings of this module ask for the topic, whether a route is open or not.
 function ContractPanel({ connection, topic, type, own, routes }) {
   const { value, failure } = useAnswer(connection, "contract", { topic, type: type === "*" ? "" : type || "" });
   const rows = Object.entries(value || {});
   const set = rows.filter(([, one]) => one.rule !== "default");
-  const table = (shown) => html`<${Table} caption="Contract" columns=${["Term", "Value", "Set by"]}>${shown.map(([key, one]) => html`<tr key=${key}><th scope="row">${key.replaceAll("_", " ")}<div class="muted">${MEANINGS[key] || ""}</div></th><td>${term(key, one.value)}</td><td class="muted">${one.rule}</td></tr>`)}<//>`;
-  return html`<${Panel} title=${`Contract, by the settings of ${own}`} wide><${Failure} failure=${failure} />
-    ${value && (set.length ? table(set) : html`<p class="empty">No rule of <code>[[contract]]</code> names it: the defaults hold.</p>`)}
-    ${value && !routes && html`<p class="muted">It has no route yet. When a peer subscribes, the stricter terms of both modules hold.</p>`}
-    ${value && html`<details><summary>${set.length ? "The terms that no rule sets" : "The defaults"}</summary>${table(rows.filter(([, one]) => one.rule === "default"))}</details>`}<//>`;
+  const table = (shown) =>
+    html`<${Table} caption="Contract" columns=${["Term", "Value", "Set by"]}
+      >${shown.map(
+        ([key, one]) =>
+          html`<tr key=${key}>
+            <th scope="row">
+              ${key.replaceAll("_", " ")}
+              <div class="muted">${MEANINGS[key] || ""}</div>
+            </th>
+            <td>${term(key, one.value)}</td>
+            <td class="muted">${one.rule}</td>
+          </tr>`,
+      )}<//
+    >`;
+  return html`<${Panel} title=${`Contract, by the settings of ${own}`} wide
+    ><${Failure} failure=${failure} /> ${value &&
+    (set.length
+      ? table(set)
+      : html`<p class="empty">No rule of <code>[[contract]]</code> names it: the defaults hold.</p>`)}
+    ${value &&
+    !routes &&
+    html`<p class="muted">It has no route yet. When a peer subscribes, the stricter terms of both modules hold.</p>`}
+    ${value &&
+    html`<details>
+      <summary>${set.length ? "The terms that no rule sets" : "The defaults"}</summary>
+      ${table(rows.filter(([, one]) => one.rule === "default"))}
+    </details>`}<//
+  >`;
 }
 
 const Events = ({ routes }) => {
-  const events = routes.flatMap(([, route]) => (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })));
-  return events.length > 0 && html`<${Panel} title="Events of its contract" wide><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}>${events.sort((a, b) => b.at - a.at).map((event) => html`<tr key=${event.from + event.kind + event.at}><th scope="row">${clock(event.at)}</th><td>${event.kind.replaceAll("_", " ")}</td><td>${event.from}</td><td>${event.text}</td></tr>`)}<//><//>`;
+  const events = routes.flatMap(([, route]) =>
+    (route.recent || []).map((event) => ({ ...event, from: `${route.peer} ${route.node}` })),
+  );
+  return (
+    events.length > 0 &&
+    html`<${Panel} title="Events of its contract" wide
+      ><${Table} caption="Events" columns=${["Time", "Event", "Source", "Text"]}
+        >${events
+          .sort((a, b) => b.at - a.at)
+          .map(
+            (event) =>
+              html`<tr key=${event.from + event.kind + event.at}>
+                <th scope="row">${clock(event.at)}</th>
+                <td>${event.kind.replaceAll("_", " ")}</td>
+                <td>${event.from}</td>
+                <td>${event.text}</td>
+              </tr>`,
+          )}<//
+      ><//
+    >`
+  );
 };
-

@@ -1,0 +1,295 @@
+"""A client of a resource in this or another module: requests a quality and receives the answers.
+
+::
+
+    async with Node("driver") as node, ResourceClient(node, "sonar") as sonar:
+        answer = await sonar.require(rate=at_least("20 Hz", hard=True), noise=at_most("5 cm"))
+        print(answer.level.name, answer.message)
+        async for answer in sonar.answers():
+            ...
+
+A resource that has requirements on others is such a client too (``Demands``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+import secrets
+import time
+from typing import TYPE_CHECKING, Any, Self
+
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.resource import limits
+from rmpa.resource.descriptor import TOPIC, Descriptor
+from rmpa.resource.quality import EXPIRES, PRIORITY, RequirementAnswer
+from rmpa.resource.runtime import RuntimePart
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import printable
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+    from rmpa.resource.declare import Demand
+    from rmpa.resource.quality import QoSRequest, Value
+    from rmpa.resource.runtime import Runtime
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
+    from rmpa.ros.node.node import Node
+
+_log = logging.getLogger(__name__)
+
+
+class ResourceClient:
+    """One client of one resource; leaving the context (``async with``) releases its requirement.
+
+    Args:
+        node: A registered node; it may have one client for each resource.
+        resource: Name of the resource's node in this module's graph: ``sonar``, ``/robot1/sonar``.
+    """
+
+    def __init__(self, node: Node, resource: str) -> None:
+        self._node = node
+        self.resource = resource if resource.startswith("/") else f"/{resource}"
+        self.answer: RequirementAnswer | None = None
+        """The last answer to the present request; ``None`` until it arrives."""
+        self._requirements: Publisher | None = None
+        self._observed: Publisher | None = None
+        self._responses: Subscriber | None = None
+        self._mark = "none yet"
+        self._version = 0
+        self._change = asyncio.Event()
+
+    async def __aenter__(self) -> Self:
+        """Subscribe to the resource's responses and advertise the requests.
+
+        Raises:
+            UnreachableError: The master does not answer.
+        """
+        kind = MessageType(ARRAY_TYPE)
+        self._responses = await self._node.subscribe(f"{self.resource}/responses", kind, self._response_received)
+        self._requirements = await self._node.advertise(f"{self.resource}/requirements", kind, latch=True)
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        for topic in (self._requirements, self._observed, self._responses):
+            if topic is not None:
+                await topic.close()
+
+    async def require(
+        self,
+        *,
+        priority: int = 0,
+        expires: str = "",
+        timeout: float = limits.RESOURCE_ANSWER_TIMEOUT,  # noqa: ASYNC109 - the message names it
+        **requests: QoSRequest,
+    ) -> RequirementAnswer:
+        """Request a quality, in place of the previous request, and wait for the answer.
+
+        Args:
+            priority: In a conflict between clients the higher priority wins.
+            expires: How long the request holds, such as ``"60 s"``; empty: until this client ends.
+            timeout: Seconds to wait for the answer.
+            requests: By attribute; a qualified one (``ranges.rate``) is written ``ranges__rate``.
+
+        Raises:
+            PeerRefused: The request is invalid; the previous one stays in force.
+            UnreachableError: No resource of this name has answered in time.
+        """
+        self.ask(priority=priority, expires=expires, **requests)
+        try:
+            async with asyncio.timeout(timeout):
+                while self.answer is None:
+                    self._change.clear()
+                    await self._change.wait()
+        except TimeoutError:
+            remedy = "`rmpa resource list` shows which there are"
+            raise UnreachableError("resource", f"{self.resource} ({timeout:g} s)", remedy) from None
+        if self.answer.level is DiagnosticLevel.ERROR and "non-adaptable" not in self.answer.message:
+            raise PeerRefused(f"resource {self.resource}", self.answer.message)
+        return self.answer
+
+    def ask(self, *, priority: int = 0, expires: str = "", **requests: QoSRequest) -> None:
+        """Request a quality as ``require`` does, without waiting for the answer; ``answers`` yields it."""
+        values = {name.replace("__", "."): str(request) for name, request in requests.items()}
+        if priority:
+            values[PRIORITY] = str(priority)
+        if expires:
+            values[EXPIRES] = expires
+        if self._requirements is None:
+            raise UnreachableError("resource", self.resource, "enter the client first: async with ResourceClient(…)")
+        self._mark = secrets.token_hex(8)
+        self.answer = None
+        # The stamp identifies a latched request that arrives again, so that its expiry does not start again.
+        self._publish(self._requirements, values, self._mark)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the resource publishes responses to this client's node."""
+        return self._responses is not None and self._responses.publishers > 0
+
+    async def observe(self, **values: float | str) -> None:
+        """Report the quality that this client observes: ``await sonar.observe(rate="12 Hz")``, periodically.
+
+        The resource measures the messages that it sends; fewer may arrive here, and it has to adapt to that. A report
+        counts for three of the resource's quality windows, provided that this client has a requirement.
+
+        Args:
+            values: By attribute, as in ``require``; a number is in the attribute's unit.
+
+        Raises:
+            UnreachableError: The master does not answer.
+        """
+        if self._observed is None:
+            self._observed = await self._node.advertise(f"{self.resource}/observed", MessageType(ARRAY_TYPE))
+        if values:
+            self.report(**values)
+
+    def report(self, **values: float | str) -> None:
+        """Report as ``observe`` does, without waiting; ``observe`` must have been called once.
+
+        Raises:
+            UnreachableError: ``observe`` has not been called.
+        """
+        if self._observed is None:
+            raise UnreachableError("resource", self.resource, "await observe() once before")
+        self._publish(self._observed, {key.replace("__", "."): str(value) for key, value in values.items()})
+
+    def release(self) -> None:
+        """Release the requirement."""
+        self.ask()
+
+    async def answers(self) -> AsyncIterator[RequirementAnswer]:
+        """The present answer, if there is one, and each change from now on."""
+        seen = 0
+        while True:
+            while self._version == seen:
+                self._change.clear()
+                await self._change.wait()
+            seen = self._version
+            if self.answer is not None:
+                yield self.answer
+
+    def _publish(self, publisher: Publisher, values: Mapping[str, str], mark: str = "") -> None:
+        pairs: Any = [{"key": key, "value": value} for key, value in values.items()]
+        status: Any = [{"name": self._node.name, "hardware_id": mark, "values": pairs}]
+        publisher.publish(header={"stamp": time.time()}, status=status)
+
+    def _response_received(self, received: Received) -> None:
+        for status in received.message.status:
+            # In the resource's graph this client may have its proxy's name, so the unique mark identifies it.
+            if status.hardware_id == self._mark:
+                values = {str(pair.key): str(pair.value) for pair in status.values}
+                answer = RequirementAnswer(DiagnosticLevel(int(status.level)), str(status.message), values)
+                if answer != self.answer:
+                    self.answer = answer
+                    self._version += 1
+                    self._change.set()
+
+
+class Demands(RuntimePart):
+    """All requirements of one resource on others: requests, answers, and reports of the observed quality.
+
+    Args:
+        runtime: The runtime of the resource that has the requirements.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._clients: dict[str, ResourceClient] = {}
+        self._first: dict[str, str] = {}
+        """Name of the first output of each resource whose descriptor has been received, by resource."""
+        self._undo = contextlib.AsyncExitStack()
+
+    async def start(self) -> None:
+        """Send the requests."""
+        async with contextlib.AsyncExitStack() as undo:
+            for demand in self._runtime.resource.demands.values():
+                client = await undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
+                self._clients[demand.resource] = client
+                demand.on_change = functools.partial(self._runtime.call_in_loop, self._request)
+                undo.callback(setattr, demand, "on_change", None)
+                name = f"follow {demand.resource}"
+                following = asyncio.get_running_loop().create_task(self._follow(demand, client), name=name)
+                undo.push_async_callback(_ended, following)
+                if demand.requests:
+                    self._request(demand)
+                if any(name.startswith(f"{demand.resource}/") for name in self._runtime.resource.inputs):
+                    await self._observe(demand.resource, client)
+            self._undo = undo.pop_all()
+
+    async def close(self) -> None:
+        """Release all requirements."""
+        await self._undo.aclose()
+        self._clients.clear()
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Problems as texts: resources that are not connected, and resources that miss the requirement."""
+        missing, short = [], []
+        for name, client in self._clients.items():
+            if not self._runtime.resource.demands[name].requests:
+                continue
+            if not client.connected:
+                missing.append(f"there is no resource {name}")
+            elif client.answer is not None and client.answer.level is not DiagnosticLevel.OK:
+                short.append(f"{name}: {printable(client.answer.message)}")
+        return missing, short
+
+    def window_ended(self, measured: Mapping[str, Value]) -> None:
+        """Report the measured values of inputs to the resources that send them, for the requested attributes."""
+        resource = self._runtime.resource
+        labels = resource.labels
+        for name, client in self._clients.items():
+            found: dict[str, Any] = {}
+            for request in resource.demands[name].requests if name in self._first else ():
+                output, _, attribute = request.replace("__", ".").rpartition(".")
+                item = f"{name}/{output or self._first[name]}"
+                value = measured.get(f"{labels[item]}.{attribute}") if item in resource.inputs else None
+                if value is not None:
+                    found[request] = value
+            if found and client.connected:
+                client.report(**found)
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _request(self, demand: Demand) -> None:
+        client = self._clients.get(demand.resource)
+        if client is not None:
+            demand.answer = None
+            requests: dict[str, Any] = dict(demand.requests)
+            client.ask(priority=demand.priority if requests else 0, **requests)
+            self._runtime.publish_descriptor()
+
+    async def _observe(self, name: str, client: ResourceClient) -> None:
+        """Begin to report observations to a resource.
+
+        A request without an output's name, such as ``rate``, refers to the resource's first output. The resource's
+        descriptor says which output that is.
+        """
+
+        def descriptor_received(received: Received) -> None:
+            try:
+                outputs = Descriptor.parse(str(received.message.data)).outputs
+            except RmpaError as error:
+                _log.warning("! %s: %s: %s", self._runtime.node.name, name, error)
+            else:
+                self._first[name] = outputs[0].name if outputs else ""
+
+        await client.observe()
+        await self._runtime.node.subscribe(f"{name}/{TOPIC}", MessageType("std_msgs/String"), descriptor_received)
+
+    async def _follow(self, demand: Demand, client: ResourceClient) -> None:
+        last: tuple[DiagnosticLevel, str] | None = None
+        async for answer in client.answers():
+            demand.answer = answer
+            if last != (last := (answer.level, answer.message)):
+                well = answer.level is DiagnosticLevel.OK
+                texts = "=" if well else "!", self._runtime.node.name, demand.resource, printable(answer.message)
+                _log.log(logging.INFO if well else logging.WARNING, "%s %s: %s says: %s", *texts)
+
+
+async def _ended(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.wait([task])

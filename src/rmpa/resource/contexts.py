@@ -1,0 +1,321 @@
+"""Switches a resource between its contexts: by hand (a topic, the configuration) or by the contexts' rules.
+
+The context to be in is a function of the choice by hand and of the values that the rules refer to (``_wanted``),
+which is evaluated whenever one of them may have changed. A switch is atomic: no task runs and no message is sent
+until the context's function has ended, the context's outputs and requirements are in force, and the resulting profile
+has been applied.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource import limits
+from rmpa.resource.declare import Context, parse_rule, split_reference
+from rmpa.resource.descriptor import topic_of
+from rmpa.resource.loop import HungError, call_function
+from rmpa.resource.runtime import RuntimePart
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.loop import MachineTimer
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from rmpa.resource.declare import Input, Output, Parameter, Scalar
+    from rmpa.resource.loop import Adapter
+    from rmpa.resource.runtime import Runtime
+    from rmpa.resource.tasks import Tasks
+    from rmpa.ros.node.endpoints import Received, Subscriber
+
+_log = logging.getLogger(__name__)
+_HOLDER: Final = "context"
+_DEBOUNCE: Final = 0.02
+"""Seconds from a change of a value until the rules are evaluated; changes within that time share one evaluation."""
+_INTERVAL: Final = 0.25
+"""Seconds between evaluations without a change: a dwell time may have ended, or a publisher may be gone."""
+
+
+class Contexts(RuntimePart):
+    """The contexts of one resource; must be started after the adapter.
+
+    Args:
+        runtime: The runtime of the resource.
+        tasks: The resource's tasks, paused during a switch.
+        adapter: Puts the requirements of contexts in force.
+    """
+
+    def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter) -> None:
+        resource = runtime.resource
+        self._runtime = runtime
+        self._tasks = tasks
+        self._adapter = adapter
+        self._known = resource.contexts
+        self.current = ""
+        """Name of the present context; empty: none."""
+        self.chosen = ""
+        """Name of the context chosen by hand; empty: the rules decide. May be set before ``start``."""
+        self._since = -math.inf
+        """When the present context began, monotonic seconds."""
+        self._rules = {
+            name: parse_rule(context.when, resource.parameters, f"context {name} of {resource.name}")
+            for name, context in self._known.items()
+            if context.when
+        }
+        references = {reference for rule in self._rules.values() for reference in rule.references}
+        self._parameters = {reference for reference in references if reference.startswith("~")}
+        self._fields = {reference: _TopicField(reference) for reference in references - self._parameters}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._taps: dict[str, str] = {}
+        """The topic of each input or output of the resource that a rule refers to, by the declared name."""
+        self._latest: dict[str, tuple[MessageType, bytes]] = {}
+        self._retry = 0.0
+        self._lock = asyncio.Lock()
+        """Held during a switch, and from a choice to its outcome: one that fails must not undo the next."""
+        self._work: set[asyncio.Task[None]] = set()
+        self._next_evaluation: float | None = None
+        self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
+        self._closed = True
+        """True before ``start`` and after ``close``."""
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Why fields that rules refer to cannot be read."""
+        return [], [f"rule over {field.problem}" for field in self._fields.values() if field.problem]
+
+    async def start(self) -> None:
+        """Enter the chosen context, if any, and evaluate the rules from now on."""
+        self._loop, self._closed = asyncio.get_running_loop(), False
+        self._runtime.publish_text("context", "")
+        if not self._known:
+            return
+        node = self._runtime.node
+        await node.subscribe(f"{node.name}/set_context", MessageType("std_msgs/String"), self._choice_received)
+        async with self._lock:
+            try:
+                await self._switch(self.chosen)
+            except RmpaError as error:
+                _log.warning("! %s: %s", node.name, error)
+                self.chosen = ""
+        if self._fields:
+            self._spawn(self._find_topics(), "find topics of rules")
+        if self._rules:
+            self._evaluate(self._loop.time())
+            self._timer.arm()
+
+    async def close(self) -> None:
+        """Stop the evaluation of rules; the present context stays."""
+        self._closed = True
+        self._timer.close()
+        for task in self._work:
+            task.cancel()
+        await asyncio.gather(*self._work, return_exceptions=True)
+
+    async def choose(self, name: str) -> None:
+        """Choose a context by hand; an empty name lets the rules decide again.
+
+        Raises:
+            ConfigError: The resource has no context of this name; nothing has changed.
+            PeerRefused: The function of the context failed; the present context stays.
+        """
+        if name and name not in self._known:
+            near = did_you_mean(name, self._known)
+            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(self._known) or 'none'}"
+            raise ConfigError(f"resource {self._runtime.resource.name}", f"no context {name[:80]!r}", remedy)
+        async with self._lock:
+            before, self.chosen = self.chosen, name
+            if not name:
+                self._since, self._retry = -math.inf, 0.0
+            try:
+                await self._switch(self._wanted(self._loop.time()))
+            except RmpaError:
+                if name:
+                    self.chosen = before
+                raise
+            self._publish()
+
+    # --- values of rules ----------------------------------------------------------------------------------------
+
+    def received(self, item: Input, message: Received) -> None:
+        """Keep the message of an input if a rule refers to its topic."""
+        if item.name in self._taps:
+            self._update(self._taps[item.name], message.kind, message.raw)
+
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002
+        """Keep the message of an output if a rule refers to its topic."""
+        if output.name in self._taps:
+            self._update(self._taps[output.name], output.type, raw)
+
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """Evaluate the rules soon if one of them refers to the parameter."""
+        if f"~{parameter.name}" in self._parameters:
+            self._evaluate_soon()
+
+    def _update(self, topic: str, kind: MessageType, raw: bytes) -> None:
+        self._latest[topic] = kind, raw
+        self._evaluate_soon()
+
+    def _values(self) -> dict[str, Scalar]:
+        found = {text: self._runtime.resource.parameters[text[1:]].value for text in self._parameters}
+        for text, field in self._fields.items():
+            if (subscriber := self._subscribers.get(field.topic)) is not None and not subscriber.publishers:
+                self._latest.pop(field.topic, None)  # without a publisher the value is unknown
+            if (latest := self._latest.get(field.topic)) and (value := field.read(*latest)) is not None:
+                found[text] = value
+        return found
+
+    async def _find_topics(self) -> None:
+        """Look up the topics that rules refer to, and subscribe to them, until all are found."""
+        node, delay = self._runtime.node, limits.CONTEXT_LOOK
+        while missing := [field for field in self._fields.values() if not field.topic]:
+            try:
+                published = {topic for topic, _ in await node.get_published_topics()}
+                for field in missing:
+                    if field.find(published):
+                        await self._subscribe(field.topic)
+            except RmpaError as error:
+                _log.debug("! %s: topics of rules: %s", node.name, error)
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, limits.CONTEXT_RETRY)
+
+    async def _subscribe(self, topic: str) -> None:
+        resource, node = self._runtime.resource, self._runtime.node
+        own = [name for name in (*resource.inputs, *resource.outputs) if topic_of(name, node.name) == topic]
+        self._taps.update(dict.fromkeys(own, topic))
+        if not own and topic not in self._subscribers:  # else its messages come already
+            self._subscribers[topic] = await node.subscribe(
+                topic, callback=lambda message: self._update(topic, message.kind, message.raw)
+            )
+
+    # --- decision -----------------------------------------------------------------------------------------------
+
+    def _wanted(self, now: float) -> str:
+        """The context to be in: the one chosen by hand, or else the first whose rule holds; empty: none.
+
+        One that a rule has selected stays at least ``limits.CONTEXT_DWELL`` seconds.
+        """
+        if self.chosen:
+            return self.chosen
+        if now - self._since < limits.CONTEXT_DWELL:
+            return self.current
+        values = self._values()
+        return next((name for name, rule in self._rules.items() if rule.holds(values)), "")
+
+    def _evaluate_soon(self) -> None:
+        if self._next_evaluation is not None:
+            self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
+            self._timer.arm()
+
+    def _evaluate(self, now: float) -> None:
+        """Begin a switch if the rules select another context."""
+        self._next_evaluation = now + _INTERVAL
+        if not self._lock.locked() and now >= self._retry and self._wanted(now) != self.current:
+            self._spawn(self._follow_rules(), "switch context")
+
+    async def _follow_rules(self) -> None:
+        async with self._lock:
+            try:
+                await self._switch(self._wanted(self._loop.time()))
+            except RmpaError as error:
+                _log.warning("! %s: %s", self._runtime.node.name, error)
+                self._retry = self._loop.time() + limits.CONTEXT_RETRY
+
+    def _choice_received(self, message: Received) -> None:
+        self._spawn(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
+
+    async def _choose_by_topic(self, name: str, client: str) -> None:
+        try:
+            await self.choose(name)
+        except RmpaError as error:
+            self._adapter.refuse(client, printable(str(error)))
+
+    # --- switch -------------------------------------------------------------------------------------------------
+
+    async def _switch(self, name: str) -> None:
+        """Switch to a context.
+
+        Raises:
+            PeerRefused: The context's function failed; the resource stays in its present context.
+            HungError: It did not return within ``limits.CONTEXT_ENTER_TIMEOUT`` seconds.
+        """
+        if name == self.current or self._closed:
+            return
+        runtime, context = self._runtime, self._known.get(name, Context(""))
+        await self._tasks.pause(_HOLDER)
+        runtime.hold(_HOLDER)
+        try:
+            if context.enter is not None:
+                limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
+                await call_function(context.enter, "context", name, limit, remedy)
+            runtime.context_outputs = context.outputs
+            self._adapter.enter_context(context)
+            self.current, self._since = name, self._loop.time()
+            await self._adapter.settled()
+        except HungError as error:
+            runtime.release(_HOLDER, drop=True)
+            self._adapter.end(error)
+            raise
+        except Exception as error:
+            raise PeerRefused(f"context {name}", f"{type(error).__name__}: {error}") from error
+        finally:
+            runtime.release(_HOLDER)
+            self._tasks.resume(_HOLDER)
+        _log.info("= %s: %s", runtime.node.name, f"context {name}" if name else "no context any more")
+        self._publish()
+
+    def _publish(self) -> None:
+        if not self._closed:
+            self._runtime.publish_text("context", self.current)
+            self._runtime.changed()
+
+    def _spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
+        task = self._loop.create_task(work, name=name)
+        self._work.add(task)
+        task.add_done_callback(self._work.discard)
+
+
+class _TopicField:
+    """A field of a topic that rules refer to."""
+
+    def __init__(self, reference: str) -> None:
+        self._reference = reference
+        self._fields: tuple[str, ...] = ()
+        self.topic = ""
+        """Global name of the topic; empty until it is found."""
+        self.problem = ""
+        """Why the field cannot be read from the topic's messages; empty if it can."""
+
+    def find(self, published: set[str]) -> bool:
+        """Find the topic among the published ones; false if none of the candidates is published."""
+        for topic, fields in split_reference(self._reference):
+            if topic in published:
+                self.topic, self._fields = topic, fields
+                return True
+        return False
+
+    def read(self, kind: MessageType, raw: bytes) -> Any:
+        """The field's value in a serialized message; ``None`` if it does not exist or is no scalar."""
+        fields, problem, value = self._fields, "", None
+        if not fields and len(kind.fields) == 1:
+            fields = (kind.fields[0].name,)
+        try:
+            value = kind.deserialize(raw)
+            for name in fields:
+                value = getattr(value, name)
+            if hasattr(value, "nanosec"):
+                value = float(value.sec + value.nanosec / 1e9)
+            if not isinstance(value, bool | int | float | str):
+                problem = "it is no number, text or truth; name a field of it"
+        except AttributeError:
+            has = ", ".join(field.name for field in kind.fields)
+            problem = f"{kind.name} has no {'.'.join(fields)}; it has {has}"
+        except RmpaError as error:
+            problem = str(error)
+        before, self.problem = self.problem, f"{self._reference}: {problem}" if problem else ""
+        if problem and self.problem != before:
+            _log.warning("! rule over %s", self.problem)
+        return None if problem else value

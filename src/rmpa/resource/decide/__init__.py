@@ -1,1 +1,0 @@
-"""Decides which profile a resource applies. Pure: no I/O, no clocks."""

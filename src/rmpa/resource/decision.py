@@ -1,0 +1,253 @@
+"""Which profile fits: the most similar one, with its reasons; shortfalls and alarms (paper, section 3.1). Pure.
+
+For each requested attribute, a profile's *shortfall* is the distance by which its value lies outside of the bound,
+divided by ``s``: the attribute's tolerance, or else its range over all profiles. Where that is 0, the shortfall is 0
+or 1. A value within the bound has no shortfall. A profile's *distance* ``D`` is the weighted root mean square of its
+shortfalls, plus a part of its cost::
+
+    delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
+
+The result is the profile with the least ``D`` among those that meet every hard requirement. If none does, it is the
+declared best-effort profile, or else the profile with the least (largest weighted hard shortfall, ``D``, cost). In a
+tie the profile that was declared first is chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError
+from rmpa.resource.quality import Scale
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.resource.declare import Profile
+    from rmpa.resource.quality import Attribute, Bound, Value
+
+EPSILON: Final = 1e-3
+"""What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall."""
+_MISSING: Final = 1.0
+"""Shortfall of a profile that does not offer the attribute, or that offers another word: the whole range."""
+EXPECTED: Final = 1.25
+"""Factor by which a soft bound may be missed further than the profile declares, before it counts as violated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One attribute's part in a profile's distance.
+
+    Args:
+        attribute: Name of the attribute.
+        wanted: The requested bound, as a text for people.
+        offered: The profile's value; ``None`` if it offers none.
+        delta: The relative shortfall; 0 if the request is met.
+        weight: Weight of the attribute, above 0.
+        hard: Whether a shortfall makes the profile infeasible.
+    """
+
+    attribute: str
+    wanted: str
+    offered: Value | None
+    delta: float
+    weight: float
+    hard: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileScore:
+    """How well one profile serves the requirements.
+
+    Args:
+        profile: Name of the profile.
+        distance: The profile's ``D`` (see the module).
+        hard_shortfall: The largest weighted shortfall of a hard requirement; 0: all are met.
+        excluded: Why the profile is excluded (a precondition, a cool-down); empty: it is not.
+        terms: The parts of the distance, in the order of the requested attributes.
+    """
+
+    profile: str
+    distance: float
+    hard_shortfall: float
+    excluded: str = ""
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the profile meets every hard requirement and is not excluded."""
+        return self.hard_shortfall == 0.0 and not self.excluded
+
+
+class Decider:
+    """Decides among one resource's profiles.
+
+    Args:
+        resource: Name of the resource, for errors.
+        attributes: The attributes that clients may request, by name.
+        profiles: The declared profiles, in order of declaration.
+    """
+
+    def __init__(self, resource: str, attributes: Mapping[str, Attribute], profiles: Sequence[Profile]) -> None:
+        self._resource = resource
+        self._attributes = attributes
+        self.profiles = {profile.name: profile for profile in profiles}
+        self._spans: dict[str, float] = {}
+        """What a shortfall of 1 is on the scale of each attribute that a profile offers."""
+        for name in {name for profile in profiles for name in profile.offers}:
+            attribute = attributes[name]
+            places = [attribute.position(profile.offers[name]) for profile in profiles if name in profile.offers]
+            span = attribute.tolerance
+            if span is None:
+                self._spans[name] = max(places) - min(places)
+            else:
+                self._spans[name] = math.log(span) if attribute.scale is Scale.LOG else span
+
+    def profile(self, name: str) -> Profile:
+        """The profile of this name.
+
+        Raises:
+            ConfigError: The resource has no profile of this name.
+        """
+        found = self.profiles.get(name)
+        if found is None:
+            near = did_you_mean(name, self.profiles)
+            remedy = f"did you mean {near}?" if near else f"it has {', '.join(self.profiles)}"
+            raise ConfigError(f"profile {name}", f"{self._resource} has no such profile", remedy)
+        return found
+
+    def decide(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> ProfileScore | None:
+        """The profile that serves the requirements best; ``None`` if all are excluded.
+
+        Args:
+            bounds: The merged requirements by attribute; an undeclared attribute raises ``KeyError``.
+            excluded: Profiles that may not be chosen, with the reasons.
+        """
+        scores = [score for score in self.explain(bounds, excluded) if not score.excluded]
+        if feasible := [score for score in scores if score.feasible]:
+            return min(feasible, key=lambda score: score.distance)
+        if effort := next((score for score in scores if self.profiles[score.profile].best_effort), None):
+            return effort
+        costs = {name: profile.cost for name, profile in self.profiles.items()}
+        return min(scores, key=lambda one: (one.hard_shortfall, one.distance, costs[one.profile]), default=None)
+
+    def explain(
+        self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None
+    ) -> tuple[ProfileScore, ...]:
+        """The score of every profile with all its terms, in order of declaration; arguments as for ``decide``."""
+        reasons = excluded or {}
+        texts = {name: bound.describe(self._attributes[name]) for name, bound in bounds.items()}
+        scale = sum(bound.weight for bound in bounds.values())
+        found = []
+        for name, profile in self.profiles.items():
+            terms = tuple(
+                Term(key, texts[key], offer, self._delta(key, bound, offer), bound.weight, bound.hard)
+                for key, bound in bounds.items()
+                for offer in (profile.offers.get(key),)
+            )
+            total = sum(term.weight * term.delta * term.delta for term in terms)
+            distance = (math.sqrt(total / scale) if terms else 0.0) + EPSILON * profile.cost
+            hard = max((term.weight * term.delta for term in terms if term.hard), default=0.0)
+            found.append(ProfileScore(name, distance, hard, reasons.get(name, ""), terms))
+        return tuple(found)
+
+    def _delta(self, name: str, bound: Bound, offered: Value | None) -> float:
+        """The shortfall of a profile in one attribute."""
+        if name not in self._spans:
+            return 0.0  # no profile offers the attribute, so only measurements are judged
+        if offered is None:
+            return _MISSING
+        if bound.words:
+            return 0.0 if offered in bound.words else _MISSING
+        beyond, span = bound.excess(self._attributes[name].position(offered)), self._spans[name]
+        if not beyond:
+            return 0.0
+        return beyond / span if span > 0 else _MISSING
+
+
+# Shortfalls of measured quality, and alarms about them.
+
+
+@dataclass(frozen=True, slots=True)
+class Shortfall:
+    """One attribute that violates the requirements.
+
+    Args:
+        attribute: Name of the attribute.
+        requested: The bound that is violated.
+        offered: The measured value, or else the one that the profile declares; ``None``: there is neither.
+    """
+
+    attribute: str
+    requested: Bound
+    offered: Value | None
+
+
+def find_shortfalls(
+    attributes: Mapping[str, Attribute],
+    measured: Mapping[str, Value],
+    bounds: Mapping[str, Bound],
+    offers: Mapping[str, Value],
+) -> tuple[Shortfall, ...]:
+    """The attributes that violate the requirements in one window; those that were not measured are left out.
+
+    A profile may have been chosen although it is declared to miss a soft bound. Then only a measurement that misses
+    it by ``EXPECTED`` times as much violates it.
+
+    Args:
+        attributes: The resource's attributes, by name.
+        measured: Measured values by attribute.
+        bounds: The merged requirements by attribute.
+        offers: The declared quality of the profile that runs, by attribute.
+    """
+
+    def violates(name: str, bound: Bound) -> bool:
+        attribute, value, offer = attributes[name], measured[name], offers.get(name)
+        if bound.met_by(attribute, value):
+            return False
+        if bound.hard or offer is None or bound.met_by(attribute, offer):
+            return True
+        beyond, declared = bound.excess(attribute.position(value)), bound.excess(attribute.position(offer))
+        return beyond > EXPECTED * declared
+
+    return tuple(
+        Shortfall(name, bound, measured[name])
+        for name, bound in bounds.items()
+        if name in measured and violates(name, bound)
+    )
+
+
+class AlarmKind(Enum):
+    """The kind of an alarm, which determines its diagnostic level (REP 107)."""
+
+    ADAPTATION = "adaptation"
+    """A quality is violated, and another profile takes over: WARN."""
+    NON_ADAPTABLE = "non_adaptable"
+    """No profile meets the requirements; the most similar one runs: ERROR."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """An alarm, which is published to all clients.
+
+    Args:
+        kind: Adaptation or non-adaptable.
+        shortfalls: The violated attributes.
+        before: The profile that ran; empty: none.
+        after: The profile that takes over; equal to ``before`` if that stays.
+    """
+
+    kind: AlarmKind
+    shortfalls: tuple[Shortfall, ...]
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        """The alarm as a sentence."""
+        names = ", ".join(short.attribute for short in self.shortfalls) or "the quality"
+        if self.kind is AlarmKind.ADAPTATION:
+            return f"adaptation: {names} fell short under {self.before}; {self.after} takes over"
+        return f"non-adaptable: no profile gives {names} as asked; {self.after} is the best there is"

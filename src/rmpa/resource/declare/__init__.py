@@ -1,1 +1,0 @@
-"""What a user declares: resources, qualities, requirements, profiles, contexts, parameters."""

@@ -1,0 +1,557 @@
+"""Drives the control loop of a resource: takes measurements and requests, applies profiles, publishes reports.
+
+Requests and reports are plain topics below the resource's node (``docs/smart-resources.md`` lists them), so any node
+in any module can use them. ``resource.adaptation`` makes the decisions.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.resource import limits
+from rmpa.resource.adaptation import Adaptation
+from rmpa.resource.decision import AlarmKind, Decider
+from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, count_missing
+from rmpa.resource.quality import Requirement
+from rmpa.resource.runtime import CALLER, RuntimePart
+from rmpa.resource.saved import Clients, SavedState
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import LENGTH, printable
+from rmpa.runtime.accept import in_thread
+from rmpa.runtime.loop import MachineTimer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.resource.decision import Alarm
+    from rmpa.resource.declare import Context, Hook, Input, Output, Profile
+    from rmpa.resource.quality import Attribute, Bound, Value
+    from rmpa.resource.runtime import Runtime
+    from rmpa.resource.tasks import Tasks
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
+
+_log = logging.getLogger(__name__)
+LEVEL_FOR: Final = "level_for"
+"""The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ."""
+_WAIT: Final = 0.25
+"""The longest time in seconds between two looks whether a profile has been applied."""
+_CLIENTS_INTERVAL: Final = 0.25
+"""Seconds between checks whether clients are still connected."""
+_CONTEXT_PRIORITY: Final = 1 << 30
+"""Priority of a context's requirement; above that of every client."""
+_CONTEXT_CLIENT: Final = "context "
+"""Prefix of the client name under which a context's requirement is kept."""
+
+
+# Calls of the user's functions: those of profiles and contexts, and preconditions.
+
+
+class HungError(RmpaError):
+    """A function of a profile or context has not returned within its time-out; the resource ends."""
+
+
+async def call_function(function: Hook, what: str, name: str, limit: float, remedy: str) -> None:
+    """Call a function of a profile or context: a coroutine function in the event loop, a plain one in a thread.
+
+    A thread cannot be stopped from outside, so a plain function that exceeds its time-out goes on until the process
+    ends.
+
+    Args:
+        function: The function.
+        what: ``profile`` or ``context``.
+        name: Name of the profile or context.
+        limit: The time-out in seconds.
+        remedy: What to do if the function exceeds it.
+
+    Raises:
+        HungError: The function has exceeded its time-out.
+        Exception: As raised by the function.
+    """
+
+    async def run() -> None:
+        CALLER.set(what)
+        outcome = function() if inspect.iscoroutinefunction(function) else await in_thread(function, f"{what} {name}")
+        if outcome is not None:
+            await outcome
+
+    call = asyncio.create_task(run(), name=f"{what} {name}")
+    try:
+        await asyncio.wait([call], timeout=limit)
+    finally:
+        call.cancel()
+    if not call.done():
+        text = f"the function of {what} {name} has not returned within {limit:g} s; the resource ends"
+        raise HungError(f"{text}; {remedy}")
+    if call.cancelled():
+        raise RuntimeError("CancelledError: something that it awaited was cancelled")
+    call.result()
+
+
+class Preconditions:
+    """The preconditions of one resource's profiles (``needs=``), each in a thread of its own: they may block.
+
+    Args:
+        profiles: The declared profiles, by name.
+    """
+
+    def __init__(self, profiles: Mapping[str, Profile]) -> None:
+        self._needs = {name: one.needs for name, one in profiles.items() if one.needs is not None}
+        self._calls: dict[str, asyncio.Task[str | bool | None]] = {}
+        """The call under way, by profile."""
+
+    async def check(self) -> dict[str, str]:
+        """Call all preconditions, except those whose last call has not returned; at most one check at a time.
+
+        Returns:
+            The profiles that must not run, with the reason, after ``limits.PRECONDITION_TIMEOUT`` seconds at most.
+        """
+        for name, needs in self._needs.items():
+            if name not in self._calls:
+                self._calls[name] = asyncio.create_task(in_thread(needs, f"needs of {name}"), name=f"needs of {name}")
+        if not self._calls:
+            return {}
+        done, _ = await asyncio.wait(self._calls.values(), timeout=limits.PRECONDITION_TIMEOUT)
+        found = {}
+        for name, call in list(self._calls.items()):
+            why: str | bool | None = f"its precondition has not answered for {limits.PRECONDITION_TIMEOUT:g} s"
+            if call in done:
+                del self._calls[name]
+                error = call.exception()
+                why = f"its precondition failed: {type(error).__name__}: {error}" if error else call.result()
+            if why is False:
+                why = "its precondition does not hold"
+            if why and isinstance(why, str):
+                found[name] = why
+        return found
+
+    async def close(self) -> None:
+        """Stop waiting for calls; threads that hang are left behind."""
+        for call in self._calls.values():
+            call.cancel()
+        await asyncio.gather(*self._calls.values(), return_exceptions=True)
+
+
+# Texts and values of a resource's reports: alarms, health, responses (``docs/smart-resources.md``).
+
+
+def alarm_values(
+    alarm: Alarm, attributes: Mapping[str, Attribute], *, cleared: bool, reaction: float | None
+) -> dict[str, str]:
+    """The values of an alarm's message, by key; ``reaction``: seconds that the last reconfiguration took."""
+    values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}
+    if cleared and reaction is not None:
+        values["reaction"] = f"{reaction:.6g} s"
+    for short in alarm.shortfalls:
+        values[short.attribute] = _compare(attributes[short.attribute], short.requested, short.offered, "nothing")
+    return values
+
+
+def _compare(attribute: Attribute, requested: Bound, offered: Value | None, absent: str) -> str:
+    shown = attribute.format(offered) if offered is not None else absent
+    return f"wanted {requested.describe(attribute)}, given {shown}"
+
+
+def health(loop: Adaptation, missing: Sequence[str], broken: Sequence[str]) -> tuple[DiagnosticLevel, str]:
+    """Level and message of a resource's ``quality`` and ``/diagnostics``.
+
+    Args:
+        loop: The resource's control loop.
+        missing: What the resource needs and lacks, as texts.
+        broken: What does not work, as texts.
+    """
+    alarm = loop.alarm
+    if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
+        return DiagnosticLevel.ERROR, str(alarm)
+    if missing:
+        return DiagnosticLevel.STALE, "; ".join((*missing, *broken))
+    if not loop.profile:
+        return DiagnosticLevel.ERROR, "; ".join(("no profile runs", *broken))
+    if alarm is not None or broken:
+        return DiagnosticLevel.WARN, "; ".join((*([str(alarm)] if alarm is not None else []), *broken))
+    return DiagnosticLevel.OK, f"profile {loop.profile}"
+
+
+def answer_to(
+    requirement: Requirement, loop: Adaptation, attributes: Mapping[str, Attribute], offered: Mapping[str, Value]
+) -> tuple[DiagnosticLevel, str, dict[str, str]]:
+    """Level, message and values of the response to a client.
+
+    Args:
+        requirement: The client's requirement.
+        loop: The resource's control loop.
+        attributes: The resource's attributes, by name.
+        offered: Measured values of the requested attributes; those not measured yet are left out.
+    """
+    values, short = {}, []
+    for name, bound in requirement.bounds.items():
+        values[name] = _compare(attributes[name], bound, offered.get(name), "not measured yet")
+        if name in offered and not bound.met_by(attributes[name], offered[name]):
+            short.append(name)
+    conflicts = [text for client, text in loop.conflicts if client == requirement.client]
+    level, message = DiagnosticLevel.OK, f"profile {loop.profile}"
+    if loop.alarm is not None and loop.alarm.kind is AlarmKind.NON_ADAPTABLE:
+        level, message = DiagnosticLevel.ERROR, str(loop.alarm)
+    elif not loop.profile:
+        level, message = DiagnosticLevel.WARN, "no profile runs yet"
+    elif short or conflicts:
+        level, message = DiagnosticLevel.WARN, f"{', '.join(short)} {'fall' if len(short) > 1 else 'falls'} short"
+    return level, "; ".join(conflicts) or message, values
+
+
+class Adapter(RuntimePart):
+    """The driver of one resource's control loop.
+
+    Args:
+        runtime: The runtime of the resource.
+        tasks: The resource's tasks, paused while a profile is applied.
+        stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
+    """
+
+    def __init__(self, runtime: Runtime, tasks: Tasks, stop: asyncio.Event) -> None:
+        resource = runtime.resource
+        self._runtime = runtime
+        self._tasks = tasks
+        self._stop = stop
+        self._name = runtime.node.name
+        self._attributes = resource.attributes
+        self._settings = resource.settings
+        decider = Decider(resource.name, self._attributes, list(resource.profiles.values()))
+        self.loop = Adaptation(self._attributes, decider, self._settings, self)
+        self.clients = Clients(resource.name, self._attributes)
+        self.saved = SavedState()
+        """The state that was saved before a restart."""
+        self.preset = ""
+        """The profile chosen by hand before ``start``; empty: the loop decides."""
+        self.reaction: float | None = None
+        """Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first."""
+        self.hung: HungError | None = None
+        """The function for which the resource ends; ``None``: none hangs."""
+        self.observed = ObservedQualities(
+            self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * self._settings.window
+        )
+        self._measuring: QualityMeasurement | None = None
+        """``None`` before the start."""
+        self._measured: dict[str, Value] = {}
+        self._missing: dict[str, int] = {}
+        self._preconditions = Preconditions(resource.profiles)
+        self._blocked_by_needs: dict[str, str] = {}
+        self._blocked_by_context: dict[str, str] = {}
+        self._checking: asyncio.Task[None] | None = None
+        self._applying: asyncio.Task[None] | None = None
+        self._requirements: Subscriber | None = None
+        self.publishers: dict[str, Publisher] = {}
+        self._responses: list[bytes] | None = None
+        self._level: tuple[DiagnosticLevel, float] | None = None
+        """The level of ``quality``, and since when, in monotonic seconds."""
+        self._window_end: float | None = None
+        self._clients_check: float | None = None
+        self._timers = (
+            MachineTimer(self.loop.next_timer, self._handle_timer),
+            MachineTimer(lambda: self._window_end, self._end_window),
+            MachineTimer(lambda: self._clients_check, self._check_clients),
+        )
+        self._closed = False
+
+    # --- start and end ------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Begin to measure, choose the first profile, and serve clients."""
+        self._loop = asyncio.get_running_loop()
+        self._blocked_by_needs = await self._preconditions.check()
+        node, kind = self._runtime.node, MessageType(ARRAY_TYPE)
+        for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
+            self.publishers[name] = await node.advertise(f"{node.name}/{name}", kind, latch=latch)
+        self.publishers["diagnostics"] = await node.advertise("/diagnostics", kind)
+        now, now_ns = self._loop.time(), time.time_ns()
+        self._measuring = QualityMeasurement(self._runtime.resource, now)
+        self._runtime.on_observation = self._measuring.observe
+        requirements = self.clients.restore(self.saved.requirements, now, now_ns)
+        left = {name: one.left(now, now_ns) for name, one in self.saved.cool_downs.items()}
+        cool_downs = {name: one for name, one in left.items() if one is not None}
+        self.loop.restore(requirements, self.saved.last, cool_downs, now)
+        self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
+        await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
+        self.loop.block(self._blocked_by_needs, now)
+        if self.preset:
+            self.loop.pin(self.preset, now, restored=True)
+        else:
+            self.loop.reconsider("the resource starts", now)
+        self._window_end, self._clients_check = now + self._settings.window, now + _CLIENTS_INTERVAL
+        self._tell()
+
+    async def close(self) -> None:
+        """Stop all decisions and reports; a profile that is being applied is given up."""
+        self._closed = True
+        for timer in self._timers:
+            timer.close()
+        self.publishers.clear()
+        tasks = [task for task in (self._checking, self._applying) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._preconditions.close()
+
+    # --- measurements -------------------------------------------------------------------------------------------
+
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+        """Measure a message that an output has sent."""
+        if self._measuring is not None:
+            self._measuring.message(output.name, raw, self._loop.time(), now_ns)
+
+    def received(self, item: Input, message: Received) -> None:
+        """Measure a message that an input has received."""
+        if self._measuring is not None:
+            self._measuring.message(item.name, message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
+
+    def _end_window(self, now: float) -> None:
+        # Counted from the due time, not from now, so that lateness does not add up.
+        self._window_end = max((self._window_end or now) + self._settings.window, now)
+        measured = self._measuring.window(now) if self._measuring is not None else {}
+        self._measured = self.observed.worst(measured, self.loop.requirements, now)
+        for text, missing in count_missing(self._missing, self._runtime.problems()[0]):
+            message = text if missing else f"over: {text}"
+            self._log_change(message, over=not missing)
+            level = DiagnosticLevel.STALE if missing else DiagnosticLevel.OK
+            self._report("alarms", level, message, {"cleared": str(not missing).lower()})
+        if self._checking is None or self._checking.done():
+            self._checking = self._loop.create_task(self._check_preconditions(), name="check preconditions")
+        self.loop.window(self._measured, now)
+        for part in self._runtime.parts:
+            part.window_ended(self._measured)
+        self._report_quality(now)
+        self._tell()
+
+    async def _check_preconditions(self) -> None:
+        self._blocked_by_needs = await self._preconditions.check()
+        self._update_blocked()
+        self._tell()
+
+    def _update_blocked(self) -> None:
+        """Block the profiles whose preconditions do not hold, and those that the context excludes."""
+        self.loop.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
+
+    # --- clients ------------------------------------------------------------------------------------------------
+
+    def _observation_received(self, message: Received) -> None:
+        try:
+            self.observed.report(message.caller_id, _pairs(message), self._loop.time())
+        except ConfigError as error:
+            if self.clients[message.caller_id].refusal != str(error):  # reports repeat; one error is logged once
+                self.refuse(message.caller_id, str(error))
+
+    def _requirement_received(self, message: Received) -> None:
+        client, stamp, now = message.caller_id, message.message.header.stamp, self._loop.time()
+        mark = next((str(s.hardware_id) for s in message.message.status), "")
+        self.clients.received(client, mark, f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else "")
+        try:
+            requirement = self.clients.read(client, _pairs(message), now)
+        except ConfigError as error:
+            self.refuse(client, str(error))
+            return
+        if requirement is not None and requirement.bounds:
+            self.loop.require(requirement, now)
+        elif requirement is not None:
+            self.loop.release(client, now)
+        self._tell()
+
+    def refuse(self, client: str, text: str) -> None:
+        """Publish a response that the client's last message is invalid; ``text`` is the reason."""
+        _log.warning("! %s: %s: %s", self._name, printable(client), text)
+        self.clients.refuse(client, text)
+        self._tell()
+
+    def _check_clients(self, now: float) -> None:
+        self._clients_check = now + _CLIENTS_INTERVAL
+        connected = self._requirements.callers if self._requirements is not None else set()
+        for client in self.clients.remove_absent(connected, now):
+            if client in self.loop.requirements:
+                _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
+            self.loop.release(client, now)
+            self._tell()
+
+    # --- choices ------------------------------------------------------------------------------------------------
+
+    def enter_context(self, context: Context) -> None:
+        """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
+
+        Args:
+            context: The context; one without a name: no context.
+        """
+        now, name = self._loop.time(), f"{_CONTEXT_CLIENT}{context.name}"
+        before = [client for client in self.loop.requirements if client.startswith(_CONTEXT_CLIENT)]
+        barred = set(self._runtime.resource.profiles).difference(context.profiles) if context.profiles else set()
+        self._blocked_by_context = dict.fromkeys(barred, f"not in context {context.name}")
+        self._update_blocked()
+        if bounds := {key: request.bound(self._attributes[key]) for key, request in context.requires.items()}:
+            self.loop.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)
+        for client in before:
+            if client != name or not bounds:
+                self.loop.release(client, now)
+        self.loop.reconsider(f"context {context.name}" if context.name else "no context any more", now)
+        self._tell()
+
+    def pin(self, profile: str) -> None:
+        """Choose a profile by hand; an empty name lets the loop decide.
+
+        Raises:
+            ConfigError: The resource has no profile of this name.
+        """
+        self.loop.pin(profile, self._loop.time())
+        self._tell()
+
+    async def settled(self) -> None:
+        """Wait until no profile is being applied, or the resource ends."""
+        while self.loop.applying and self._applying is not None and not self._closed and self.hung is None:
+            await asyncio.wait([self._applying], timeout=_WAIT)
+
+    # --- what the loop has decided ------------------------------------------------------------------------------
+
+    def apply(self, profile: str, why: str) -> None:
+        """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
+        _log.info("= %s: profile %s: %s", self._name, profile, why)
+        self._applying = self._loop.create_task(self._apply(profile), name=f"apply {profile}")
+
+    async def _apply(self, profile: str) -> None:
+        function, limit, why = self._runtime.resource.profiles[profile].apply, self._settings.apply_timeout, ""
+        try:
+            await self._tasks.pause()
+            self._runtime.hold()
+            remedy = "mend it, or allow it longer: adaptation(apply_timeout=…)"
+            await call_function(function, "profile", profile, limit, remedy)
+        except HungError as error:
+            self._runtime.release(drop=True)
+            self.loop.begin_cool_down(profile, f"not applied within {limit:g} s", self._loop.time())
+            self.end(error)
+            return
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            why = f"{type(error).__name__}: {error}"
+            _log.warning("! %s: profile %s: %s", self._name, profile, why)
+        self._runtime.release(drop=bool(why))
+        self._tasks.resume()
+        self.observed.clear()
+        if why:
+            self.loop.failed(profile, why, self._loop.time())
+        else:
+            self.loop.applied(profile, self._loop.time())
+        self._tell()
+
+    def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
+        """Publish an alarm, or that it is over."""
+        if cleared:
+            level, text = DiagnosticLevel.OK, f"over: {alarm}"
+        else:
+            level, text = DiagnosticLevel.WARN, str(alarm)
+            if alarm.kind is AlarmKind.NON_ADAPTABLE:
+                level = DiagnosticLevel.ERROR
+        self._log_change(text, over=cleared)
+        values = alarm_values(alarm, self._attributes, cleared=cleared, reaction=self.reaction)
+        self._report("alarms", level, text, values)
+
+    def reacted(self, profile: str, reaction: float) -> None:
+        """Begin a new window, so that a profile is not judged by values measured under the previous one."""
+        self.reaction = reaction
+        now = self._loop.time()
+        if self._measuring is not None:
+            self._measuring.restart(now)
+        if self._window_end is not None:
+            self._window_end = now + self._settings.window
+        _log.info("= %s: %s runs, after %.3g s", self._name, profile, reaction)
+
+    def end(self, hung: HungError) -> None:
+        """Raise an alarm about a function that has exceeded its time-out, and let the resource end."""
+        _log.error("! %s: %s", self._name, hung)
+        self.hung = hung
+        values = {"before": self.loop.profile, "after": "", "cleared": "false"}
+        self._report("alarms", DiagnosticLevel.ERROR, str(hung), values)
+        self._stop.set()
+
+    def _handle_timer(self, now: float) -> None:
+        self.loop.handle_timer(now)
+        self._tell()
+
+    # --- reports ------------------------------------------------------------------------------------------------
+
+    def _tell(self) -> None:
+        """Publish what may have changed: profile, decision and responses; and move the timers."""
+        if self._closed:
+            return
+        self._runtime.publish_text("profile", self.loop.profile)
+        self._runtime.publish_text("decision", msgspec.json.encode(self.decision()).decode())
+        self._runtime.changed()
+        refused = [name for name, client in self.clients.known.items() if client.refusal]
+        statuses = [self._response(name) for name in dict.fromkeys((*self.loop.requirements, *refused))]
+        serialized = [status.serialize() for status in statuses]
+        if serialized != self._responses:
+            self._responses = serialized
+            self._publish("responses", serialized)
+        for timer in self._timers:
+            timer.arm()
+
+    def _response(self, name: str) -> DiagnosticStatus:
+        """The response for a client; it repeats the mark of the request, by which the client recognises it."""
+        client, requirement = self.clients[name], self.loop.requirements.get(name)
+        level, message, values = DiagnosticLevel.ERROR, client.refusal, dict[str, str]()
+        if requirement is not None:
+            reports = {key: self.observed.observed(name, key) for key in requirement.bounds}
+            offered = self._measured | {key: value for key, value in reports.items() if value is not None}
+            level, message, values = answer_to(requirement, self.loop, self._attributes, offered)
+            if client.refusal:
+                level, message = DiagnosticLevel.ERROR, f"{client.refusal}; what was asked before stays"
+        return DiagnosticStatus(level, name, message, client.mark or self._runtime.resource.name, values)
+
+    def decision(self) -> dict[str, Any]:
+        """The present decision with each profile's score and terms, as plain values for ``rmpa profile explain``."""
+        loop = self.loop
+        return {
+            "profile": loop.profile,
+            "applying": loop.applying,
+            "chosen": loop.pinned,
+            "reaction": self.reaction,
+            "alarm": loop.alarm.kind.value if loop.alarm is not None else "",
+            "conflicts": [text for _, text in loop.conflicts],
+            "clients": sorted(loop.requirements),
+            "scores": [
+                msgspec.to_builtins(score) | {"feasible": score.feasible} for score in loop.explain(self._loop.time())
+            ],
+        }
+
+    def health(self) -> tuple[DiagnosticLevel, str]:
+        """The present level and message of the resource's ``quality`` topic."""
+        return health(self.loop, *self._runtime.problems())
+
+    def _report_quality(self, now: float) -> None:
+        """Publish the quality of a window, also on ``/diagnostics``, with how long it has had this level."""
+        level, message = self.health()
+        if self._level is None or self._level[0] != level:
+            self._level = level, now
+        values = self._measuring.format(self._measured) if self._measuring is not None else {}
+        values |= {"profile": self.loop.profile, LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
+        if self.reaction is not None:
+            values["reaction"] = f"{self.reaction:.6g} s"
+        for topic in ("quality", "diagnostics"):
+            self._report(topic, level, message, values)
+
+    def _log_change(self, text: str, *, over: bool) -> None:
+        _log.log(logging.INFO if over else logging.WARNING, "%s %s: %s", "=" if over else "!", self._name, text)
+
+    def _report(self, topic: str, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
+        name = self._runtime.resource.name
+        self._publish(topic, [DiagnosticStatus(level, name, message, name, values).serialize()])
+
+    def _publish(self, topic: str, statuses: list[bytes]) -> None:
+        if (publisher := self.publishers.get(topic)) is not None:
+            array = frame_array(0, time.time_ns(), statuses)[LENGTH.size :]
+            publisher.publish_raw(publisher.numbers.stamp(array) if publisher.numbers is not None else array)
+
+
+def _pairs(message: Received) -> list[tuple[str, str]]:
+    """Keys and values of a ``DiagnosticArray``."""
+    return [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]

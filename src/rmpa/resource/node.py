@@ -1,0 +1,312 @@
+"""A running resource: its node, its parts and its life cycle."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.resource.client import Demands
+from rmpa.resource.contexts import Contexts
+from rmpa.resource.loop import Adapter
+from rmpa.resource.reconfigure import Reconfigure
+from rmpa.resource.runtime import LifecycleState, Runtime
+from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
+from rmpa.resource.tasks import Tasks
+from rmpa.ros import limits
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node.fetch_type import fetch_type
+from rmpa.ros.node.node import Node
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.accept import in_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from rmpa.resource.declare import Output
+    from rmpa.resource.resource import Resource
+    from rmpa.resource.runtime import RuntimePart
+
+_log = logging.getLogger(__name__)
+_UNCONFIGURED, _INACTIVE, _ACTIVE, _FINALIZED = LifecycleState
+TRANSITIONS: Final = {
+    "configure": ((_UNCONFIGURED,), _INACTIVE),
+    "activate": ((_INACTIVE,), _ACTIVE),
+    "deactivate": ((_ACTIVE,), _INACTIVE),
+    "finalize": ((_UNCONFIGURED, _INACTIVE, _ACTIVE), _FINALIZED),
+}
+"""The states from which each transition of the life cycle is valid, and the one to which it leads."""
+
+
+class ResourceNode:
+    """Runs one resource on the core of its module.
+
+    Args:
+        resource: The resource, completely declared.
+        master_uri: URI of the core's master.
+        state: The file that keeps the resource's state over a restart; ``None``: nothing is kept.
+        stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
+
+    Raises:
+        ConfigError: The resource declares no profile, so there is nothing to decide.
+    """
+
+    def __init__(
+        self, resource: Resource, master_uri: str, *, state: Path | None = None, stop: asyncio.Event | None = None
+    ) -> None:
+        if not resource.profiles:
+            remedy = "declare one: @NAME.profile(offers={…})"
+            raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy)
+        self.resource = resource
+        self.ended = asyncio.Event()
+        """Set when the resource is finalized, or when its node is shut down from outside."""
+        node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
+        self.runtime = Runtime(resource, node)
+        self.runtime.close_outputs()
+        self.tasks = Tasks(self.runtime, self._deactivate_soon)
+        self.adapter = Adapter(self.runtime, self.tasks, stop if stop is not None else asyncio.Event())
+        self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
+        self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
+        self.demands = Demands(self.runtime)
+        self.parts: list[RuntimePart] = [self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
+        """In the order of their start."""
+        self._persistence: Persistence | None = None
+        if state is not None:
+            self._persistence = Persistence(self.runtime, self._state, state)
+            self.parts.append(self._persistence)
+        self._last = ""
+        """The profile that ran last; empty: none yet."""
+        self._under_way = ""
+        """The transition whose callback runs; empty: none."""
+        self._deactivating: asyncio.Task[None] | None = None
+
+    async def learn(self) -> None:
+        """Wait until the types of all outputs are known: a publisher, here or at a peer, tells an unknown one.
+
+        Missing types and the places searched for them are logged once.
+        """
+        name, logged = self.runtime.node.name, set[str]()
+        while missing := [output for output in self.resource.outputs.values() if output.known is None]:
+            for output in missing:
+                if not await self._learn(output) and output.type_name not in logged:
+                    logged.add(output.type_name)
+                    _log.warning("! %s waits for the type of output %s: %s", name, output.name, output.problem)
+            if any(output.known is None for output in missing):
+                await asyncio.sleep(limits.TYPE_LOOK)
+
+    async def _learn(self, output: Output) -> bool:
+        name = self.runtime.node.name
+        try:
+            learnt = await fetch_type(self.runtime.node.master_uri, name, output.type_name)
+        except UnreachableError as error:
+            _log.debug("! %s: %s", name, error)  # the start reports an unreachable master
+            return False
+        if learnt is None:
+            return False
+        output.known = learnt.kind
+        whence = printable(learnt.node), printable(learnt.topic)
+        _log.info("= %s: %s is learnt from %s, which publishes %s", name, output.type_name, *whence)
+        return True
+
+    async def start(self) -> None:
+        """Configure and activate the resource, once the types of all its outputs are known.
+
+        Raises:
+            PeerRefused: A node of this name runs at the core already, the core refuses a registration, or the
+                callback of ``configure`` or ``activate`` raised.
+            UnreachableError: The core does not answer.
+            HungError: A function of the first profile or context has exceeded its time-out.
+        """
+        await self._refuse_duplicate()
+        await self.learn()
+        if self._persistence is not None:
+            saved = self.adapter.saved = await self._persistence.restore()
+            self.adapter.preset, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
+        try:
+            # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
+            await self.runtime.start(self.parts, self.configuration.load, self._configure)
+        except BaseException:
+            if self._persistence is not None:
+                await self._persistence.close()
+            raise
+        try:
+            await self.adapter.settled()  # the function of the first profile ends before ``activate``
+            if self.adapter.hung is not None:
+                raise self.adapter.hung
+            await self.activate()
+        except RmpaError:
+            await self.close()
+            raise
+
+    async def activate(self) -> None:
+        """Activate an inactive resource: open the outputs, call its callback, then start the tasks.
+
+        Raises:
+            LocalProtocolError: The resource is not inactive, or a transition is under way.
+            PeerRefused: The callback of ``activate`` raised; the resource stays inactive.
+        """
+        await self._change_state("activate")
+
+    async def deactivate(self) -> None:
+        """Deactivate an active resource: end its tasks, call its callback, then close the outputs.
+
+        Raises:
+            LocalProtocolError: The resource is not active, or a transition is under way.
+        """
+        await self._change_state("deactivate")
+
+    async def close(self) -> None:
+        """Finalize the resource, from any state, and close its parts and its node; does nothing the second time."""
+        if self.runtime.state is _FINALIZED:
+            return
+        if self._deactivating is not None:
+            await asyncio.wait([self._deactivating])
+        if self.runtime.state is _ACTIVE:
+            await self.deactivate()
+        await self._change_state("finalize")
+        await self.runtime.close()
+        self.ended.set()
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    async def _configure(self) -> None:
+        try:
+            await self._change_state("configure")
+        except RmpaError:
+            await self._change_state("finalize")
+            raise
+
+    async def _refuse_duplicate(self) -> None:
+        """Refuse to start if a node of this name runs already, because registering again would shut that node down.
+
+        Raises:
+            PeerRefused: Such a node runs.
+        """
+        node = self.runtime.node
+        reply = await call_api(node.master_uri, "lookupNode", node.name, node.name)
+        if reply.code != 1:
+            return
+        try:
+            other = await call_api(str(reply.value), "getPid", node.name, timeout=1.0)
+        except RmpaError:
+            return  # a registration without a running node
+        text = f"a node {node.name} runs there already (process {other.value})"
+        raise PeerRefused(f"the core at {node.master_uri}", text, "end it, or name this resource otherwise")
+
+    async def _change_state(self, transition: str) -> None:
+        """Make a transition of the life cycle, with the user's callback for it.
+
+        If the callback raises, the state stays the same, except after ``finalize`` and ``deactivate``: an error must
+        not prevent these.
+        """
+        runtime, (valid, target) = self.runtime, TRANSITIONS[transition]
+        if self._under_way:
+            raise LocalProtocolError(f"{transition} while {self._under_way} is under way")
+        if runtime.state not in valid:
+            raise LocalProtocolError(f"{runtime.state} does not lead anywhere by {transition}")
+        self._under_way = transition
+        if transition == "deactivate":
+            await self.tasks.deactivate()
+        elif transition == "activate":
+            runtime.open_outputs()
+        why = ""
+        hook = self.resource.hooks.get(transition)
+        try:
+            if inspect.iscoroutinefunction(hook):
+                await hook()
+            elif hook is not None:
+                outcome = await in_thread(hook, transition)
+                if outcome is not None:
+                    await outcome
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            why = f"{type(error).__name__}: {error}"
+            _log.warning("! %s: %s: %s", runtime.node.name, transition, why)
+        refused = bool(why) and transition in ("configure", "activate")
+        self._under_way = ""
+        runtime.state = runtime.state if refused else target
+        if runtime.state is not _ACTIVE:
+            runtime.close_outputs()
+        elif not refused:
+            self.tasks.activate()
+        runtime.publish_text("state", runtime.state)
+        if refused:
+            raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
+
+    def _deactivate_soon(self, why: str) -> None:
+        over = self._deactivating is None or self._deactivating.done()
+        if over and self.runtime.state is _ACTIVE and not self._under_way:
+            _log.error("! %s is deactivated: %s", self.runtime.node.name, why)
+            self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
+
+    def _state(self, now: float, now_ns: int) -> SavedState:
+        """The state to keep over a restart; see ``Persistence``."""
+        loop = self.adapter.loop
+        self._last = loop.profile or self._last
+        cooling = loop.cooling(asyncio.get_running_loop().time())
+        return SavedState(
+            parameters={n: p.value for n, p in self.resource.parameters.items() if p.value != p.default},
+            chosen=loop.pinned,
+            last=self._last,
+            context=self.contexts.chosen,
+            requirements=self.adapter.clients.save(loop.requirements, now, now_ns),
+            cool_downs={
+                name: SavedCoolDown(
+                    until_ns=now_ns + round((one.until - now) * 1e9), cool_down=one.cool_down, why=one.why
+                )
+                for name, one in cooling.items()
+            },
+        )
+
+
+async def run_all(
+    resources: list[Resource],
+    master_uri: str,
+    stop: asyncio.Event,
+    ready: Callable[[], None],
+    directory: Path | None = None,
+) -> None:
+    """Run resources until ``stop`` is set or all of them have ended.
+
+    Args:
+        resources: Resources of one module, with different names.
+        master_uri: URI of the master of the module's core.
+        stop: Set by the caller to end all resources; set here when a function has exceeded its time-out.
+        ready: Called when all resources are active.
+        directory: The folder of the resources' state; ``None``: nothing is kept over a restart.
+
+    Raises:
+        RmpaError: A resource cannot start, or a function of one has exceeded its time-out; all are closed.
+    """
+    running: list[ResourceNode] = []
+    stopped = asyncio.create_task(stop.wait())
+    try:
+        # Resources that wait for the type of an output start last.
+        for resource in sorted(resources, key=lambda each: any(o.known is None for o in each.outputs.values())):
+            state = directory / f"{resource.name}.json" if directory is not None else None
+            one = ResourceNode(resource, master_uri, state=state, stop=stop)
+            types = asyncio.create_task(one.learn(), name=f"types of {resource.name}")
+            await asyncio.wait([types, stopped], return_when=asyncio.FIRST_COMPLETED)
+            if not types.done():
+                types.cancel()
+                await asyncio.gather(types, return_exceptions=True)
+                break
+            await types
+            await one.start()
+            running.append(one)
+        else:
+            ready()
+            while not stop.is_set() and (left := [one for one in running if not one.ended.is_set()]):
+                ended = asyncio.create_task(left[0].ended.wait())
+                await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
+                ended.cancel()
+    finally:
+        stopped.cancel()
+        await asyncio.gather(stopped, return_exceptions=True)
+        for one in reversed(running):
+            await one.close()
+    for one in running:
+        if one.adapter.hung is not None:
+            raise one.adapter.hung

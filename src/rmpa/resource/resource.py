@@ -1,0 +1,500 @@
+"""``Resource``: the declaration of a Smart Resource. Nothing runs here; ``rmpa.resource.node`` executes it.
+
+::
+
+    sonar = Resource("sonar", role="sensing")
+    ranges = sonar.output("ranges", "sensor_msgs/Range", deadline="100 ms")
+    gain = sonar.parameter("gain", 1.0, low=0.0, high=10.0)
+
+    @sonar.profile(offers={"rate": "40 Hz"})
+    def precise() -> None: ...
+
+    @sonar.task(rate="40 Hz")
+    def measure() -> None:
+        ranges.publish(range=0.3)
+
+Each of these calls checks its arguments and raises ``ConfigError`` with the problem and a remedy.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError
+from rmpa.core.identity import is_legal_name
+from rmpa.resource.declare import (
+    AdaptationSettings,
+    Context,
+    DeclaredAttribute,
+    Demand,
+    Hook,
+    Input,
+    OnFailure,
+    Output,
+    Parameter,
+    ParameterValue,
+    Profile,
+    Task,
+    check_arity,
+    parse_rule,
+    read_contract,
+    read_enum,
+)
+from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
+
+if TYPE_CHECKING:
+    from rmpa.resource.quality import QoSRequest
+
+_RATE_MAX: Final = 10_000
+"""The highest rate of a periodic task, in Hz."""
+_Function = TypeVar("_Function", bound=Callable[..., object])
+RESERVED: Final = frozenset(
+    {
+        "alarms", "context", "decision", "descriptor", "observed", "parameter_descriptions", "parameter_updates",
+        "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
+    }
+)  # fmt: skip
+"""Names below a resource's node that are reserved for topics, services and parameters of every resource."""
+NOT_ATTRIBUTES: Final = frozenset({"expires", "level_for", "priority", "profile", "reaction"})
+"""Keys of requirements and quality reports that cannot be names of attributes."""
+_LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, "apply_timeout": 0.01}
+"""The least value in seconds of each time of the control loop."""
+_DAY: Final = 86400
+
+
+class Role(StrEnum):
+    """The function of a module in the robot (paper, section 3)."""
+
+    SENSING = "sensing"
+    ACTING = "acting"
+    CONTROLLING = "controlling"
+
+
+class Resource:
+    """The declaration of one Smart Resource.
+
+    Args:
+        name: A ROS base name; the resource's node is ``/<name>``.
+        role: ``sensing``, ``acting`` or ``controlling``.
+        physical: Whether the resource has a real device; else it is simulated.
+        description: A text for people.
+
+    Raises:
+        ConfigError: The name is illegal or the role is unknown.
+    """
+
+    def __init__(self, name: str, *, role: str, physical: bool = True, description: str = "") -> None:
+        if not name or not is_legal_name(name) or "/" in name or name.startswith("~"):
+            raise ConfigError("resource", f"{name!r} is not a ROS base name", "letters, digits and _, a letter first")
+        if role not in set(Role):
+            near = did_you_mean(role, list(Role))
+            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(Role)}"
+            raise ConfigError(f"resource {name}", f"there is no role {role!r}", remedy)
+        self.name = name
+        self.role = Role(role)
+        self.physical = physical
+        self.description = description
+        self.outputs: dict[str, Output] = {}
+        self.inputs: dict[str, Input] = {}
+        self.parameters: dict[str, Parameter] = {}
+        self.declared_attributes: dict[str, DeclaredAttribute] = {}
+        self.profiles: dict[str, Profile] = {}
+        self.contexts: dict[str, Context] = {}
+        self.tasks: dict[str, Task] = {}
+        self.demands: dict[str, Demand] = {}
+        self.hooks: dict[str, Hook] = {}
+        self.settings = AdaptationSettings()
+        """Parameters of the control loop."""
+
+    # --- interfaces -------------------------------------------------------------------------------
+
+    def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
+        """Declare a topic that the resource publishes.
+
+        Args:
+            name: A name in the resource's namespace, or a global one (``/cmd_vel``).
+            kind: The message type, ``package/Name``: one that comes with rmpa, or of this machine's ROS packages
+                (``rmpa.ros.types.find``). A type of another package is learnt at the start from a publisher of that
+                type, here or in another module; the resource waits for one.
+            latch: Whether a late subscriber gets the last message.
+            contract: The keys of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
+
+        Raises:
+            ConfigError: The name is illegal or taken, or the contract has an unknown key or an invalid value.
+            DefinitionError: The type's name is malformed, or its package is known and has no such type.
+        """
+        where = self._check_topic("output", name, self.outputs, self.inputs)
+        made = Output(name, kind, read_contract(where, contract))
+        made.latch = latch
+        self.outputs[name] = made
+        return made
+
+    def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
+        """Declare a topic that the resource needs; arguments and errors as for ``output``, except ``required``.
+
+        A type that is unknown on this machine is learnt from the topic's publisher; the resource starts without it.
+        ``required``: whether the resource is stale while the topic has no publisher.
+        """
+        where = self._check_topic("input", name, self.inputs, self.outputs)
+        made = Input(name, kind, read_contract(where, contract))
+        made.required = required
+        self.inputs[name] = made
+        return made
+
+    def asks(self, resource: str, *, priority: int = 0, **requests: QoSRequest) -> Demand:
+        """Declare a requirement on another resource: ``keeper.asks("sonar", accuracy=at_most("5 cm"))``.
+
+        Args:
+            resource: Name of the other resource's node in this module's graph.
+            priority: In a conflict between clients the higher priority wins.
+            requests: By attribute of the other resource; ``ranges.rate`` is written ``ranges__rate``.
+
+        Raises:
+            ConfigError: The name is illegal, is the resource's own, or has a requirement already.
+        """
+        where = f"what {self.name} asks of {resource}"
+        name = resource if resource.startswith("/") else f"/{resource}"
+        if not is_legal_name(name) or name == "/":
+            raise ConfigError(where, f"{resource!r} is not a ROS name", "for example sonar, or /robot1/sonar")
+        if name in self.demands:
+            raise ConfigError(where, "it asks it already", "say all wishes at once, or change them by .ask()")
+        if name == f"/{self.name}":
+            raise ConfigError(where, "that is itself", "give its profiles what they need")
+        made = self.demands[name] = Demand(name, dict(requests), priority)
+        return made
+
+    def parameter(
+        self,
+        name: str,
+        default: ParameterValue,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        choices: Sequence[ParameterValue] = (),
+        unit: str = "",
+        description: str = "",
+    ) -> Parameter:
+        """Declare a parameter, whose type is that of its default; ``Parameter`` explains the arguments.
+
+        Raises:
+            ConfigError: The name is illegal or taken, the bounds are the wrong way round, or the default is invalid.
+        """
+        where = self._check_name("parameter", name, self.parameters)
+        made = Parameter(name, default, low, high, tuple(choices), unit, description)
+        made.check_declaration(where)
+        self.parameters[name] = made
+        return made
+
+    def attribute(
+        self,
+        name: str,
+        *,
+        better: str,
+        unit: str = "",
+        scale: str = "linear",
+        category: str = "performance",
+        tolerance: float | str | None = None,
+        words: Sequence[str] = (),
+    ) -> DeclaredAttribute:
+        """Declare a quality attribute that the user's code observes, in addition to ``quality.MEASURED``.
+
+        Args:
+            name: ``accuracy``, ``energy`` …
+            better: ``max``, ``min``, ``target`` or ``exact``.
+            unit: Unit of the values (``resource.quality``); empty: a ratio.
+            scale: ``linear``, ``log``, ``ordinal`` or ``nominal``.
+            category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
+            tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.
+            words: The values of ordinal and nominal scales.
+
+        Raises:
+            ConfigError: The name is illegal or taken, or the arguments contradict each other.
+        """
+        where = f"attribute {name} of {self.name}"
+        if name in self.attributes or name in MEASURED:
+            raise ConfigError(where, "there is one of this name already", "name it otherwise")
+        if not is_legal_name(name) or not name or "/" in name or name in NOT_ATTRIBUTES:
+            remedy = f"letters, digits and _, a letter first, and none of {', '.join(sorted(NOT_ATTRIBUTES))}"
+            raise ConfigError(where, f"{name!r} cannot be the name of one", remedy)
+        plain = tolerance if tolerance is None else quantity(tolerance, unit if scale == "linear" else "", where)
+        attribute = Attribute(
+            name=name,
+            direction=read_enum(Direction, better, where),
+            unit=unit,
+            scale=read_enum(Scale, scale, where),
+            category=read_enum(Category, category, where),
+            tolerance=plain,
+            words=tuple(words),
+        )
+        made = self.declared_attributes[name] = DeclaredAttribute(attribute)
+        return made
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The prefix of the measured attributes of each output and input, by name, outputs first.
+
+        The prefix is the last part of the name; if that is taken, as many last parts as make it unique, joined by
+        dots; if all are taken, the whole name after ``in.`` or ``out.``.
+        """
+        found: dict[str, str] = {}
+        for name in (*self.outputs, *self.inputs):
+            parts = name.strip("/").split("/")
+            several = [".".join(parts[-count:]) for count in range(1, len(parts) + 1)]
+            several.append(f"{'in' if name in self.inputs else 'out'}.{several[-1]}")
+            found[name] = next((label for label in several if label not in found.values()), several[-1])
+        return found
+
+    @property
+    def attributes(self) -> dict[str, Attribute]:
+        """All attributes that clients may request: the declared ones, and those measured of each output and input.
+
+        ``rate`` is that of the first output; ``scan.rate`` names the output or input by its label (``labels``).
+        """
+        found: dict[str, Attribute] = {}
+        for position, label in enumerate(self.labels.values()):
+            for key, attribute in MEASURED.items():
+                if position == 0 and self.outputs:
+                    found[key] = attribute
+                found[f"{label}.{key}"] = attribute
+        return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
+
+    # --- behaviour -------------------------------------------------------------------------------------------
+
+    def profile(
+        self,
+        *,
+        offers: Mapping[str, float | str],
+        cost: float = 0.0,
+        best_effort: bool = False,
+        needs: Callable[[], str | bool | None] | None = None,
+        name: str = "",
+        description: str = "",
+    ) -> Callable[[_Function], _Function]:
+        """Declare a System Profile; the decorated function applies it.
+
+        Args:
+            offers: The offered quality: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
+            cost: Relative cost; decides among profiles of nearly equal distance.
+            best_effort: Whether the profile runs when none meets the requirements.
+            needs: The precondition, called once in each window in a thread of its own, so it may block. It returns
+                true or ``None`` while the profile may be used, else false or a text with the reason.
+            name: By default the function's name.
+            description: By default the first line of the function's docstring.
+
+        Raises:
+            ConfigError: The name is taken, an attribute or unit is unknown, a value is invalid, or there is a
+                best-effort profile already.
+        """
+
+        def declare(function: _Function) -> _Function:
+            title = name or function.__name__
+            where = self._new("profile", title, self.profiles)
+            check_arity(function, 0, where)
+            if needs is not None:
+                check_arity(needs, 0, f"the precondition of {where}")
+                if inspect.iscoroutinefunction(needs):
+                    raise ConfigError(where, "its precondition is a coroutine function", "make it a plain one")
+            if not (math.isfinite(cost) and cost >= 0):
+                raise ConfigError(where, f"a cost of {cost:g}", "it is at least 0")
+            for one in self.profiles.values():
+                if best_effort and one.best_effort:
+                    problem = f"{one.name} is the best-effort profile already"
+                    raise ConfigError(where, problem, "mark one of them only")
+            attributes = self.attributes
+            values = {
+                key: find_attribute(attributes, key, self.name).parse(value, f"{where}, {key}")
+                for key, value in offers.items()
+            }
+            text = description or (function.__doc__ or "").strip().partition("\n")[0]
+            self.profiles[title] = Profile(title, values, cost, best_effort, text, function, needs)  # type: ignore[arg-type] # check_arity
+            return function
+
+        return declare
+
+    def context(
+        self,
+        name: str,
+        *,
+        when: str = "",
+        requires: Mapping[str, QoSRequest] | None = None,
+        profiles: Sequence[str] = (),
+        outputs: Sequence[Output] | None = None,
+        enter: Hook | None = None,
+    ) -> Context:
+        """Declare a context; the profiles and attributes that it names must be declared before.
+
+        ``declare.Context`` explains the arguments.
+
+        Raises:
+            ConfigError: The name is taken, a profile or attribute is unknown, an output is another resource's, or the
+                rule is invalid.
+        """
+        where = self._new("context", name, self.contexts)
+        for profile in profiles:
+            if profile not in self.profiles:
+                near = did_you_mean(profile, self.profiles)
+                remedy = f"did you mean {near}?" if near else "declare the profile before the context"
+                raise ConfigError(where, f"there is no profile {profile}", remedy)
+        for key, request in (requires or {}).items():
+            request.bound(find_attribute(self.attributes, key, self.name))
+        if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
+            raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
+        if when:
+            parse_rule(when, self.parameters, where)
+        names = tuple(output.name for output in outputs) if outputs is not None else None
+        made = self.contexts[name] = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
+        return made
+
+    def task(
+        self,
+        *,
+        rate: float | str | Parameter | None = None,
+        on: Input | None = None,
+        name: str = "",
+        on_failure: str = "restart",
+        stuck_after: float | str | None = None,
+    ) -> Callable[[_Function], _Function]:
+        """Declare a task, which runs periodically at a rate or on each message of an input.
+
+        Args:
+            rate: The rate, such as ``"10 Hz"``, or a parameter whose present value is the rate in Hz.
+            on: The input on whose messages the task runs.
+            name: By default the function's name.
+            on_failure: ``restart``, ``stop`` or ``deactivate`` (``declare.OnFailure``).
+            stuck_after: A run that takes longer counts as stuck; in seconds or with a unit.
+
+        Raises:
+            ConfigError: Neither or both of ``rate`` and ``on`` are given, the rate is out of range, or the input or
+                parameter is another resource's.
+        """
+
+        def declare(function: _Function) -> _Function:
+            title = name or function.__name__
+            where = self._new("task", title, self.tasks)
+            if (rate is None) == (on is None):
+                raise ConfigError(where, "it needs either a rate or an input", 'rate="10 Hz", or on=an input')
+            rate_parameter, hertz = None, None
+            if isinstance(rate, Parameter):
+                self._check_rate(rate, where)
+                rate_parameter, hertz = rate, float(rate.default)
+            elif rate is not None:
+                hertz = quantity(rate, "Hz", where)
+            if hertz is not None and not 0 < hertz <= _RATE_MAX:
+                raise ConfigError(where, f"a rate of {hertz:g} Hz", "it is above 0 and at most 10 kHz")
+            if on is not None and on not in self.inputs.values():
+                raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
+            seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
+            check_arity(function, 1 if on is not None else 0, where)
+            if seconds is not None and seconds <= 0:
+                raise ConfigError(where, f"stuck after {seconds:g} s", "it is above 0")
+            policy = read_enum(OnFailure, on_failure, where)
+            self.tasks[title] = Task(title, function, hertz, on, policy, seconds, rate_parameter)  # type: ignore[arg-type] # check_arity
+            return function
+
+        return declare
+
+    def adaptation(
+        self,
+        *,
+        window: float | str = 1.0,
+        violations: int = 2,
+        windows: int = 3,
+        improvement: float = 0.05,
+        dwell: float | str = 2.0,
+        settle: float | str = 1.0,
+        cool_down: float | str = 10.0,
+        cool_down_max: float | str = 160.0,
+        apply_timeout: float | str = 5.0,
+    ) -> None:
+        """Set the parameters of the control loop: ``AdaptationSettings`` explains them; times may have a unit.
+
+        Args:
+            window: Length of a quality window.
+            violations: Number of violated windows among the last ``windows`` that is a disturbance.
+            windows: Number of last windows that are considered.
+            improvement: Least improvement of the distance for a change without a disturbance.
+            dwell: Least time that a profile runs before such a change.
+            settle: Time after a change in which windows are not judged.
+            cool_down: Time for which a profile is excluded after it failed or was violated.
+            cool_down_max: The longest such time, if that happens repeatedly.
+            apply_timeout: Time-out of a profile's function.
+
+        Raises:
+            ConfigError: A time is out of range, or ``violations`` is greater than ``windows``.
+        """
+        where = f"adaptation of {self.name}"
+        if not 1 <= violations <= windows <= 100:
+            raise ConfigError(where, f"{violations} of {windows} windows", "1 <= violations <= windows <= 100")
+        texts = {"window": window, "dwell": dwell, "settle": settle, "cool_down": cool_down}
+        texts |= {"cool_down_max": cool_down_max, "apply_timeout": apply_timeout}
+        times = {name: quantity(value, "s", f"{where}, {name}") for name, value in texts.items()}
+        for name, least in _LEAST.items():
+            if not least <= times[name] <= _DAY:
+                raise ConfigError(where, f"{name} is {times[name]:g} s", f"at least {least:g} s, at most a day")
+        times["cool_down_max"] = max(times["cool_down_max"], times["cool_down"])
+        self.settings = AdaptationSettings(violations, windows, improvement, **times)
+
+    def on(self, event: str) -> Callable[[_Function], _Function]:
+        """Declare the callback of a life-cycle transition.
+
+        Args:
+            event: ``configure``, ``activate``, ``deactivate`` or ``finalize``.
+
+        Raises:
+            ConfigError: The transition is unknown, or has a callback already.
+        """
+        known = ("configure", "activate", "deactivate", "finalize")
+        if event not in known:
+            near = did_you_mean(event, known)
+            remedy = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
+            raise ConfigError(f"resource {self.name}", f"no change {event!r}", remedy)
+        if event in self.hooks:
+            raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
+
+        def declare(function: _Function) -> _Function:
+            check_arity(function, 0, f"what {self.name} does at {event}")
+            self.hooks[event] = function  # type: ignore[assignment] # check_arity
+            return function
+
+        return declare
+
+    def _new(self, kind: str, name: str, known: Mapping[str, object]) -> str:
+        """Refuse a name that is taken, and return a description of the declared item for errors."""
+        where = f"{kind} {name} of {self.name}"
+        if name in known:
+            raise ConfigError(where, "there are two of this name", "name one of them otherwise")
+        return where
+
+    def _check_rate(self, parameter: Parameter, where: str) -> None:
+        if parameter not in self.parameters.values():
+            raise ConfigError(where, f"{parameter.name} is no parameter of this resource", "declare it there first")
+        low, high = parameter.bounds
+        if parameter.type not in ("int", "double") or not low > 0 or not high <= _RATE_MAX:
+            remedy = f"declare it with low above 0 and high at most {_RATE_MAX:g}"
+            raise ConfigError(where, f"{parameter.name} may be what no rate can be", remedy)
+
+    def _check_topic(self, kind: str, name: str, same: Mapping[str, object], other: Mapping[str, object]) -> str:
+        where = self._check_name(kind, name, same)
+        if name in other:
+            opposite = "an input" if kind == "output" else "an output"
+            remedy = "a global name (/scan) is another topic"
+            raise ConfigError(where, f"it is {opposite} of the same resource", remedy)
+        return where
+
+    def _check_name(self, kind: str, name: str, known: Mapping[str, object]) -> str:
+        """Check a new name, and return a description of the declared item for errors."""
+        where = f"{kind} {name} of {self.name}"
+        if not name or not is_legal_name(name) or name.startswith("~"):
+            raise ConfigError(where, f"{name!r} is not a ROS name", "letters, digits, _ and /, a letter or / first")
+        if kind == "parameter" and "/" in name:
+            raise ConfigError(where, "a parameter has a base name", "leave the / out")
+        if name in known:
+            raise ConfigError(where, "there is one of this name already", "name it otherwise")
+        if name.removeprefix(f"/{self.name}/") in RESERVED:
+            raise ConfigError(where, "that name is the resource's own", f"not one of {', '.join(sorted(RESERVED))}")
+        return where

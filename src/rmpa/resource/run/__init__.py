@@ -1,1 +1,0 @@
-"""Runs resources: nodes, tasks, control loop, life cycle, store."""

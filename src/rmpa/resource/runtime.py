@@ -1,0 +1,321 @@
+"""The runtime of one resource: its node, its topics, and the events that its parts receive (``RuntimePart``)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+import threading
+import time
+from collections import Counter, deque
+from contextvars import ContextVar
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.core.errors import RmpaError
+from rmpa.resource import limits
+from rmpa.resource.descriptor import TOPIC, describe, topic_of
+from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
+from rmpa.ros.wire.tcpros import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Mapping
+
+    from rmpa.resource.declare import Input, Output, Parameter
+    from rmpa.resource.quality import Value
+    from rmpa.resource.resource import Resource
+    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
+    from rmpa.ros.node.node import Node
+
+_log = logging.getLogger(__name__)
+_CLOSED: Final = "life cycle"
+CALLER: ContextVar[str] = ContextVar("caller", default="")
+"""``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
+begins; else empty."""
+
+
+class LifecycleState(StrEnum):
+    """State of a resource: as of ROS 2's managed nodes (design.ros2.org/articles/node_lifecycle).
+
+    ::
+
+        unconfigured ──configure──► inactive ──activate──► active
+                                        ▲                    │
+                                        └─────deactivate─────┘
+        any of them ──finalize──► finalized
+    """
+
+    UNCONFIGURED = "unconfigured"
+    """The node is registered; the device is not open yet."""
+    INACTIVE = "inactive"
+    """Parameters can be set; no task runs and nothing is published."""
+    ACTIVE = "active"
+    """The tasks run, and outputs are published."""
+    FINALIZED = "finalized"
+    """The resource has ended; no transition leads out of this state."""
+
+
+class RuntimePart:
+    """Base of the parts of a running resource. The callbacks do nothing here; all are called in the event loop."""
+
+    async def start(self) -> None:
+        """Start the part: the node is registered and the outputs are advertised; tasks do not run yet."""
+
+    async def close(self) -> None:
+        """End the part: the resource ends; the node is still registered."""
+
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+        """An output has sent a message."""
+
+    def received(self, item: Input, message: Received) -> None:
+        """An input has received a message."""
+
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """A parameter's value has changed."""
+
+    def window_ended(self, measured: Mapping[str, Value]) -> None:
+        """A quality window has ended; the measured values are by attribute."""
+
+    def changed(self) -> None:
+        """The requirements, the profile, its cool-downs, the context or a choice by hand may have changed."""
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Problems apart from the quality, as texts: first what is missing, second what does not work."""
+        return [], []
+
+
+class Runtime:
+    """Runs one resource on a node: connects its declaration, its topics and its parts.
+
+    Args:
+        resource: The resource, completely declared.
+        node: The resource's node, with the resource's name; not yet entered.
+    """
+
+    def __init__(self, resource: Resource, node: Node) -> None:
+        self.resource = resource
+        self.node = node
+        self.parts: list[RuntimePart] = []
+        self.state = LifecycleState.UNCONFIGURED
+        self.on_observation: Callable[[str, Value], None] = lambda _attribute, _value: None
+        """Called in the event loop with each value that the user's code has observed."""
+        self.context_outputs: tuple[str, ...] | None = None
+        """The only outputs that are published in the present context; ``None``: all."""
+        self._publishers: dict[str, Publisher] = {}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._texts: dict[str, tuple[Publisher, str | None]] = {}
+        self._held: deque[tuple[Output, bytes, str]] = deque()
+        self._held_bytes = 0
+        self._holders: set[str] = set()
+        self._open = True
+        self._refused: Counter[str] = Counter()
+        """Number of messages refused since the outputs were closed, by output."""
+        self._unusable: set[tuple[str, str]] = set()
+        """Pairs of an input and a publisher whose message definition cannot be used; each is logged once."""
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = 0
+        self._undo = contextlib.AsyncExitStack()
+
+    async def start(self, parts: Iterable[RuntimePart] = (), *first: Callable[[], Awaitable[None]]) -> None:
+        """Register the node, its outputs and inputs, and start the parts in the given order.
+
+        Args:
+            parts: The parts of the resource.
+            first: Called one after the other before the parts start.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses a registration.
+        """
+        self.parts = list(parts)
+        self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
+        async with contextlib.AsyncExitStack() as undo:
+            await undo.enter_async_context(self.node)
+            for output in self.resource.outputs.values():
+                topic = topic_of(output.name, self.node.name)
+                self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
+                output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
+                undo.callback(setattr, output, "on_publish", None)
+            for declared in self.resource.declared_attributes.values():
+                declared.on_observation = functools.partial(self.call_in_loop, self._observed)
+                undo.callback(setattr, declared, "on_observation", None)
+            for parameter in self.resource.parameters.values():
+                parameter.on_change = functools.partial(self.call_in_loop, self._parameter_changed)
+                undo.callback(setattr, parameter, "on_change", None)
+            for name in (TOPIC, "state", "profile", "decision", "context"):
+                kind = MessageType("std_msgs/String")
+                publisher = await self.node.advertise(f"{self.node.name}/{name}", kind, latch=True)
+                self._texts[name] = publisher, None
+            self.publish_descriptor()
+            for item in self.resource.inputs.values():
+                await self._subscribe(item)
+            for step in first:
+                await step()
+            for part in self.parts:
+                await part.start()
+                undo.push_async_callback(part.close)
+            self._undo = undo.pop_all()
+
+    async def close(self) -> None:
+        """Close the parts in reverse order of their start, then the node."""
+        await self._undo.aclose()
+
+    def publish_text(self, name: str, text: str) -> None:
+        """Publish a text on one of the resource's latched topics ``std_msgs/String``, if it differs from the last."""
+        publisher, before = self._texts[name]
+        if text != before:
+            self._texts[name] = publisher, text
+            publisher.publish(data=text)
+
+    def publish_descriptor(self) -> None:
+        """Publish the descriptor, at the start and after the declaration has changed."""
+        self.publish_text(TOPIC, describe(self.resource, self.node.name).serialize())
+
+    def changed(self) -> None:
+        """Tell the parts that requirements, profile, context or a choice may have changed."""
+        for part in self.parts:
+            part.changed()
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Problems of all parts apart from the quality, as texts: what is missing, and what does not work."""
+        missing = [
+            f"no node publishes {name}"
+            for name, item in self.resource.inputs.items()
+            if item.required and not ((subscriber := self._subscribers.get(name)) and subscriber.publishers)
+        ]
+        broken = []
+        for part in self.parts:
+            lacks, fails = part.problems()
+            missing += lacks
+            broken += fails
+        if self.state is not LifecycleState.ACTIVE:
+            broken.append(f"it is {self.state}")
+        return missing, broken
+
+    def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
+        """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
+        if threading.get_ident() == self._thread:
+            function(*args)
+        elif self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(function, *args)
+
+    def _observed(self, attribute: str, value: Value) -> None:
+        self.on_observation(attribute, value)
+
+    def _parameter_changed(self, parameter: Parameter) -> None:
+        for part in self.parts:
+            part.parameter_changed(parameter)
+
+    # --- inputs -------------------------------------------------------------------------------------------------
+
+    async def _subscribe(self, item: Input) -> None:
+        unknown = item.known is None
+
+        def received(message: Received) -> None:
+            if not unknown or self._learn(item, message):
+                for part in self.parts:
+                    part.received(item, message)
+
+        name, topic = self.node.name, topic_of(item.name, self.node.name)
+        if unknown:
+            text = "is not known here; a publisher of"
+            _log.info("= %s: the type of input %s, %s, %s %s tells it", name, item.name, item.type_name, text, topic)
+        self._subscribers[item.name] = await self.node.subscribe(topic, item.known or item.type_name, received)
+
+    def _learn(self, item: Input, message: Received) -> bool:
+        """Take the type of an input from its publisher's header; false if the definition there cannot be used."""
+        caller = printable(message.caller_id)
+        try:
+            kind = message.kind
+        except RmpaError as error:
+            if (item.name, caller) not in self._unusable:
+                self._unusable.add((item.name, caller))
+                text = "its messages are dropped; this is said once"
+                _log.warning("! %s: input %s from %s: %s; %s", self.node.name, item.name, caller, error, text)
+            return False
+        if item.known is None:
+            item.known = kind
+            _log.info("= %s: %s is learnt from %s", self.node.name, item.type_name, caller)
+        return True
+
+    # --- outputs ------------------------------------------------------------------------------------------------
+
+    def hold(self, holder: str = "profile") -> None:
+        """Queue messages from now on, so that no output mixes messages of two profiles or two contexts.
+
+        Args:
+            holder: The kind of change: ``profile``, ``context`` or the life cycle. The queue is sent when no holder
+                is left.
+        """
+        if not self._open:
+            # Messages of the previous change of this kind are outdated.
+            self._held = deque(held for held in self._held if held[2] in {"profile", "context"} - {holder})
+            self._held_bytes = sum(len(raw) for _, raw, _ in self._held)
+        self._holders.add(holder)
+
+    def release(self, holder: str = "profile", *, drop: bool = False) -> None:
+        """End a ``hold``; without another holder the queued messages are sent in order.
+
+        Args:
+            holder: As given to ``hold``.
+            drop: Drop the queued messages instead: they belong to a profile that was not applied.
+        """
+        self._holders.discard(holder)
+        if drop or not self._holders:
+            held, self._held, self._held_bytes = self._held, deque(), 0
+            for output, raw, _ in held if not drop else ():
+                self._send(output, raw)
+
+    def open_outputs(self) -> None:
+        """Send messages from now on; first those that functions of profiles and contexts published while closed."""
+        self._open = True
+        for name, count in self._refused.items():
+            _log.info("= %s: %s flows again; %d messages were refused", self.node.name, name, count)
+        self._refused.clear()
+        self.release(_CLOSED)
+
+    def close_outputs(self) -> None:
+        """Refuse messages from now on; the first refusal of each output is logged.
+
+        Messages of the function of the last profile and of the last context are queued instead: they describe the
+        state that the resource has when the outputs open again.
+        """
+        self._open = False
+        self.hold(_CLOSED)
+
+    def _publish(
+        self, output: Output, numbers: HeaderNumbers, values: Mapping[str, Any], message: object | None
+    ) -> None:
+        """Serialize a message in the caller's thread, so that the caller gets the errors, and send it in the loop."""
+        kind = output.type
+        try:
+            payload = kind.serialize(kind.given(message, values))
+        except MessageError as error:
+            raise MessageError(f"{output.name}: {error}") from None
+        self.call_in_loop(self._accept, output, bytes(numbers.stamp(payload)), CALLER.get())
+
+    def _accept(self, output: Output, raw: bytes, caller: str) -> None:
+        """Send one message, or queue it while a profile or context is being applied; ``caller`` is ``CALLER``."""
+        if not self._open and not caller:
+            self._refused[output.name] += 1
+            if self._refused[output.name] == 1:
+                text = "is refused while the resource is not active; this is said once"
+                _log.warning("! %s: what is published on %s %s", self.node.name, output.name, text)
+        elif self._holders:
+            self._held.append((output, raw, caller))
+            self._held_bytes += len(raw)
+            while self._held_bytes > limits.RESOURCE_HELD_MAX and len(self._held) > 1:
+                self._held_bytes -= len(self._held.popleft()[1])  # drop-oldest
+        else:
+            self._send(output, raw)
+
+    def _send(self, output: Output, raw: bytes) -> None:
+        publisher = self._publishers.get(output.name)
+        if publisher is None or (self.context_outputs is not None and output.name not in self.context_outputs):
+            return
+        publisher.publish_raw(raw)
+        now_ns = time.time_ns()
+        for part in self.parts:
+            part.published(output, raw, now_ns)

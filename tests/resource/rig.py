@@ -1,0 +1,55 @@
+"""What the tests of resources share: waiting for what comes, and listening to topics."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from rmpa.resource.quality import Attribute, Bound, QoSRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.node.endpoints import Subscriber
+    from rmpa.ros.node.node import Node
+
+TEXT = "std_msgs/String"
+ARRAY = "diagnostic_msgs/DiagnosticArray"
+DEADLINE = 30.0
+OK, WARN, ERROR, STALE = range(4)
+
+
+def bound(attribute: Attribute, **request: Any) -> Bound:
+    """The bound of a request: ``bound(RATE, at_least="20 Hz", hard=True)``."""
+    return QoSRequest(**request).bound(attribute)
+
+
+async def until(true: Callable[[], object], why: str = "it does not come") -> None:
+    try:
+        async with asyncio.timeout(DEADLINE):
+            while not true():
+                await asyncio.sleep(0.01)
+    except TimeoutError:
+        raise AssertionError(why) from None
+
+
+async def listen(node: Node, topic: str, kind: str = TEXT) -> list[Any]:
+    """The messages of a topic, which come later."""
+    found: list[Any] = []
+    await node.subscribe(topic, kind, lambda received: found.append(received.message))
+    return found
+
+
+async def status(topic: Subscriber, fits: Callable[[Any], bool]) -> Any:
+    """The first status on a topic that fits."""
+    async with asyncio.timeout(DEADLINE):
+        async for received in topic:
+            for one in received.message.status:
+                if fits(one):
+                    return one
+    raise AssertionError
+
+
+def pairs(one: Any) -> dict[str, str]:
+    """The values of a status."""
+    return {pair.key: pair.value for pair in one.values}

@@ -1,0 +1,107 @@
+// What the pages compute: the layout of the ring, figures as text, patches, and the search.
+import assert from "node:assert/strict";
+import test from "node:test";
+
+import { bandwidth, bytes, duration, hertz, plain, seconds, sentence } from "./static/format.js";
+import { SIZE, arrange, chord, emptyRing, geometry, outside, place } from "./static/ring.js";
+import { adopt, applyPatch } from "./static/state.js";
+
+const THIN = "\u2009";
+const far = (a, b) => Math.hypot(a.x - b.x, a.y - b.y);
+
+test("a module keeps its place when others come and go, and this module is at the top", () => {
+  const ring = emptyRing();
+  const before = arrange(ring, "pc", ["pc", "base", "arm"]);
+  assert.equal(before.places.pc, 0);
+  assert.equal(new Set(Object.values(before.places)).size, 3);
+  assert.deepEqual(arrange(ring, "pc", ["base", "arm", "pc"]), before);
+  const more = arrange(ring, "pc", ["arm", "pc", "camera"]);
+  assert.equal(more.places.arm, before.places.arm);
+  assert.equal(more.places.camera, before.places.base);
+});
+
+test("a full ring gets more slots, and its order stays", () => {
+  const ring = emptyRing();
+  const names = Array.from({ length: 300 }, (_, at) => `m${String(at).padStart(3, "0")}`);
+  let order = [];
+  for (const most of [1, 4, 5, 9, 30, 256, 300]) {
+    const { slots, places } = arrange(ring, names[0], names.slice(0, most));
+    assert.equal(new Set(Object.values(places)).size, most);
+    assert.ok(Math.max(...Object.values(places)) < slots);
+    const present = Object.keys(places).sort((a, b) => places[a] - places[b]);
+    assert.deepEqual(
+      present.filter((name) => order.includes(name)),
+      order,
+    );
+    order = present;
+  }
+});
+
+test("another module's page begins a ring of its own", () => {
+  const ring = emptyRing();
+  arrange(ring, "pc", ["pc", "base"]);
+  assert.deepEqual(arrange(ring, "base", ["pc", "base"]).places.base, 0);
+});
+
+for (const slots of [4, 8, 16, 32, 256])
+  for (const compact of [false, true])
+    test(`${slots} modules stand inside the picture and apart${compact ? ", on a phone" : ""}`, () => {
+      const geo = geometry(slots, compact);
+      const places = Array.from({ length: slots }, (_, slot) => place(slot, geo));
+      for (const at of places) {
+        assert.ok(at.x >= geo.node && at.x <= SIZE - geo.node && at.y >= geo.node && at.y <= SIZE - geo.node);
+        if (geo.small) assert.ok(["start", "middle", "end"].includes(outside(at, geo).anchor));
+      }
+      if (slots <= 16) assert.ok(far(places[0], places[1]) > 2 * geo.node, "two neighbours overlap");
+    });
+
+test("a chord goes from edge to edge, and both directions are apart", () => {
+  const geo = geometry(4, false);
+  const [a, b] = [place(0, geo), place(1, geo)];
+  const there = chord(a, b, geo.node, 9);
+  assert.match(there.d, /^M[\d.]+ [\d.]+Q[\d.]+ [\d.]+ [\d.]+ [\d.]+$/);
+  assert.ok(Math.abs(far(there.at(0), a) - Math.hypot(geo.node + 10, 9)) < 9);
+  assert.ok(far(there.at(0.5), chord(b, a, geo.node, 9).at(0.5)) > 10);
+  assert.doesNotMatch(chord(a, a, geo.node, 0).d, /NaN/);
+});
+
+test("figures have three digits and a unit", () => {
+  for (const [said, text] of [
+    [bytes(0), "0 B"],
+    [bytes(999), "999 B"],
+    [bytes(1234567), "1.23 MB"],
+    [bandwidth(36900), "36.9 kB/s"],
+    [bandwidth(undefined), "–"],
+    [hertz(49.96), "50 Hz"],
+    [hertz(9.95), "9.9 Hz"],
+    [hertz(0.123), "0.12 Hz"],
+    [hertz(1234.5), "1235 Hz"],
+    [seconds(0), "0 s"],
+    [seconds(0.00035), "350 µs"],
+    [seconds(0.0123), "12.3 ms"],
+    [seconds(2), "2.00 s"],
+    [seconds(3600), "1 h 00 min"],
+    [seconds(NaN), "–"],
+    [duration(59.4), "59 s"],
+    [duration(61), "1 min 01 s"],
+    [duration(90000), "1 d 1 h"],
+  ])
+    assert.equal(said, text.replaceAll(/(?<=\d) /g, THIN).replaceAll(/(?<=min|h|d) /g, " "));
+});
+
+test("what is not seen in a text is shown by its code", () => {
+  assert.equal(plain("a\u202eb\u0000"), "a\\u202eb\\u0000");
+  assert.equal(plain("naïve – ok"), "naïve – ok");
+  assert.equal(sentence("no agent answers"), "No agent answers.");
+  assert.equal(sentence("rmpa up starts one"), "rmpa up starts one.");
+  assert.equal(sentence(""), "");
+});
+
+test("a patch changes what it names alone, and removes with null (RFC 7396)", () => {
+  const state = adopt({ topics: { "/a": { rate: 1 }, "/b": { rate: 2 } }, notes: ["x"] });
+  const next = applyPatch(state, { topics: { "/a": { rate: 5 }, "/b": null }, notes: [] });
+  assert.equal(JSON.stringify(next), '{"topics":{"/a":{"rate":5}},"notes":[]}');
+  assert.equal(applyPatch(state, { notes: ["y"] }).topics, state.topics, "what is not touched is the same object");
+  assert.equal(applyPatch(state, { ["__proto__"]: { polluted: 1 } }).polluted, undefined);
+  assert.equal(adopt(JSON.parse('{"__proto__": {"toString": 1}}')).toString, undefined);
+});

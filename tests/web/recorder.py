@@ -1,0 +1,321 @@
+"""What a session is tested with: a hub and a connection that write down its calls, and give what the test says."""
+
+from __future__ import annotations
+
+import inspect
+from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import cbor2
+import msgspec
+
+from rmpa.core.errors import RmpaError
+from rmpa.ros.types.installed import ServiceType
+from rmpa.ros.types.messages import MessageType
+from rmpa.web.gateways.frame_writer import FairQueue, Opcode
+from rmpa.web.hub.graph import GraphService, GraphTopic
+from rmpa.web.hub.node_link import EVERYTHING
+from rmpa.web.hub.topics import ReceivedMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.web.gateways.connection import ClientStream
+    from rmpa.web.gateways.frame_writer import OutFrame
+    from rmpa.web.hub.hub import HubClient
+
+NOW_NS = 1_700_000_000_000_000_123
+
+
+class Asked(SimpleNamespace):
+    """One call of a session: its name and arguments, and what the test does with it."""
+
+    what: str
+    published: list[bytes]
+    receive: Callable[[ReceivedMessage], None]
+    differs: Callable[[str], None]
+    done: Callable[[Any], None]
+    failed: Callable[[RmpaError], None]
+
+    def __init__(self, what: str, **arguments: Any) -> None:
+        super().__init__(what=what, closed=False, published=[], reason="", **arguments)
+
+    def close(self, reason: str = "") -> None:
+        self.__dict__.update(closed=True, reason=reason)
+
+    def publish(self, payload: Any) -> None:
+        self.published.append(bytes(payload))
+
+    def message(self, payload: bytes | memoryview, type_: str = "std_msgs/String", md5sum: str = "") -> None:
+        """Let the hub have a message for this subscription."""
+        view = payload if isinstance(payload, memoryview) else memoryview(payload)
+        self.receive(ReceivedMessage(self.topic, type_, view, NOW_NS, "/talker", md5sum))
+
+
+class Graph:
+    """The graph, as the test makes it up."""
+
+    def __init__(self) -> None:
+        self.topics: dict[str, GraphTopic] = {}
+        self.services: dict[str, GraphService] = {}
+        self.nodes: tuple[str, ...] = ()
+        self.found: dict[str, str] = {}
+        self.searched: list[str] = []
+        self.changed: Callable[[], None] = lambda: None
+
+    def add_topic(self, name: str, *types: str, publishers: tuple[str, ...] = (), subscribers: Any = ()) -> None:
+        self.topics[name] = GraphTopic(name, types, publishers, tuple(subscribers))
+
+    def add_service(self, name: str, kind: str, provider: str = "/server", uri: str = "rosrpc://robot:1234") -> None:
+        self.services[name] = GraphService(name, kind, (provider,), uri)
+
+    def show(self, *entries: GraphTopic | GraphService) -> None:
+        """The graph is this from now on."""
+        self.topics = {each.name: each for each in entries if isinstance(each, GraphTopic)}
+        self.services = {each.name: each for each in entries if isinstance(each, GraphService)}
+        self.changed()
+
+    def follow(self, changed: Callable[[], None]) -> Asked:
+        self.changed = changed
+        changed()
+        return Asked("follow")
+
+    async def find(self, name: str) -> str:
+        self.searched.append(name)
+        if name not in self.found:
+            raise RmpaError(f"no service {name}")
+        self._say(name)
+        return self.found[name]
+
+    async def find_all(self) -> None:
+        for name in self.found:
+            self._say(name)
+
+    def _say(self, name: str) -> None:
+        known = self.services.get(name)
+        if known is not None:
+            self.services[name] = msgspec.structs.replace(known, type=self.found[name])
+            self.changed()
+
+
+class Types:
+    """The definitions that rmpa brings; others are learnt when the test says so."""
+
+    def __init__(self) -> None:
+        self.missing: dict[str, RmpaError] = {}
+        self.versions: dict[str, MessageType] = {}
+        self.asked: list[str] = []
+        self.on_learnt: Callable[[MessageType], None] = lambda _: None
+
+    def message(self, name: str) -> MessageType:
+        return MessageType(name)
+
+    def version(self, name: str, md5sum: str) -> MessageType:
+        return self.versions.get(md5sum) or self.message(name)
+
+    def service(self, name: str) -> ServiceType:
+        return ServiceType(name)
+
+    async def find_message(self, name: str, md5sum: str = "") -> MessageType:
+        self.asked.append(name)
+        if name in self.missing:
+            raise self.missing[name]
+        return self.version(name, md5sum)
+
+    async def find_service(self, name: str) -> ServiceType:
+        return ServiceType(name)
+
+
+class Params:
+    """The parameters, as the test makes them up; those at ``/denied`` cannot be changed."""
+
+    def __init__(self) -> None:
+        self.tree: dict[str, Any] = {}
+        self.changes: list[tuple[str, Any]] = []
+
+    async def set(self, name: str, value: Any) -> None:
+        if name == "/denied":
+            raise RmpaError("the core refuses it")
+        self.changes.append((name, value))
+
+    async def delete(self, name: str) -> None:
+        await self.set(name, None)
+
+
+class FakeHub:
+    """What sessions read of a hub."""
+
+    def __init__(self, *, sim_time: bool = False) -> None:
+        self.graph = Graph()
+        self.types = Types()
+        self.published: dict[str, str] = {}
+        self.params = Params()
+        self.link = SimpleNamespace(rules=EVERYTHING)
+        self.topics = SimpleNamespace(publishers=SimpleNamespace(names=self.published))
+        self.time = SimpleNamespace(now_ns=lambda: NOW_NS, simulated=sim_time)
+
+
+class Connection:
+    """The connection of a session: what it was given, encoded at once."""
+
+    def __init__(self, client: Recorded) -> None:
+        self._client = client
+        self.queue: FairQueue[Any] = FairQueue()
+        self.sent: list[OutFrame] = []
+        self.ended: list[int] = []
+
+    def push(self, *frames: OutFrame) -> None:
+        self.sent += frames
+
+    def push_frames(self, _: ClientStream, frames: list[OutFrame]) -> None:
+        self.sent += frames
+
+    def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
+        self.sent += stream.frames(message, self._client.now)
+
+    def end(self, code: int, _reason: str, _refusal: str = "") -> None:
+        self.ended.append(code)
+
+    def age(self) -> float:
+        return 0.0
+
+
+class Recorded:
+    """One client with its session; `now` is the clock of all calls."""
+
+    def __init__(self, session: Any) -> None:
+        self.now = 0.0
+        self.session = session
+        self.asked: list[Asked] = []
+        self.connection = Connection(self)
+        self.session.connection = self.connection
+        record(session, self.asked)
+
+    def send_raw(self, data: str | bytes) -> list[Asked]:
+        """Take a frame of the client; returns what the session has asked for then."""
+        count = len(self.asked)
+        self.session.received_frame(data, self.now)
+        return self.asked[count:]
+
+    def one(self, what: str, asked: list[Asked]) -> Asked:
+        (only,) = asked
+        assert only.what == what
+        return only
+
+    def last(self, what: str) -> Asked:
+        return next(each for each in reversed(self.asked) if each.what == what)
+
+    def all(self, what: str) -> list[Asked]:
+        return [each for each in self.asked if each.what == what]
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass; timers are handled at their time."""
+        end = self.now + seconds
+        while (at := self.session.next_timer()) is not None and at <= end:
+            self.now = max(self.now, at)
+            self.session.handle_timer(self.now)
+        self.now = end
+
+    def frames(self) -> list[OutFrame]:
+        """What the client got since the last call."""
+        sent, self.connection.sent = self.connection.sent, []
+        return sent
+
+
+def record(client: HubClient, asked: list[Asked]) -> None:
+    """Have the calls of a client written down in place of being done."""
+    made: Any = client
+
+    def say(what: str, **arguments: Any) -> Asked:
+        asked.append(Asked(what, **arguments))
+        return asked[-1]
+
+    def run(work: Any, done: Callable[[Any], None], failed: Callable[[RmpaError], None]) -> None:
+        def finish(result: Any) -> None:
+            try:
+                done(result)
+            except RmpaError as error:
+                failed(error)
+
+        if isinstance(work, Asked):
+            work.done, work.failed = finish, failed
+        else:
+            drive(work, done, failed)
+
+    names: dict[str, Callable[..., Asked]] = {
+        "subscribe": lambda topic, type_, receive, failed, differs=None: say(
+            "subscribe", topic=topic, type=type_, receive=receive, failed=failed, differs=differs
+        ),
+        "advertise": lambda topic, type_, failed, latch=False: say(
+            "advertise", topic=topic, type=type_, failed=failed, latch=latch
+        ),
+        "serve": lambda service, type_, called, failed: say(
+            "serve", service=service, type=type_, called=called, failed=failed
+        ),
+        "call": lambda service, type_, request, timeout=None: say(
+            "call", service=service, type=type_, request=bytes(request), timeout=timeout
+        ),
+        "find_service": lambda service: say("find_service", service=service),
+        "get_params": lambda names: say("get_params", names=names),
+        "set_param": lambda name, value: say("set_param", name=name, value=value),
+        "delete_param": lambda name: say("delete_param", name=name),
+        "follow_params": lambda names, changed: say("follow_params", names=names, changed=changed),
+        "fetch_asset": lambda uri, most: say("fetch_asset", uri=uri, most=most),
+    }
+    rights = {"advertise": "publish", "serve": "offer services"}
+    for name, recorded in names.items():
+
+        def checked(*args: Any, name: str = name, recorded: Callable[..., Asked] = recorded, **kwargs: Any) -> Asked:
+            if name in rights:
+                made.check_control(rights[name])
+            return recorded(*args, **kwargs)
+
+        setattr(made, name, checked)
+    made.run = run
+
+
+def drive(work: Any, done: Callable[[Any], None], failed: Callable[[RmpaError], None]) -> None:
+    """Do work that waits for nothing."""
+    assert inspect.iscoroutine(work)
+    try:
+        work.send(None)
+    except StopIteration as stop:
+        done(stop.value)
+    except RmpaError as error:
+        failed(error)
+    else:
+        raise AssertionError("it waits")
+
+
+def answer(asked: Asked, data: bytes) -> None:
+    """Let the hub do something with what it was asked, as it may with any client."""
+    error = RmpaError("it cannot be done")
+    if asked.what == "subscribe":
+        asked.message(data)
+        asked.failed(error)
+    elif asked.what == "serve":
+        response: Future[bytes] = Future()
+        asked.called(data, response)
+        asked.failed(error)
+    elif asked.what == "advertise":
+        asked.failed(error)
+    elif asked.what == "call":
+        asked.done(data)
+    elif asked.what == "find_service":
+        asked.done("std_srvs/Empty")
+    elif asked.what in ("set_param", "delete_param"):
+        asked.done(None)
+    elif asked.what == "get_params":
+        asked.done({"/a": 1.0, "/b": data})
+    elif asked.what == "follow_params":
+        asked.changed({"/a": [data], "/b": None})
+    elif asked.what == "fetch_asset":
+        asked.done(data)
+
+
+def decoded(frame: OutFrame) -> dict[str, Any]:
+    opcode, parts = frame
+    data = b"".join(parts)
+    values: dict[str, Any] = cbor2.loads(data) if opcode is Opcode.BINARY else msgspec.json.decode(data)
+    return values
