@@ -83,7 +83,7 @@ def test_what_an_ended_subscription_had_is_not_sent() -> None:
     queue.end(7)
     assert queue.bytes == 1
     assert _all(queue) == ["b"]
-    assert not queue
+    assert queue.pop() is None
 
 
 @given(
@@ -111,4 +111,4 @@ def test_bytes_are_counted_and_bounded_and_order_is_kept(steps: list[tuple[int, 
     while (entry := queue.pop()) is not None:
         assert entry in inside
     assert queue.bytes == 0
-    assert not queue
+    assert queue.pop() is None

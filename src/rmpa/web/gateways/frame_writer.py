@@ -88,7 +88,7 @@ def frame_header(opcode: Opcode, size: int) -> bytes:
     return _LONG.pack(_FIN | opcode, 127, size)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Queue(Generic[_T]):
     stream: object
     priority: int
@@ -116,35 +116,25 @@ class FairQueue(Generic[_T]):
     ) -> None:
         self._total = total_bytes
         self._each = subscription_bytes
-        self._urgent: deque[tuple[_T, int]] = deque()
-        self._urgent_bytes = 0
-        self._data_bytes = 0
+        self._urgent: _Queue[_T] = _Queue(None, 0)
         self._queues: dict[object, _Queue[_T]] = {}
-        self._turns: dict[int, deque[_Queue[_T]]] = {}
-        """The subscriptions that have entries, by priority, in the order of their turns."""
+        """The subscriptions that have entries, in the order of their turns."""
+        self.bytes = 0
+        """Bytes that wait."""
         self.dropped: Counter[Any] = Counter()
         """Messages dropped so far, by subscription, of the present ones."""
         self.dropped_total = 0
         """Messages dropped so far, those of ended subscriptions included."""
 
-    def __bool__(self) -> bool:
-        """Whether there is anything to send."""
-        return bool(self._urgent or self._turns)
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that wait."""
-        return self._urgent_bytes + self._data_bytes
-
     @property
     def overflow(self) -> bool:
         """Whether the entries that are never dropped exceed the bound alone."""
-        return self._urgent_bytes > self._total
+        return self._urgent.size > self._total
 
     @property
     def waiting(self) -> Mapping[object, int]:
         """Messages that wait, by subscription."""
-        return {queue.stream: len(queue.entries) for queue in self._queues.values() if queue.entries}
+        return {stream: len(queue.entries) for stream, queue in self._queues.items()}
 
     def push(self, stream: object, entry: _T, size: int, priority: int = 0) -> None:
         """Add an entry.
@@ -155,79 +145,67 @@ class FairQueue(Generic[_T]):
             size: Its bytes.
             priority: Of the subscription; a higher one is served first.
         """
-        if stream is None:
-            self._urgent.append((entry, size))
-            self._urgent_bytes += size
-            self._make_room(None)
-            return
-        queue = self._queues.get(stream)
-        if queue is None:
-            queue = self._queues[stream] = _Queue(stream, priority)
-        if not queue.entries:
-            queue.priority = priority
-            self._turns.setdefault(priority, deque()).append(queue)
+        queue = self._urgent
+        if stream is not None:
+            queue = self._queues.get(stream) or self._queues.setdefault(stream, _Queue(stream, priority))
         queue.entries.append((entry, size))
         queue.size += size
-        self._data_bytes += size
-        while queue.size > self._each and len(queue.entries) > 1:
+        self.bytes += size
+        while stream is not None and queue.size > self._each and len(queue.entries) > 1:
             self._drop_oldest(queue)
-        self._make_room(queue)
+        while self.bytes > self._total and self._queues and self._drops_for(queue):
+            pass
 
     def pop(self) -> _T | None:
         """The next entry; ``None`` where there is none."""
-        if self._urgent:
-            entry, size = self._urgent.popleft()
-            self._urgent_bytes -= size
-            return entry
-        if not self._turns:
+        if self._urgent.entries:
+            return self._take(self._urgent)
+        if not self._queues:
             return None
-        priority = max(self._turns)
-        turns = self._turns[priority]
-        queue = turns.popleft()
-        entry, size = queue.entries.popleft()
-        queue.size -= size
-        self._data_bytes -= size
+        # The first of the highest priority: its next turn is behind all others.
+        queue = max(self._queues.values(), key=_priority)
+        del self._queues[queue.stream]
+        entry = self._take(queue)
         if queue.entries:
-            turns.append(queue)
-        elif not turns:
-            del self._turns[priority]
+            self._queues[queue.stream] = queue
         return entry
 
     def end(self, stream: object) -> None:
         """Forget a subscription, and what waits for it."""
         self.dropped.pop(stream, None)
-        queue = self._queues.pop(stream, None)
-        if queue is not None and queue.entries:
-            self._data_bytes -= queue.size
-            self._forget_turn(queue)
+        if (queue := self._queues.pop(stream, None)) is not None:
+            self.bytes -= queue.size
 
-    def _make_room(self, newest: _Queue[_T] | None) -> None:
-        """Drop until all together fit; the newest message stays where it is the only one."""
-        while self.bytes > self._total and self._turns:
-            turns = self._turns[min(self._turns)]
-            fullest = max(turns, key=lambda queue: queue.size)
-            if fullest is newest and len(fullest.entries) == 1:
-                if len(self._turns) == 1 and len(turns) == 1 and not self._urgent:
-                    return
-                # Others of the same or a higher priority wait: the newest gives way if it alone has this priority.
-                others = [queue for queue in turns if queue is not newest]
-                fullest = max(others, key=lambda queue: queue.size) if others else fullest
-            self._drop_oldest(fullest)
+    def _drops_for(self, newest: _Queue[_T]) -> bool:
+        """Drop a message, as all together do not fit; the newest one stays where it is the only one."""
+        lowest = min(map(_priority, self._queues.values()))
+        queues = [queue for queue in self._queues.values() if queue.priority == lowest]
+        fullest = max(queues, key=lambda queue: queue.size)
+        if fullest is newest and len(fullest.entries) == 1:
+            if len(self._queues) == 1 and not self._urgent.entries:
+                return False
+            # Others of the same or a higher priority wait: the newest gives way if it alone has this priority.
+            others = [queue for queue in queues if queue is not newest]
+            fullest = max(others, key=lambda queue: queue.size, default=fullest)
+        self._drop_oldest(fullest)
+        return True
 
     def _drop_oldest(self, queue: _Queue[_T]) -> None:
-        _, size = queue.entries.popleft()
-        queue.size -= size
-        self._data_bytes -= size
+        self._take(queue)
         self.dropped[queue.stream] += 1
         self.dropped_total += 1
         if not queue.entries:
-            self._forget_turn(queue)
+            del self._queues[queue.stream]
 
-    def _forget_turn(self, queue: _Queue[_T]) -> None:
-        turns = self._turns[queue.priority]
-        turns.remove(queue)
-        if not turns:
-            del self._turns[queue.priority]
+    def _take(self, queue: _Queue[_T]) -> _T:
+        entry, size = queue.entries.popleft()
+        queue.size -= size
+        self.bytes -= size
+        return entry
+
+
+def _priority(queue: _Queue[Any]) -> int:
+    return queue.priority
 
 
 _log = logging.getLogger(__name__)

@@ -217,13 +217,12 @@ class TypeLibrary:
         """
         kind = self._messages.get(name)
         if kind is None:
-            self._may_search(name, brought=known_text(name) is not None, service=False)
             try:
-                kind = MessageType(name) if known_text(name) is not None else find_message_type(name)
-            except RmpaError as error:
-                if isinstance(error, UnknownTypeError) and error.fetchable:
+                kind = self._here(name, known_text(name) is not None, MessageType, find_message_type, service=False)
+            except UnknownTypeError as error:
+                if error.fetchable:
                     self._finding.start(name, lambda: self._find(name))  # a publisher may tell it, for the next time
-                raise self._remember(name, error, service=False) from None
+                raise
             self._keep(name, kind)
         return kind
 
@@ -248,11 +247,7 @@ class TypeLibrary:
         """A service type; as ``message``."""
         kind = self._services.get(name)
         if kind is None:
-            self._may_search(name, brought=name in known_services(), service=True)
-            try:
-                kind = ServiceType(name) if name in known_services() else find_service_type(name)
-            except RmpaError as error:
-                raise self._remember(name, error, service=True) from None
+            kind = self._here(name, name in known_services(), ServiceType, find_service_type, service=True)
             self._services[name] = kind
             _bound(self._services, ros_limits.TYPES_FOUND_MAX)
         return kind
@@ -325,15 +320,21 @@ class TypeLibrary:
         self.on_learnt(kind)
         return kind
 
-    def _may_search(self, name: str, *, brought: bool, service: bool) -> None:
-        """Count a search on this machine, which reads files, and walks through all packages for an unknown type.
+    def _here(
+        self, name: str, brought: bool, make: Callable[[str], _T], find: Callable[[str], _T], *, service: bool
+    ) -> _T:
+        """A type that rmpa brings, or that this machine has: its search reads files, and walks through packages.
 
         Raises:
-            RmpaError: It was searched for in vain just now, or too many were; the event loop serves robots too.
+            RmpaError: It is not found, or too many were searched for just now; the event loop serves robots too.
         """
         self._check_missing(name, service=service)
         if not brought and not self._searches.take(asyncio.get_running_loop().time()):
             raise RmpaError("too many types were searched for at once; ask again in a second")
+        try:
+            return make(name) if brought else find(name)
+        except RmpaError as error:
+            raise self._remember(name, error, service=service) from None
 
     def _check_missing(self, name: str, *, service: bool) -> None:
         when, error = self._missing.get((name, service), (0.0, None))

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import functools
 import logging
+import weakref
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -141,7 +142,7 @@ class _Latched:
 
     message: ReceivedMessage
     header: Mapping[str, str]
-    had: set[ClientSubscription] = field(default_factory=set)
+    had: weakref.WeakSet[ClientSubscription] = field(default_factory=weakref.WeakSet)
 
 
 @dataclass(slots=True, eq=False)
@@ -152,7 +153,6 @@ class _Topic:
     kind: MessageType | None = None
     """The type that it is registered with; ``None``: any."""
     linger: asyncio.TimerHandle | None = None
-    latched: dict[str, _Latched] = field(default_factory=dict)
     headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
     """The last header of each publisher, by its name."""
 
@@ -173,8 +173,8 @@ class HubTopics:
         self._graph = graph
         self._now_ns = now_ns
         self._topics: dict[str, _Topic] = {}
-        self._latched_bytes = 0
-        self._latched_order: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._latched: OrderedDict[tuple[str, str], _Latched] = OrderedDict()
+        """The last messages of latching sources, by topic and source, the oldest first."""
         self._buffers = PayloadBuffers()
         self.publishers = Publishers(link, types, self, now_ns)
         graph.follow(self._graph_changed)
@@ -211,7 +211,7 @@ class HubTopics:
             there = self._topics[topic] = _Topic(topic)
             self._register_with(there, None)
             if (own := self.publishers.latched(topic)) is not None:
-                self._keep(there, _Latched(own, {}))
+                self._keep(_Latched(own, {}))
         if there.linger is not None:
             there.linger.cancel()
             there.linger = None
@@ -227,8 +227,6 @@ class HubTopics:
         if there is None or subscription not in there.subscriptions:
             return
         del there.subscriptions[subscription]
-        for latched in there.latched.values():
-            latched.had.discard(subscription)
         if not there.subscriptions:
             there.linger = asyncio.get_running_loop().call_later(limits.SUBSCRIPTION_LINGER, self._end, there)
 
@@ -240,7 +238,7 @@ class HubTopics:
 
     def forget_own(self, topic: str) -> None:
         """Forget the latched message of the hub's own publisher, which has ended."""
-        self._forget_latched(topic, OWN)
+        self._latched.pop((topic, OWN), None)
 
     def close(self) -> None:
         """End all."""
@@ -297,8 +295,8 @@ class HubTopics:
     def _end(self, there: _Topic) -> None:
         if there.linger is not None:
             there.linger.cancel()
-        for source in [*there.latched]:
-            self._forget_latched(there.name, source)
+        for key in [key for key in self._latched if key[0] == there.name]:
+            del self._latched[key]
         del self._topics[there.name]
         if there.registration is not None:
             there.registration.end()
@@ -326,36 +324,29 @@ class HubTopics:
         if latching is None:
             _hand(message, there.subscriptions)
             return
-        latched = there.latched.get(message.source)
+        latched = self._latched.get((there.name, message.source))
         again = latched is not None and latched.header is not latching and latched.message.payload == message.payload
         if latched is not None and again and message.source != OWN:
             # The publisher sends its latched message at each new connection: most have had it.
             latched.header = latching
         else:
-            latched = self._keep(there, _Latched(message, latching))
+            latched = self._keep(_Latched(message, latching))
         _hand_latched(latched, there.subscriptions)
 
-    def _keep(self, there: _Topic, latched: _Latched) -> _Latched:
-        source = latched.message.source
-        self._forget_latched(there.name, source)
-        there.latched[source] = latched
-        self._latched_order[there.name, source] = None
-        self._latched_bytes += len(latched.message.payload)
-        while self._latched_bytes > limits.LATCHED_BYTES and len(self._latched_order) > 1:
-            self._forget_latched(*next(iter(self._latched_order)))
+    def _keep(self, latched: _Latched) -> _Latched:
+        self._latched[latched.message.topic, latched.message.source] = latched
+        self._latched.move_to_end((latched.message.topic, latched.message.source))
+        size = sum(len(each.message.payload) for each in self._latched.values())
+        while size > limits.LATCHED_BYTES and len(self._latched) > 1:
+            size -= len(self._latched.popitem(last=False)[1].message.payload)
         return latched
-
-    def _forget_latched(self, topic: str, source: str) -> None:
-        if (topic, source) in self._latched_order:
-            del self._latched_order[topic, source]
-            self._latched_bytes -= len(self._topics[topic].latched.pop(source).message.payload)
 
     def _replay(self, there: _Topic, subscription: ClientSubscription) -> None:
         subscriber = there.registration.value if there.registration is not None else None
         connected = {OWN} | (subscriber.callers if subscriber is not None else set())
         if subscription in there.subscriptions:
-            for source, latched in there.latched.items():
-                if source in connected:
+            for (topic, source), latched in [*self._latched.items()]:
+                if topic == there.name and source in connected:
                     _hand_latched(latched, (subscription,))
 
 

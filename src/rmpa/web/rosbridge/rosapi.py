@@ -6,9 +6,11 @@ and not offered as ROS services.
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
@@ -17,64 +19,61 @@ from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web import limits
+from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine, Iterable
 
     from rmpa.ros.types.definitions import Field, Specification
-    from rmpa.ros.types.messages import MessageType
-    from rmpa.web.hub.graph import GraphService, GraphTopic, GraphWatch
+    from rmpa.web.hub.graph import GraphWatch
     from rmpa.web.hub.hub import HubClient
     from rmpa.web.hub.node_link import ParamValue
 
-
-# rosapi's TypeDef: a message type as lists of names, types and examples, for clients that make forms of them.
-
-
+Values: TypeAlias = dict[str, Any]
+Answer: TypeAlias = "Values | Coroutine[Any, Any, Values | None]"
+"""The response's fields; or what takes time and returns them, or None where there are none."""
+NAMESPACE: Final = "/rosapi/"
 _TIMES: Final = ("time", "duration")
 _EXAMPLES: Final = {"string": "", "bool": "False", "float32": "0.0", "float64": "0.0", "time": "{}", "duration": "{}"}
-
-
-def typedefs_of(kind: MessageType) -> list[dict[str, Any]]:
-    """The type, then all that it embeds, each once, in the order of the fields."""
-    return _typedefs(kind.name, kind.definition)
+_ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
+_SERVER_TOPICS: Final = ("feedback", "result", "status")
+"""Those that an action's server publishes."""
+_STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
 
 
 @functools.lru_cache(maxsize=64)
-def _typedefs(name: str, definition: str) -> list[dict[str, Any]]:
+def _typedefs(name: str, definition: str) -> list[Values]:
+    """Rosapi's TypeDef of a type, for clients that make forms of it, then of all that it embeds, each once."""
     known = parse_definition(name, definition)
     order: dict[str, None] = {}
-    _visit(name, known, order)
-    return [_time(each) if each in _TIMES else _typedef(known[each]) for each in order]
+
+    def visit(name: str) -> None:
+        order[name] = None
+        for field in known[name].fields if name in known else ():
+            # The depth is bounded by the definition's parser.
+            if field.type not in order and (field.type in _TIMES or not field.primitive):
+                visit(field.type)
+
+    visit(name)
+    return [_typedef(each, known.get(each)) for each in order]
 
 
-def _visit(name: str, known: Mapping[str, Specification], order: dict[str, None]) -> None:
-    order[name] = None
-    for field in known[name].fields if name in known else ():
-        # The depth is bounded by the definition's parser.
-        if field.type not in order and (field.type in _TIMES or not field.primitive):
-            _visit(field.type, known, order)
-
-
-def _typedef(specification: Specification) -> dict[str, Any]:
-    fields = specification.fields
-    constants = sorted(_constant(each) for each in specification.constants)
-    return {
-        "type": specification.name,
-        "fieldnames": [field.name for field in fields],
-        "fieldtypes": [field.type for field in fields],
-        "fieldarraylen": [(field.size or 0) if field.array else -1 for field in fields],
-        "examples": [_example(field) for field in fields],
-        "constnames": [name for name, _ in constants],
-        "constvalues": [value for _, value in constants],
-    }
-
-
-def _constant(text: str) -> tuple[str, str]:
-    """The name and value of ``type name=value``."""
-    name, _, value = text.partition(" ")[2].partition("=")
-    return name, value
+def _typedef(name: str, specification: Specification | None) -> Values:
+    if specification is None:  # time or duration
+        fields = [("secs", "int32", -1, "0"), ("nsecs", "int32", -1, "0")]
+        constants: list[list[str]] = []
+    else:
+        fields = [
+            (each.name, each.type, (each.size or 0) if each.array else -1, _example(each))
+            for each in specification.fields
+        ]
+        # As ``type name=value``.
+        constants = sorted(each.partition(" ")[2].split("=", 1) for each in specification.constants)
+    values: Values = {"type": name}
+    for at, key in enumerate(("fieldnames", "fieldtypes", "fieldarraylen", "examples")):
+        values[key] = [each[at] for each in fields]
+    return values | {"constnames": [each[0] for each in constants], "constvalues": [each[1] for each in constants]}
 
 
 def _example(field: Field) -> str:
@@ -83,30 +82,8 @@ def _example(field: Field) -> str:
     return _EXAMPLES.get(field.type, "0") if field.primitive else "{}"
 
 
-def _time(name: str) -> dict[str, Any]:
-    return {
-        "type": name,
-        "fieldnames": ["secs", "nsecs"],
-        "fieldtypes": ["int32", "int32"],
-        "fieldarraylen": [-1, -1],
-        "examples": ["0", "0"],
-        "constnames": [],
-        "constvalues": [],
-    }
-
-
-Values: TypeAlias = dict[str, Any]
-Answer: TypeAlias = "Values | Coroutine[Any, Any, Values | None]"
-NAMESPACE: Final = "/rosapi/"
-_NANO: Final = 1_000_000_000
-_ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
-_SERVER_TOPICS: Final = ("feedback", "result", "status")
-"""Those that an action's server publishes."""
-_STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
-
-
 class Rosapi:
-    """Answers the services of rosapi.
+    """Answers the services of rosapi. Each is a method ``_answer_…``, whose keywords are the request's fields.
 
     Args:
         client: Asks.
@@ -114,43 +91,15 @@ class Rosapi:
 
     def __init__(self, client: HubClient) -> None:
         self._client = client
-        self._types = client.hub.types
-        self._services: Mapping[str, tuple[str, Callable[[Any], Answer]]] = {
-            "topics": ("Topics", self._topics),
-            "topics_for_type": ("TopicsForType", self._topics_for_type),
-            "topics_and_raw_types": ("TopicsAndRawTypes", self._topics_and_raw_types),
-            "topic_type": ("TopicType", self._topic_type),
-            "publishers": ("Publishers", self._publishers),
-            "subscribers": ("Subscribers", self._subscribers),
-            "services": ("Services", lambda _: {"services": list(self._graph.services)}),
-            "services_for_type": ("ServicesForType", self._services_for_type),
-            "service_type": ("ServiceType", self._service_type),
-            "service_node": ("ServiceNode", self._service_node),
-            "service_host": ("ServiceHost", self._service_host),
-            "service_providers": ("ServiceProviders", self._service_providers),
-            "service_request_details": ("ServiceRequestDetails", self._service_request_details),
-            "service_response_details": ("ServiceResponseDetails", self._service_response_details),
-            "message_details": ("MessageDetails", self._message_details),
-            "nodes": ("Nodes", lambda _: {"nodes": list(self._graph.nodes)}),
-            "node_details": ("NodeDetails", self._node_details),
-            "action_servers": ("GetActionServers", self._action_servers),
-            "get_param": ("GetParam", self._get_param),
-            "set_param": ("SetParam", self._set_param),
-            "has_param": ("HasParam", self._has_param),
-            "search_param": ("SearchParam", self._search_param),
-            "delete_param": ("DeleteParam", self._delete_param),
-            "get_param_names": ("GetParamNames", self._get_param_names),
-            "get_time": ("GetTime", self._get_time),
-        }
 
     @property
-    def services(self) -> dict[str, str]:
-        """The type of each service by its global name."""
-        return {f"{NAMESPACE}{name}": f"rosapi/{kind}" for name, (kind, _) in self._services.items()}
+    def _graph(self) -> GraphWatch:
+        return self._client.hub.graph
 
-    def offers(self, service: str) -> bool:
+    @staticmethod
+    def offers(service: str) -> bool:
         """Whether a global name is that of a service of rosapi."""
-        return service.startswith(NAMESPACE) and service.removeprefix(NAMESPACE) in self._services
+        return service in SERVICES
 
     def call(self, service: str, arguments: Any) -> Answer:
         """Answer a call.
@@ -159,59 +108,49 @@ class Rosapi:
             service: A global name that `offers` knows.
             arguments: An object of the request's fields, a list of them, or None.
 
-        Returns:
-            The response's fields; or what takes time and returns them, or None where there are none.
-
         Raises:
             RmpaError: The arguments do not fit, or ask for something that is not there.
         """
-        kind, answer = self._services[service.removeprefix(NAMESPACE)]
-        codec = codec_for(ServiceType(f"rosapi/{kind}").request)
+        codec = codec_for(ServiceType(SERVICES[service]).request)
         # Once to bytes and back: each field is there, and of its type.
         request = codec.json_values(memoryview(codec.write_arguments(arguments, 0).payload))
-        return answer(request)
-
-    @property
-    def _graph(self) -> GraphWatch:
-        return self._client.hub.graph
+        answer: Answer = getattr(self, f"_answer_{service.removeprefix(NAMESPACE)}")(**request)
+        return answer
 
     # --- topics ---------------------------------------------------------------------------------------------------
 
-    def _topics(self, _: Any) -> Values:
+    def _answer_topics(self) -> Values:
         topics = self._graph.topics
         return {"topics": list(topics), "types": [_first_type(each) for each in topics.values()]}
 
-    def _topics_and_raw_types(self, _: Any) -> Values:
-        values = self._topics(_)
+    def _answer_topics_and_raw_types(self) -> Values:
+        values = self._answer_topics()
         texts = {name: self._full_text(name) for name in set(values["types"])}
         return values | {"typedefs_full_text": [texts[name] for name in values["types"]]}
 
     def _full_text(self, name: str) -> str:
         try:
-            return self._types.message(name).definition if name else ""
+            return self._client.hub.types.message(name).definition if name else ""
         except RmpaError:
             return ""  # as rosapi does: the client then knows the name only
 
-    def _topics_for_type(self, request: Any) -> Values:
-        kind = type_name(request["type"])
+    def _answer_topics_for_type(self, type: str) -> Values:  # noqa: A002 - the field's name
+        kind = type_name(type)
         return {"topics": [each.name for each in self._graph.topics.values() if kind in each.types]}
 
-    def _topic_type(self, request: Any) -> Values:
-        topic = self._topic(request)
-        return {"type": _first_type(topic) if topic else ""}
+    def _answer_topic_type(self, topic: str) -> Values:
+        return {"type": _first_type(self._topic(topic))}
 
-    def _publishers(self, request: Any) -> Values:
-        topic = self._topic(request)
-        return {"publishers": list(topic.publishers) if topic else []}
+    def _answer_publishers(self, topic: str) -> Values:
+        return {"publishers": list(self._topic(topic).publishers)}
 
-    def _subscribers(self, request: Any) -> Values:
-        topic = self._topic(request)
-        return {"subscribers": list(topic.subscribers) if topic else []}
+    def _answer_subscribers(self, topic: str) -> Values:
+        return {"subscribers": list(self._topic(topic).subscribers)}
 
-    def _topic(self, request: Any) -> GraphTopic | None:
-        return self._graph.topics.get(graph_name(request["topic"]))
+    def _topic(self, name: str) -> GraphTopic:
+        return self._graph.topics.get(graph_name(name)) or GraphTopic(name, ())
 
-    def _action_servers(self, _: Any) -> Values:
+    def _answer_action_servers(self) -> Values:
         """As rosapi, the names of which all topics of an action are there; and those that publish a server's topics.
 
         Of a peer's server the topics that it subscribes to are not in this module's graph until a client publishes.
@@ -233,85 +172,84 @@ class Rosapi:
 
     # --- services -------------------------------------------------------------------------------------------------
 
-    def _services_for_type(self, request: Any) -> Answer:
-        kind = type_name(request["type"])
+    def _answer_services(self) -> Values:
+        return {"services": list(self._graph.services)}
 
-        def answer() -> Values:
-            return {"services": [each.name for each in self._graph.services.values() if each.type == kind]}
+    def _answer_services_for_type(self, type: str) -> Answer:  # noqa: A002 - the field's name
+        kind = type_name(type)
+        return self._with_types(lambda: {"services": [name for name, each in self._services() if each.type == kind]})
 
-        return self._with_types(answer)
+    def _services(self) -> Iterable[tuple[str, GraphService]]:
+        return self._graph.services.items()
 
     def _with_types(self, answer: Callable[[], Values]) -> Answer:
         async def find() -> Values:
             await self._graph.find_all()
             return answer()
 
-        return answer() if all(each.type for each in self._graph.services.values()) else find()
+        return answer() if all(each.type for _, each in self._services()) else find()
 
-    def _service(self, request: Any) -> GraphService | None:
-        return self._graph.services.get(graph_name(request["service"]))
+    def _service(self, name: str) -> GraphService:
+        return self._graph.services.get(graph_name(name)) or GraphService(name, "")
 
-    def _service_type(self, request: Any) -> Answer:
-        name = graph_name(request["service"])
-        if self.offers(name):
-            return {"type": self.services[name]}
-        service = self._graph.services.get(name)
+    def _answer_service_type(self, service: str) -> Answer:
+        name = graph_name(service)
 
         async def find() -> Values:
-            try:
+            with contextlib.suppress(RmpaError):
                 return {"type": await self._graph.find(name)}
-            except RmpaError:
-                return {"type": ""}
+            return {"type": ""}
 
-        return find() if service is not None and not service.type else {"type": service.type if service else ""}
+        known = SERVICES.get(name) or self._service(name).type
+        return find() if not known and name in self._graph.services else {"type": known}
 
-    def _service_node(self, request: Any) -> Values:
-        service = self._service(request)
-        return {"node": service.providers[0] if service and service.providers else ""}
+    def _answer_service_node(self, service: str) -> Values:
+        return {"node": next(iter(self._service(service).providers), "")}
 
-    def _service_host(self, request: Any) -> Values:
-        service = self._service(request)
+    def _answer_service_host(self, service: str) -> Values:
         try:
-            return {"host": (urlsplit(service.uri).hostname or "") if service else ""}
+            return {"host": urlsplit(self._service(service).uri).hostname or ""}
         except ValueError:
             return {"host": ""}
 
-    def _service_providers(self, request: Any) -> Answer:
+    def _answer_service_providers(self, service: str) -> Answer:
         # rosapi's own answer compares types, though its field is named service: both are understood.
-        asked = request["service"]
+        name = graph_name(service)
 
         def answer() -> Values:
-            found = [
-                each for each in self._graph.services.values() if each.type == asked or each.name == graph_name(asked)
-            ]
+            found = [each for each_name, each in self._services() if each.type == service or each_name == name]
             return {"providers": [node for each in found for node in each.providers]}
 
-        return answer() if graph_name(asked) in self._graph.services else self._with_types(answer)
+        return answer() if name in self._graph.services else self._with_types(answer)
 
-    # --- types ----------------------------------------------------------------------------------------------------
+    # --- types, nodes and time ------------------------------------------------------------------------------------
 
-    def _message_details(self, request: Any) -> Values:
-        return {"typedefs": typedefs_of(self._types.message(type_name(request["type"])))}
+    def _answer_message_details(self, type: str) -> Values:  # noqa: A002 - the field's name
+        kind = self._client.hub.types.message(type_name(type))
+        return {"typedefs": _typedefs(kind.name, kind.definition)}
 
-    def _service_request_details(self, request: Any) -> Values:
-        return {"typedefs": typedefs_of(self._types.service(type_name(request["type"])).request)}
+    def _answer_service_request_details(self, type: str) -> Values:  # noqa: A002 - the field's name
+        kind = self._client.hub.types.service(type_name(type)).request
+        return {"typedefs": _typedefs(kind.name, kind.definition)}
 
-    def _service_response_details(self, request: Any) -> Values:
-        return {"typedefs": typedefs_of(self._types.service(type_name(request["type"])).response)}
+    def _answer_service_response_details(self, type: str) -> Values:  # noqa: A002 - the field's name
+        kind = self._client.hub.types.service(type_name(type)).response
+        return {"typedefs": _typedefs(kind.name, kind.definition)}
 
-    # --- nodes and time -------------------------------------------------------------------------------------------
+    def _answer_nodes(self) -> Values:
+        return {"nodes": list(self._graph.nodes)}
 
-    def _node_details(self, request: Any) -> Values:
-        node = graph_name(request["node"])
+    def _answer_node_details(self, node: str) -> Values:
+        name = graph_name(node)
         topics = self._graph.topics.values()
         return {
-            "subscribing": [each.name for each in topics if node in each.subscribers],
-            "publishing": [each.name for each in topics if node in each.publishers],
-            "services": [each.name for each in self._graph.services.values() if node in each.providers],
+            "subscribing": [each.name for each in topics if name in each.subscribers],
+            "publishing": [each.name for each in topics if name in each.publishers],
+            "services": [each for each, service in self._services() if name in service.providers],
         }
 
-    def _get_time(self, _: Any) -> Values:
-        secs, nsecs = divmod(max(0, self._client.hub.time.now_ns()), _NANO)
+    def _answer_get_time(self) -> Values:
+        secs, nsecs = divmod(max(0, self._client.hub.time.now_ns()), 1_000_000_000)
         return {"time": {"secs": secs, "nsecs": nsecs}}
 
     # --- parameters -----------------------------------------------------------------------------------------------
@@ -325,9 +263,8 @@ class Rosapi:
             value = value[part]
         return True, value
 
-    def _get_param(self, request: Any) -> Values:
-        there, value = self._parameter(graph_name(request["name"]))
-        default = request["default"]
+    def _answer_get_param(self, name: str, default: str) -> Values:
+        there, value = self._parameter(graph_name(name))
         if not there and default:
             try:
                 value = json.loads(default)
@@ -335,37 +272,33 @@ class Rosapi:
                 value = default
         return {"value": json.dumps(value, default=_binary)}
 
-    def _set_param(self, request: Any) -> Answer:
+    def _answer_set_param(self, name: str, value: str) -> Answer:
         try:
-            value = json.loads(request["value"])
+            read = json.loads(value)
         except RecursionError:
             raise OpError("the value of set_param is nested too deep") from None
         except ValueError as error:
             problem = f"the value of set_param is JSON, in a string: {error}"
             raise OpError(problem, 'a text is written with its quotes, "\\"text\\""') from None
-        _check_depth(value)
-        return self._client.set_param(graph_name(request["name"]), value)
+        _check_depth(read, 1)
+        return self._client.set_param(graph_name(name), read)
 
-    def _has_param(self, request: Any) -> Values:
-        return {"exists": self._parameter(graph_name(request["name"]))[0]}
+    def _answer_has_param(self, name: str) -> Values:
+        return {"exists": self._parameter(graph_name(name))[0]}
 
-    def _search_param(self, request: Any) -> Values:
+    def _answer_search_param(self, name: str) -> Values:
         # As rospy.search_param of the node /rosapi: first below its name, then upwards.
-        name = request["name"]
         if name.startswith("/"):
-            there = self._parameter(graph_name(name))[0]
-            return {"global_name": graph_name(name) if there else ""}
+            return {"global_name": graph_name(name) if self._parameter(graph_name(name))[0] else ""}
         first = graph_name(name).split("/")[1]
-        for namespace in (NAMESPACE, "/"):
-            if self._parameter(f"{namespace}{first}")[0]:
-                return {"global_name": graph_name(f"{namespace}{name}")}
-        return {"global_name": ""}
+        found = (each for each in (NAMESPACE, "/") if self._parameter(f"{each}{first}")[0])
+        return {"global_name": next((graph_name(f"{each}{name}") for each in found), "")}
 
-    def _delete_param(self, request: Any) -> Answer:
-        name = graph_name(request["name"])
-        return self._client.delete_param(name) if self._parameter(name)[0] else {}
+    def _answer_delete_param(self, name: str) -> Answer:
+        there, _ = self._parameter(graph_name(name))
+        return self._client.delete_param(graph_name(name)) if there else {}
 
-    def _get_param_names(self, _: Any) -> Values:
+    def _answer_get_param_names(self) -> Values:
         names: list[str] = []
         todo: list[tuple[str, ParamValue]] = [("", dict(self._client.param_tree))]
         while todo:
@@ -377,28 +310,27 @@ class Rosapi:
         return {"names": sorted(names)}
 
 
+_TYPE_NAMES: Final = {"action_servers": "GetActionServers"}
+SERVICES: Final = {
+    f"{NAMESPACE}{name}": f"rosapi/{_TYPE_NAMES.get(name) or ''.join(map(str.capitalize, name.split('_')))}"
+    for name in (each.removeprefix("_answer_") for each in vars(Rosapi) if each.startswith("_answer_"))
+}
+"""The type of each service by its global name."""
+
+
 def _first_type(topic: GraphTopic) -> str:
     return topic.types[0] if topic.types else ""
 
 
 def _binary(value: object) -> object:
     """Values of parameters that JSON has not: bytes are base64 there."""
-    import base64  # noqa: PLC0415 - a rare value
-
     return base64.b64encode(value).decode() if isinstance(value, bytes) else str(value)
 
 
-def _check_depth(value: object) -> None:
-    """Refuse a parameter that is nested too deep.
-
-    Raises:
-        OpError: It is.
-    """
-    todo = [(value, 1)]
-    while todo:
-        inner, depth = todo.pop()
-        if not isinstance(inner, dict | list):
-            continue
+def _check_depth(value: object, depth: int) -> None:
+    """Refuse a parameter that is nested too deep."""
+    if isinstance(value, dict | list):
         if depth > limits.PARAMETER_DEPTH_MAX:
             raise OpError(f"the value of set_param is nested deeper than {limits.PARAMETER_DEPTH_MAX}")
-        todo += [(each, depth + 1) for each in (inner.values() if isinstance(inner, dict) else inner)]
+        for each in value.values() if isinstance(value, dict) else value:
+            _check_depth(each, depth + 1)
