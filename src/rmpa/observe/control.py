@@ -14,14 +14,13 @@ the number of its bytes, and they follow the line.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import msgspec
 
 from rmpa.bridge.messages import without_text
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.observe import limits
-from rmpa.observe.snapshot import ServiceInfo, Snapshot, TopicInfo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -96,67 +95,6 @@ def _struct(value: msgspec.Struct) -> Iterator[bytes]:
 
 def _default(field: msgspec.structs.FieldInfo) -> object:
     return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-
-
-# Decodes the snapshots of one agent, one after the other; what has not changed is not decoded again.
-
-
-_T = TypeVar("_T", bound=msgspec.Struct)
-
-
-class _SnapshotParts(Snapshot, kw_only=True, frozen=True):
-    """A ``Snapshot`` whose long lists are not decoded."""
-
-    topics: tuple[msgspec.Raw, ...] = ()  # type: ignore[assignment]
-    services: tuple[msgspec.Raw, ...] = ()  # type: ignore[assignment]
-
-
-class _SnapshotReply(msgspec.Struct, frozen=True):
-    """A ``ControlReply`` with a snapshot."""
-
-    ok: bool
-    value: _SnapshotParts
-
-
-class _Entries(Generic[_T]):
-    """The entries of one list, by their bytes in the last snapshot."""
-
-    def __init__(self, type_: type[_T]) -> None:
-        self._decode = msgspec.json.Decoder(type_).decode
-        self._known: dict[bytes, _T] = {}
-
-    def decode(self, raws: tuple[msgspec.Raw, ...]) -> tuple[_T, ...]:
-        before, texts = self._known, list(map(bytes, raws))
-        self._known = {text: before.get(text) or self._decode(text) for text in texts}
-        return tuple(self._known[text] for text in texts)
-
-
-class SnapshotDecoder:
-    """Snapshots of one agent. An entry of topics and services with the same bytes as before is the same object.
-
-    Most of a large mesh is idle: its bytes are found again in less time than they are decoded in, and equal entries
-    need not be compared.
-    """
-
-    def __init__(self) -> None:
-        self._reply = msgspec.json.Decoder(_SnapshotReply)
-        self._topics = _Entries(TopicInfo)
-        self._services = _Entries(ServiceInfo)
-
-    def decode(self, line: bytes) -> Snapshot:
-        """The snapshot of a control reply.
-
-        Raises:
-            RemoteProtocolError: It has none.
-        """
-        try:
-            parts = self._reply.decode(line).value
-            values = {name: getattr(parts, name) for name in parts.__struct_fields__}
-            values["topics"] = self._topics.decode(parts.topics)
-            values["services"] = self._services.decode(parts.services)
-            return Snapshot(**values)
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-            raise RemoteProtocolError(f"not a snapshot: {error}") from None
 
 
 # The local graph as the control socket tells it: all of it, or the topics and services that have changed since.

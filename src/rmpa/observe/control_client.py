@@ -12,7 +12,7 @@ import socket
 import stat
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 import msgspec
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from types import TracebackType
 
-    from rmpa.observe.control import SnapshotDecoder
     from rmpa.observe.snapshot import AgentInfo
 
 
@@ -161,6 +160,14 @@ _T = TypeVar("_T")
 _START_ONE = "start one with `rmpa up`"
 
 
+class _Result(msgspec.Struct, Generic[_T], frozen=True):
+    """A ``ControlReply`` that is no refusal."""
+
+    ok: Literal[True]
+    value: _T
+    follows: int = 0
+
+
 class ControlClient:
     """One connection to an agent; a context manager.
 
@@ -218,37 +225,35 @@ class ControlClient:
             UnreachableError: It closed the connection, or did not reply in time.
             RemoteProtocolError: Its value has another type.
         """
-        return self._parse(op, self._exchange(op, args), type)
 
-    def snapshot(self, decoder: SnapshotDecoder | None = None, **args: object) -> Snapshot:
-        """Everything that the agent shows; raises as ``call``.
-
-        Args:
-            decoder: For those that ask again and again.
-            args: Of the operation.
-        """
-        if decoder is None:
-            return self.call("snapshot", Snapshot, **args)
-        line = self._exchange("snapshot", args)
-        with contextlib.suppress(RemoteProtocolError):
-            return decoder.decode(line)
-        return self._parse("snapshot", line, Snapshot)
-
-    def agent(self) -> AgentInfo:
-        """What the agent tells of itself, without its peers, topics and services; raises as ``call``."""
-        return self.snapshot(topics=(), peers=False).agent
-
-    def _exchange(self, op: str, args: dict[str, object]) -> bytes:
         def exchange() -> bytes:
             self._sock.sendall(ControlRequest(op, args).serialize())
             return self._file.readline(limits.CONTROL_REPLY_MAX + 1)
 
         line = self._received(exchange)
-        if line.endswith(b"\n"):
-            return line[:-1]
         if len(line) > limits.CONTROL_REPLY_MAX:
             raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
-        raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
+        if not line.endswith(b"\n"):
+            raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
+        try:
+            reply: _Result[_T] = msgspec.json.decode(line, type=_Result[type])  # type: ignore[valid-type]
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            refused = ControlReply.parse(line)
+            if not refused.ok:
+                raise PeerRefused(f"agent {self.name}", refused.error, refused.remedy) from None
+            text = f"agent {self.name} answers {op} in another way: {error}; is it older?"
+            raise RemoteProtocolError(text) from None
+        if reply.follows:
+            with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
+        return reply.value
+
+    def snapshot(self, **args: object) -> Snapshot:
+        """Everything that the agent shows; ``args`` are those of the operation. Raises as ``call``."""
+        return self.call("snapshot", Snapshot, **args)
+
+    def agent(self) -> AgentInfo:
+        """What the agent tells of itself, without its peers, topics and services; raises as ``call``."""
+        return self.snapshot(topics=(), peers=False).agent
 
     def _received(self, receive: Callable[[], bytes]) -> bytes:
         try:
@@ -257,19 +262,6 @@ class ControlClient:
             raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
         except OSError as error:
             raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
-
-    def _parse(self, op: str, line: bytes, type: type[_T]) -> _T:  # noqa: A002 - as msgspec calls it
-        reply = ControlReply.parse(line)
-        if not reply.ok:
-            raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)
-        if reply.follows:
-            with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
-        try:
-            return msgspec.convert(reply.value, type)
-        except msgspec.ValidationError as error:
-            raise RemoteProtocolError(
-                f"agent {self.name} answers {op} in another way: {error}; is it older?"
-            ) from None
 
 
 @dataclass(frozen=True, slots=True)

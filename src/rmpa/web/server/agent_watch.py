@@ -13,7 +13,7 @@ import msgspec
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision, SnapshotDecoder
+from rmpa.observe.control import ControlReply, ControlRequest, GraphRevision
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
@@ -131,7 +131,6 @@ class ControlReader:
         self._name = name
         self._check = check
         self._client: ControlClient | None = None
-        self._decoder = SnapshotDecoder()
         self._used = 0.0
 
     def __call__(self) -> Snapshot:
@@ -163,7 +162,7 @@ class ControlReader:
 
     def _ask(self, client: ControlClient) -> Snapshot:
         try:
-            snapshot = client.snapshot(self._decoder, most=limits.WEB_TOPICS)
+            snapshot = client.snapshot(most=limits.WEB_TOPICS)
         except RmpaError:
             self.close()
             raise
