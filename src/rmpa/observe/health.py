@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import remedy
@@ -42,8 +43,14 @@ Values = dict[str, str | float | None]
 
 def _texts(*values: Values) -> dict[str, str]:
     """Figures as text, with six significant digits."""
-    found = {name: value for part in values for name, value in part.items() if value not in ("", None)}
-    return {name: f"{value:.6g}" if isinstance(value, float) else str(value) for name, value in found.items()}
+    found = {}
+    for part in values:
+        for name, value in part.items():
+            if isinstance(value, float):
+                found[name] = f"{value:.6g}"
+            elif value is not None and value != "":
+                found[name] = str(value)
+    return found
 
 
 def _scaled(value: float | None, scale: float = 1.0) -> float | None:
@@ -126,12 +133,15 @@ def route_values(route: RouteInfo) -> dict[str, str]:
         "rate (Hz)": route.rate,
         "bandwidth (B/s)": route.bandwidth,
         "age (s)": route.age,
-        **_milliseconds("period", route.period, "mean", "sd", "min", "max", "p99"),
-        "jitter (ms)": _scaled(route.jitter, 1e3) if route.period is not None else None,
-        **_milliseconds("latency", route.latency, "p50", "p99", "max", "last"),
-        "latency error (± ms)": route.latency.error * 1e3 if route.latency is not None else None,
-        "waiting": route.kept if route.direction == "out" else None,
     }
+    if route.period is not None:
+        known |= _milliseconds("period", route.period, "mean", "sd", "min", "max", "p99")
+        known["jitter (ms)"] = _scaled(route.jitter, 1e3)
+    if route.latency is not None:
+        known |= _milliseconds("latency", route.latency, "p50", "p99", "max", "last")
+        known["latency error (± ms)"] = route.latency.error * 1e3
+    if route.direction == "out":
+        known["waiting"] = route.kept
     if route.oversized:
         known |= {"too long": route.oversized, "too long, last (B)": route.oversized_bytes}
     if route.messages or route.dropped or route.lost:
@@ -150,7 +160,8 @@ HERE: Final = "rmpa: this module"
 """The name of the agent's own status."""
 _LINKED: Final = "linked"
 _LOST, _RESTORED = "liveliness_lost", "liveliness_restored"
-_EVENTS: Final = ("deadline_missed", "loss_unknown")
+_COUNTS: Final = ("lost", "late", "expired", "dropped", "oversized")
+_counts = attrgetter(*_COUNTS)
 _MISSES: Final = {
     "lost": "lost",
     "late": "late",
@@ -177,7 +188,7 @@ class Health:
     """Judges snapshots in turn, and compares each with the one before it to find what is new."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, Counter[str]] | None = None
+        self._counts: dict[str, dict[str, int]] | None = None
         """The counts of the last snapshot, by the check's name."""
         self._linked: dict[str, float] = {}
         """When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``."""
@@ -194,12 +205,13 @@ class Health:
             snapshot: With all topics and services.
             now: Monotonic seconds.
         """
-        before, counts = self._counts, dict[str, Counter[str]]()
+        before, counts = self._counts, dict[str, dict[str, int]]()
 
-        def new(name: str, **present: int) -> Counter[str]:
+        def new(name: str, present: dict[str, int]) -> Counter[str]:
             """The counts since the last snapshot; none if that snapshot did not have this check."""
-            counts[name] = Counter(present)
-            return counts[name] - (before or {}).get(name, counts[name])
+            counts[name] = present
+            was = (before or {}).get(name, present)
+            return Counter(present) - Counter(was) if was != present else Counter()
 
         peers = _by_name(snapshot.peers)
         yield _agent(snapshot)
@@ -207,21 +219,22 @@ class Health:
             if info.state == _LINKED:
                 self._linked[name] = now
                 self._topics[name] = set()
-            dropped = new(name, dropped=info.link.dropped if info.link else 0)["dropped"]
+            dropped = new(name, {"dropped": info.link.dropped if info.link else 0})["dropped"]
             level, text = _judge_peer(info, dropped, was_linked=name in self._linked)
             yield Check(f"rmpa: {name}", level, text, evidence=link_values(info))
         for name, topic, route in _incoming(snapshot.topics):
             if route.peer in peers and peers[route.peer].state == _LINKED:
                 # Else the route waits for its peer: stale, like everything of that peer.
-                missed = {kind: getattr(route, kind) for kind in _MISSES if kind not in _EVENTS}
-                missed |= {kind: route.events.get(kind, 0) for kind in _EVENTS}
+                missed = dict(zip(_COUNTS, _counts(route), strict=True))
+                missed |= {kind: count for kind, count in route.events.items() if kind in _MISSES}
                 self._topics.setdefault(route.peer, set()).add(name)
-                level, text = _judge_route(topic, route, new(name, **missed))
+                level, text = _judge_route(topic, route, new(name, missed))
                 yield Check(name, level, text, evidence=route_values(route))
         for name, route in _outgoing(snapshot.topics):
-            counts[name] = Counter(lost=route.lost, oversized=route.oversized)
+            counts[name] = {"lost": route.lost, "oversized": route.oversized}
             # A snapshot that did not have this check had missed no messages.
-            yield _sent(name, route, counts[name] - (counts if before is None else before).get(name, Counter()))
+            was = (counts if before is None else before).get(name, {})
+            yield _sent(name, route, Counter(counts[name]) - Counter(was))
         for topic in snapshot.topics:  # of a peer's one that does not fit a subscriber, its own check says it
             if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
                 yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
@@ -233,7 +246,7 @@ class Health:
             if service.calls:
                 name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
                 name += f"service {service.name}"
-                called = new(name, calls=service.calls, failed=service.failed)
+                called = new(name, {"calls": service.calls, "failed": service.failed})
                 # New failures are one warning, because a server may fail calls on purpose.
                 text = f"{called['failed']} of {called['calls']} calls failed: {service.problem}"
                 if not called["failed"]:
@@ -279,9 +292,10 @@ def _numbered(name: str, taken: Counter[str]) -> str:
 
 def _incoming(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, RouteInfo]]:
     """The routes from peers, each with the unique name of its check."""
+    taken = Counter[str]()
     for topic in topics:
         sources = [route for route in topic.routes if route.direction == "in"]
-        several, taken = Counter(route.peer for route in sources), Counter[str]()
+        several = Counter(route.peer for route in sources)
         for route in sources:
             node = f" ({route.node})" if several[route.peer] > 1 else ""
             yield _numbered(f"rmpa: {route.peer}: {topic.name}{node}", taken), topic, route
