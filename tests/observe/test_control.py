@@ -10,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.observe import limits
-from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe import limits, peer_info
+from rmpa.observe import snapshot as s
+from rmpa.observe.control import ControlReply, ControlRequest, json_pieces
+from rmpa.observe.snapshot import Snapshot
+from tests.observe.samples import SNAPSHOT, VIEWER
 
 
 def test_golden_request() -> None:
@@ -100,3 +103,84 @@ def test_a_struct_as_value() -> None:
         x: int
 
     assert ControlReply(ok=True, value=Point(1)).serialize() == b'{"ok":true,"value":{"x":1}}\n'
+
+
+# --- large values in pieces ---------------------------------------------------------------------------------------
+
+MANY = msgspec.structs.replace(SNAPSHOT, topics=SNAPSHOT.topics * 100, peers=SNAPSHOT.peers * 50)
+
+
+class Tagged(msgspec.Struct, tag=True):
+    values: tuple[int, ...]
+
+
+class Renamed(msgspec.Struct, rename="camel", omit_defaults=True):
+    some_values: list[int] = []
+    other_value: int = 3
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        SNAPSHOT,
+        MANY,
+        ControlReply(ok=True, value=MANY),
+        ControlReply(ok=True),
+        ControlReply(ok=False, error="no", remedy='\u00e4 "quoted"'),
+        Tagged(tuple(range(100))),
+        Renamed(list(range(100)), 4),
+        Renamed(),
+        list(range(16)),
+        list(range(17)),
+        tuple(range(32)),
+        (),
+        {"a": [1, 2]},
+        None,
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_the_pieces_are_what_msgspec_says(value: object) -> None:
+    assert b"".join(json_pieces(value)) == msgspec.json.encode(value)
+
+
+def test_no_piece_of_a_large_snapshot_is_long() -> None:
+    pieces = list(json_pieces(ControlReply(ok=True, value=MANY)))
+    assert max(map(len, pieces)) < 32 * 1024
+    assert msgspec.json.decode(b"".join(pieces))["value"]["topics"]
+    assert msgspec.convert(ControlReply.parse(b"".join(pieces)).value, Snapshot) == MANY
+
+
+def test_what_json_cannot_say_is_an_error_as_of_msgspec() -> None:
+    with pytest.raises(TypeError):
+        list(json_pieces(ControlReply(ok=True, value=[object()] * 20)))
+
+
+# --- snapshots ----------------------------------------------------------------------------------------------------
+
+
+def test_a_snapshot_survives_json() -> None:
+    assert msgspec.json.decode(msgspec.json.encode(SNAPSHOT), type=s.Snapshot) == SNAPSHOT
+
+
+def test_the_sample_uses_every_field() -> None:
+    def unused(value: msgspec.Struct) -> set[str]:
+        return {name for name in value.__struct_fields__ if not getattr(value, name)}
+
+    assert unused(SNAPSHOT.agent) == set()
+    assert set.intersection(*map(unused, SNAPSHOT.peers)) == {"via"}, "none of them is relayed"
+    assert unused(SNAPSHOT.topics[0].routes[0]) == {"kept", "problem", "limit"}
+    assert unused(VIEWER) == {"condition", "text"}, "it is direct"
+
+
+def test_a_topics_peers_are_those_it_comes_from() -> None:
+    by_name = {topic.name: topic.peers for topic in SNAPSHOT.topics}
+    assert by_name == {"/cmd": ("joystick",), "/odom": ()}
+
+
+def test_every_field_is_explained() -> None:
+    for struct in (*vars(peer_info).values(), *vars(s).values()):
+        if not isinstance(struct, type) or not issubclass(struct, msgspec.Struct):
+            continue
+        for name in struct.__struct_fields__:
+            said = "".join(base.__doc__ or "" for base in struct.__mro__)
+            assert f"        {name}: " in said, (struct, name)

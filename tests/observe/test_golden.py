@@ -20,6 +20,7 @@ from rmpa.observe.doctor.machine import judge_shell
 from rmpa.observe.doctor.network import judge_rules
 from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.types.definitions import frame_array
+from tests.observe import test_transport_text
 from tests.observe.doctor import test_firewall, test_judgements, test_ros_environment
 from tests.observe.samples import DIRECT, SNAPSHOT
 from tests.observe.test_health import CASES as HEALTH
@@ -69,7 +70,7 @@ def why() -> bytes:
     ways |= {f"module: {name}": (found,) for name, (found, _) in test_services.MODULES.items()}
     lines = [(name, [line for way in found for line in why_lines(way)]) for name, found in ways.items()]
     some = [msgspec.json.encode(ways[name]).decode() for name in ("a topic", "direct", "service: a service")]
-    return document((*lines, ("JSON", some)))
+    return document((*lines, ("transports", test_transport_text.words()), ("JSON", some)))
 
 
 def diagnostics() -> bytes:

@@ -304,7 +304,7 @@ def doctor(config: str | None, quiet: bool, listen: float | None, as_json: bool)
     machine and meanwhile without on the other, then the other way round.
     """
     from rmpa.observe.doctor.checks import examine
-    from rmpa.observe.doctor.facts import look_at
+    from rmpa.observe.doctor.machine import look_at
 
     found, shown = [], []
     for check in examine(look_at(os.environ, config, listen or 0.0)):

@@ -235,13 +235,7 @@ class Health:
             # A snapshot that did not have this check had missed no messages.
             was = (counts if before is None else before).get(name, {})
             yield _sent(name, route, Counter(counts[name]) - Counter(was))
-        for topic in snapshot.topics:  # of a peer's one that does not fit a subscriber, its own check says it
-            if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
-                yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
-        for node in snapshot.unreachable:
-            yield Check(
-                f"rmpa: node {node.node}", WARN, str(node), evidence=_texts({"unreachable for (s)": node.ago})
-            )
+        yield from _troubles(snapshot)
         for service in snapshot.services:
             if service.calls:
                 name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
@@ -271,6 +265,16 @@ class Health:
                 yield Check(f"rmpa: {name}", STALE, text, evidence=values)
             for topic in sorted(self._topics.get(name, ())):
                 yield Check(topic, STALE, text, evidence=values)
+
+
+def _troubles(snapshot: Snapshot) -> Iterator[Check]:
+    """Local topics that do not fit a subscriber elsewhere, and nodes that cannot be reached."""
+    for topic in snapshot.topics:  # of a peer's topic its own check says it
+        if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
+            yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
+    for node in snapshot.unreachable:
+        values = _texts({"unreachable for (s)": node.ago})
+        yield Check(f"rmpa: node {node.node}", WARN, str(node), evidence=values)
 
 
 def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:

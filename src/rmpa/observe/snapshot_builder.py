@@ -10,7 +10,7 @@ import os
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 import psutil
@@ -28,7 +28,7 @@ from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.trust.permissions import not_of_this_mesh
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
     from rmpa.bridge.services.bodies import LocalService
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
     from rmpa.core.identity import Identity
-    from rmpa.discovery.discovery import Discovery
+    from rmpa.discovery.discovery import Discovery, Stranger
     from rmpa.discovery.endpoints import PeerView
     from rmpa.mesh.io.lane import LaneSender
     from rmpa.mesh.io.link import PeerLink
@@ -239,24 +239,11 @@ class SnapshotBuilder:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             changes = {"state": "relayed", "via": via, "topics_in": counts[origin.instance]}
             relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
-        strangers = [
-            PeerInfo(
-                name=one.identity.name,
-                guid=str(one.identity.guid),
-                instance=one.identity.instance.hex(),
-                state=FOREIGN,
-                since_ago=now - one.since,
-                addresses=_endpoints(one.identity),
-                found_ago=now - one.since,
-                beacon_ago=now - one.heard,
-                last_error=one.problem,
-            )
-            for one in endpoint.discovery.strangers()
-            if one.identity.guid not in {*roster, *statuses, *links}
-        ]
+        known_guids = {*roster, *statuses, *links}
+        strangers = [one for one in endpoint.discovery.strangers() if one.identity.guid not in known_guids]
         own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
         infos = [info for info in infos if info.instance not in relayed]
-        infos += [*relayed.values(), *strangers]
+        infos += [*relayed.values(), *(_stranger(one, now) for one in strangers)]
         infos.sort(key=lambda info: (info.state == FOREIGN, info.name, info.guid))
         return mark_shared_addresses(infos, own)
 
@@ -414,6 +401,21 @@ class SnapshotBuilder:
         )
 
 
+def _stranger(one: Stranger, now: float) -> PeerInfo:
+    identity = one.identity
+    return PeerInfo(
+        name=identity.name,
+        guid=str(identity.guid),
+        instance=identity.instance.hex(),
+        state=FOREIGN,
+        since_ago=now - one.since,
+        addresses=_endpoints(identity),
+        found_ago=now - one.since,
+        beacon_ago=now - one.heard,
+        last_error=one.problem,
+    )
+
+
 def _files() -> FilesInfo:
     used, limit, reserved = DESCRIPTORS.open, DESCRIPTORS.limit, DESCRIPTORS.reserve
     counts = DESCRIPTORS.counters.as_dict()
@@ -440,44 +442,36 @@ def _endpoints(identity: Identity) -> tuple[str, ...]:
     return tuple(f"{host}:{port}" for host, port in identity.endpoints)
 
 
+_LINK_FIELDS: Final = ("dialled", "clock_offset", "clock_error", "bytes_in", "bytes_out", "dropped", "rests")
+
+
 def _link(link: PeerLink, now: float) -> LinkInfo:
     host, port = link.remote_endpoint
+    bulk = link.bulk_connection.stream if link.bulk_connection is not None else None
     return LinkInfo(
         remote=f"{host}:{port}",
-        dialled=link.dialled,
         up_ago=now - (link.since or now),
         rtt=link.connection.clock.rtt,
-        clock_offset=link.clock_offset,
-        clock_error=link.clock_error,
-        bytes_in=link.bytes_in,
-        bytes_out=link.bytes_out,
         queued=link.queue_bytes,
-        dropped=link.dropped,
         heard_ago=now - link.heard_at,
-        rests=link.rests,
         lease=link.connection.keepalive.remote_lease,
         lanes=(
             _lane(link.express, link.connection.stream),
-            _lane(
-                link.bulk,
-                link.bulk_connection.stream if link.bulk_connection is not None else None,
-                unneeded=not link.bulk_wanted,
-            ),
+            _lane(link.bulk, bulk, unneeded=not link.bulk_wanted),
         ),
+        **{name: getattr(link, name) for name in _LINK_FIELDS},
     )
 
 
 def _lane(lane: LaneSender, stream: Stream | None, *, unneeded: bool = False) -> LaneInfo:
     """A lane of a link; ``stream`` is that of its connection, while it has one."""
-    return LaneInfo(
-        name=lane.name,
-        connected=stream is not None,
-        unneeded=unneeded,
-        bytes_in=stream.bytes_in if stream is not None else 0,
-        bytes_out=stream.bytes_out if stream is not None else 0,
-        queued=stream.pending_bytes if stream is not None else lane.outbox.pending_bytes,
-        dropped=lane.outbox.dropped.total(),
+    found = LaneInfo(
+        name=lane.name, connected=stream is not None, unneeded=unneeded, dropped=lane.outbox.dropped.total()
     )
+    if stream is None:
+        return msgspec.structs.replace(found, queued=lane.outbox.pending_bytes)
+    counts = {"bytes_in": stream.bytes_in, "bytes_out": stream.bytes_out, "queued": stream.pending_bytes}
+    return msgspec.structs.replace(found, **counts)
 
 
 def _count(hidden: int, kind: str) -> str:
@@ -508,37 +502,26 @@ def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tu
     """
     holders: dict[str, list[PeerInfo]] = {}
     for peer in peers:
-        holders.setdefault(_address(peer), []).append(peer)
-    return tuple(_marked(peer, holders[_address(peer)], own) if _unreachable_by_tcp(peer) else peer for peer in peers)
-
-
-def _address(peer: PeerInfo) -> str:
-    return peer.guid.rpartition(":")[0]
-
-
-def _unreachable_by_tcp(peer: PeerInfo) -> bool:
-    """Whether its beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``."""
-    return (
-        peer.state == "linking"
-        and peer.since_ago >= discovery_limits.ADDRESS_SHARED_AFTER
-        and peer.beacon_ago is not None
-        # An agent that was killed sends no beacons after its link has fallen.
-        and peer.beacon_ago < peer.since_ago - discovery_limits.ADDRESS_SHARED_MARGIN
-        and not _address(peer).startswith("127.")
+        holders.setdefault(peer.guid.rpartition(":")[0], []).append(peer)
+    texts = ((peer, _shared_address(peer, holders, own)) for peer in peers)
+    return tuple(
+        msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text)) if text else peer
+        for peer, text in texts
     )
 
 
-def _marked(peer: PeerInfo, holders: Sequence[PeerInfo], own: Collection[str]) -> PeerInfo:
-    address = _address(peer)
-    others = [f"peer {other.name}" for other in holders if other is not peer]
-    if address in own:
-        others.append("this machine")
-    if not others:
-        return peer
-    port = peer.guid.partition("#")[0].rpartition(":")[2]
-    text = (
+def _shared_address(peer: PeerInfo, holders: Mapping[str, Sequence[PeerInfo]], own: Collection[str]) -> str:
+    """Why a peer's beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``, or empty."""
+    address, _, port = peer.guid.partition("#")[0].rpartition(":")
+    others = [f"peer {other.name}" for other in holders[address] if other is not peer]
+    others += ["this machine"] if address in own else []
+    waits = peer.state == "linking" and peer.since_ago >= discovery_limits.ADDRESS_SHARED_AFTER
+    if not others or not waits or peer.beacon_ago is None or address.startswith("127."):
+        return ""
+    if peer.beacon_ago >= peer.since_ago - discovery_limits.ADDRESS_SHARED_MARGIN:
+        return ""  # an agent that was killed sends no beacons after its link has fallen
+    return (
         f"its address {address} is also that of {' and '.join(others)}, and its port {port} does not answer there: "
         "two machines seem to have one address; give one of them another (was an image copied with its address?), "
         f"or, if both run on one machine, open port {port} in its firewall"
     )
-    return msgspec.structs.replace(peer, state="conflict", conflicts=(*peer.conflicts, text))

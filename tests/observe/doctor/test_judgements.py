@@ -10,8 +10,7 @@ import msgspec
 import pytest
 
 from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_exposed_nodes, judge_membership
-from rmpa.observe.doctor.facts import NetworkInterface
-from rmpa.observe.doctor.machine import judge_clock, judge_peer_clock, judge_rights, judge_sim_time
+from rmpa.observe.doctor.machine import NetworkInterface, judge_clock, judge_peer_clock, judge_rights, judge_sim_time
 from rmpa.observe.doctor.network import (
     MulticastEcho,
     Port,

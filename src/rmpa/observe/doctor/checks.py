@@ -28,7 +28,7 @@ from rmpa.ros.http.rpc import call_api
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.observe.doctor.facts import DoctorInput
+    from rmpa.observe.doctor.machine import DoctorInput
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.observe.snapshot import AgentInfo, Snapshot, UnreachableInfo
     from rmpa.trust.permissions import TrustStatus

@@ -29,7 +29,7 @@ from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.network import choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
-from rmpa.observe.doctor.facts import ask_program, resolve
+from rmpa.observe.doctor.machine import ask_program, resolve
 from rmpa.observe.peer_info import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.runtime.kernel_tcp import program_at
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from rmpa.discovery.network import Interface
-    from rmpa.observe.doctor.facts import DoctorInput, NetworkInterface
+    from rmpa.observe.doctor.machine import DoctorInput, NetworkInterface
 
 # --- interfaces -----------------------------------------------------------------------------------------------------
 
