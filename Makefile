@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .DEFAULT_GOAL := venv
 # One apt at a time: a lock on this folder.
 APT := flock scripts
-.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests style format types imports reference fuzz soak soak-services soak-web bench experiment wheel ros chromium clients clean
+.PHONY: packages checks venv demo demo-sites demo-kill demo-start test test-bare tests test-long style format types imports reference fuzz soak soak-services soak-web bench experiment wheel ros chromium clients clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -51,6 +51,9 @@ ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root a
 
 tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests ARGS="tests/core -k names"
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)
+
+test-long: $(STAMP)  ## the simulated networks and fuzz targets with more seeds than `make tests` has
+	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/fuzz
 
 style: $(STAMP)  ## ruff, and for the pages prettier and eslint where npm is: lint and format
 	$(BIN)/ruff check .

@@ -1,6 +1,6 @@
 """Every fuzz target: its seeds, seeded mutations of them, and hypothesis's own bytes.
 
-``python -m tests.fuzz --seconds 60`` runs longer.
+``make test-long`` makes more of them (FUZZ_MUTATIONS), ``python -m tests.fuzz --seconds 60`` as many as it can.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.fuzz import targets
 from tests.fuzz.mutate import mutate
 
-MUTATIONS = int(os.environ.get("FUZZ_MUTATIONS", "2000"))
+MUTATIONS = int(os.environ.get("FUZZ_MUTATIONS", "500"))
 every_target = pytest.mark.parametrize("name", targets.names())
 
 
@@ -44,7 +44,7 @@ def test_seeded_mutations(name: str) -> None:
 def test_any_bytes(name: str) -> None:
     target = targets.load(name)
 
-    @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=MUTATIONS // 10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     @given(st.binary(max_size=512))
     def run(data: bytes) -> None:
         target.fuzz(data)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
-CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
+CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
 TERMS_HERE: Final = """
 [[contract]]
 topics = ["/relayed_here"]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
-CLIENTS: Final = [(s, p) for s in ("roscpp", "rospy") for p in ("roscpp", "rospy")]
+CLIENTS: Final = [("roscpp", "rospy"), ("rospy", "roscpp")]
 RATE: Final = 100
 MOVE_GAP: Final = RATE * 2
 """Messages that may pass while a subscriber is moved: a tenth of a second in general, much more on a busy machine."""

@@ -1,6 +1,6 @@
 """Rosters with links: after the network healed every pair has exactly one link with both lanes, agreed by both ends.
 
-``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
+``make test-long`` runs eight times as many (RMPA_SIMULATION_SEEDS);
 ``python -m tests.simulation --kind mesh --seed N --peers M`` one.
 """
 
@@ -18,7 +18,7 @@ from tests.simulation.rests_scenario import RestsScenario
 pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
-BLOCK = 25
+BLOCK = 6
 BLOCKS = [(count, block) for count, blocks in ((2, 4), (3, 2), (4, 1), (5, 1)) for block in range(blocks * FACTOR)]
 
 
@@ -30,11 +30,11 @@ def test_small_networks_are_linked_after_healing(count: int, block: int) -> None
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_links_that_rest_and_wake_are_whole_after_healing(count: int) -> None:
-    for seed in range(15 * FACTOR):
+    for seed in range(4 * FACTOR):
         RestsScenario(seed, count).play()
 
 
-@pytest.mark.parametrize("seed", range(4 * FACTOR))
+@pytest.mark.parametrize("seed", range(FACTOR))
 def test_networks_of_ten_are_linked_after_healing(seed: int) -> None:
     MeshScenario(seed, 10).play()
 
@@ -45,12 +45,12 @@ def test_a_network_of_thirty_is_linked_after_healing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3 * FACTOR))
 def test_where_both_can_dial_one_side_dialled_both_lanes(seed: int, count: int) -> None:
     MeshScenario(seed, count, calm=True).play()
 
 
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.parametrize("seed", range(4 * FACTOR))
 def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
     scenario = MeshScenario(seed, 3, keep=True, calm=True)
@@ -68,7 +68,7 @@ def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatc
     assert all("replaced" in line or "linked already" in line for line in fell), fell
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_seed_gives_one_run(seed: int) -> None:
     first, second = (MeshScenario(seed, 4).play() for _ in range(2))
     assert first == second

@@ -1,6 +1,6 @@
 """Reliable routes over links that break at every byte: in order, none doubled, none lost unseen.
 
-``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
+``make test-long`` runs eight times as many (RMPA_SIMULATION_SEEDS);
 ``python -m tests.simulation --kind reliable --seed N`` one.
 """
 
@@ -16,7 +16,7 @@ from tests.simulation.reliable_ends import Bounds
 from tests.simulation.reliable_scenario import ReliableScenario
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
-BLOCK = 100
+BLOCK = 25
 
 
 @pytest.mark.parametrize("block", range(4 * FACTOR))
@@ -55,7 +55,8 @@ def test_failure_at_every_byte_of_message_and_acknowledgement(
     assert length > 100
     happened = 0
     start = ReliableScenario.__init__
-    for point in range(length):
+    points = range(0, length, max(1, 4 // FACTOR))
+    for point in points:
 
         def begin(self: ReliableScenario, seed: int, bounds: Bounds, point: int = point) -> None:
             start(self, seed, bounds)
@@ -66,7 +67,7 @@ def test_failure_at_every_byte_of_message_and_acknowledgement(
         scenario = short(0)
         happened += side not in scenario.budget
         scenario.settle()
-    assert happened == length
+    assert happened == len(points)
 
 
 def test_ten_thousand_messages_at_1_khz_across_five_cuts() -> None:
@@ -110,7 +111,7 @@ def test_outage_beyond_the_window_begins_a_new_numbering(seconds: float) -> None
     assert [got.gap for got in life.received] == [0, 0]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_one_seed_gives_one_run(seed: int) -> None:
     first, second = (ReliableScenario(seed).play() for _ in range(2))
     assert first == second
@@ -119,10 +120,10 @@ def test_one_seed_gives_one_run(seed: int) -> None:
 
 def test_every_trouble_is_met() -> None:
     """The seeds would prove nothing if they led around what is to be proved."""
-    scenarios = [ReliableScenario(seed) for seed in range(200)]
+    scenarios = [ReliableScenario(seed) for seed in range(60)]
     for scenario in scenarios:
         scenario.play()
     lives = [life for scenario in scenarios for life in scenario.importer.lives]
-    assert sum(life.gaps > 0 for life in lives) > 20
-    assert sum(life.duplicates > 0 for life in lives) > 5
-    assert sum(len(life.epochs) > 1 for life in lives) > 20
+    assert sum(life.gaps > 0 for life in lives) > 6
+    assert sum(life.duplicates > 0 for life in lives) > 1
+    assert sum(len(life.epochs) > 1 for life in lives) > 6
