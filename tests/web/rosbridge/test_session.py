@@ -9,7 +9,6 @@ from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.rosbridge.protocol import PublishFrames, decode_png
-from rmpa.web.rosbridge.session import OPS
 from tests.web.recorder import NOW_NS
 from tests.web.rosbridge.client import Client
 
@@ -167,6 +166,25 @@ def test_a_subscription_that_the_hub_refuses_is_reported_and_may_begin_again() -
     assert status["id"] == "i"
     assert status["msg"] == "subscribe /t: the core refused: not allowed; ask for the role operator"
     assert client.subscribe() is not handle
+
+
+def test_a_subscription_without_a_type_fails_where_the_topic_does_not_appear() -> None:
+    client = Client()
+    none, *others = (client.subscribe(topic, id="i") for topic in ("/none", "/soon", "/published"))
+    client.graph.add_topic("/soon", STRING)
+    client.hub.published["/published"] = STRING
+    client.advance(limits.TYPE_WAIT - 0.01)
+    assert client.received() == []
+    client.advance(0.01)
+    assert none.closed
+    assert not any(each.closed for each in others)
+    assert "its type is not known; give its 'type'" in client.error()
+
+
+def test_a_publisher_of_another_type_that_comes_later_is_reported() -> None:
+    client = Client()
+    client.subscribe(type="std_msgs/Int32").differs(STRING)
+    assert "/t has the type std_msgs/String, not std_msgs/Int32" in client.error()
 
 
 # --- publishing --------------------------------------------------------------------------------------------------
@@ -365,10 +383,3 @@ def test_what_a_client_may_have_is_bounded() -> None:
     for number in range(limits.ADVERTISED_MAX + 5):
         client.send("advertise", topic=f"/t{number}", type=STRING)
     assert len(client.received()) == 5
-
-
-def test_every_op_is_known() -> None:
-    assert OPS.keys() >= {
-        "advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service",
-        "unadvertise_service", "service_response", "fragment", "png", "set_level", "status",
-    }  # fmt: skip

@@ -92,6 +92,7 @@ class Session(HubClient):
     def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
         super().__init__(hub, f"{self.kind} {address}", rights)
         self.address = address
+        self._late_told = -limits.DROPS_SHOWN
         self.connection = ClientConnection(self, priority)
 
     def late(self) -> str:
@@ -101,7 +102,9 @@ class Session(HubClient):
 
     def show_late(self, text: str) -> None:
         """Warn of what is published too late, now and then."""
-        if self.connection.may_warn_late():
+        now = self.connection.now()
+        if now - self._late_told >= limits.DROPS_SHOWN:
+            self._late_told = now
             self.warn(text, "late")
 
     @abstractmethod
@@ -242,7 +245,6 @@ class ClientConnection:
         self._received: Callable[[], int] = int
         self._arrival = MessageArrival()
         self._age: CommandAge | None = None
-        self._late_told = -limits.DROPS_SHOWN
         self._wake = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
         self._transport: asyncio.Transport | None = None
@@ -271,15 +273,7 @@ class ClientConnection:
 
     def age(self) -> float:
         """Seconds that the frame which comes now may be old at most; 0 where that is not bounded."""
-        return self._age.bound(self._now()) if self._age is not None else 0.0
-
-    def may_warn_late(self) -> bool:
-        """Whether it is time for another text on what comes too late."""
-        now = self._now()
-        told, self._late_told = self._late_told, now
-        if now - told < limits.DROPS_SHOWN:
-            self._late_told = told
-        return now - told >= limits.DROPS_SHOWN
+        return self._age.bound(self.now()) if self._age is not None else 0.0
 
     def end(self, code: int, reason: str, refusal: str = "") -> None:
         """Close the WebSocket; what the client still sends is ignored.
@@ -353,7 +347,7 @@ class ClientConnection:
             session.opened()
             works = [("write to", self._write(socket_, self._out)), ("watch", self._watch())]
             if session.rights.command_age and not session.dates_commands:
-                self._age = CommandAge(self._now())
+                self._age = CommandAge(self.now())
                 works.append(("ask the age of", self._ask_age(self._age)))
             for name, work in works:
                 tasks.append(asyncio.get_running_loop().create_task(work, name=f"{name} {session.name}"))
@@ -396,7 +390,7 @@ class ClientConnection:
                     self._send(Opcode.PONG, (message.data,))
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 try:
-                    self._session.received_frame(message.data, self._now())
+                    self._session.received_frame(message.data, self.now())
                     self.arm()
                 except Exception:  # noqa: BLE001 - a fault of one client's session must not end the server
                     _log.exception("! a frame of %s failed", self._session.name)
@@ -422,7 +416,7 @@ class ClientConnection:
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
             now, received = self._waiting, self._received()
-            if self._arrival.takes_too_long(received, self._now()):
+            if self._arrival.takes_too_long(received, self.now()):
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return
             alive = (self._heard, received) != heard or (waiting and now != waiting)
@@ -435,7 +429,7 @@ class ClientConnection:
 
     async def _ask_age(self, age: CommandAge) -> None:
         while True:
-            payload = age.ping(self._now())
+            payload = age.ping(self.now())
             if payload is not None:
                 self._send(Opcode.PING, (payload,))
             await asyncio.sleep(self._session.rights.command_age / _AGE_PINGS)
@@ -453,7 +447,7 @@ class ClientConnection:
                     await self._wake.wait()
                     continue
                 before = self.sent
-                for opcode, parts in entry(self._now()):
+                for opcode, parts in entry(self.now()):
                     self._send(opcode, parts)
                 if self.sent == before:
                     # A message that is held back needs the timer; to ask for it at each message would take time.
@@ -478,7 +472,8 @@ class ClientConnection:
         return self._out.unsent if self._out is not None else 0
 
     @staticmethod
-    def _now() -> float:
+    def now() -> float:
+        """Seconds of the clock of all calls of the session."""
         return asyncio.get_running_loop().time()
 
     def _send(self, opcode: Opcode, parts: Sequence[Payload]) -> None:
@@ -497,10 +492,10 @@ class ClientConnection:
         self._wake.set()
 
     def _tell_drops(self) -> None:
-        if self.queue.dropped_total == self._drops_shown or self._now() < self._drops_at:
+        if self.queue.dropped_total == self._drops_shown or self.now() < self._drops_at:
             return
         self._drops_shown = self.queue.dropped_total
-        self._drops_at = self._now() + limits.DROPS_SHOWN
+        self._drops_at = self.now() + limits.DROPS_SHOWN
         for stream, count in self.queue.dropped.items():
             text = f"{count} messages were dropped so far, as this client is too slow for all that it reads"
             self._session.warn(f"{stream.topic}: {text}", f"dropped {stream.topic}")
@@ -512,7 +507,7 @@ class ClientConnection:
             self._timer = asyncio.get_running_loop().call_later(limits.TIMER_RETRY, self._due)
             return
         try:
-            self._session.handle_timer(self._now())
+            self._session.handle_timer(self.now())
         except RmpaError:
             _log.exception("! a timer of %s failed", self._session.name)
         self.arm()

@@ -162,7 +162,7 @@ class ServedService:
     kind: ServiceType
     called: Callable[[bytes, asyncio.Future[Payload]], None]
     failed: Callable[[RmpaError], None]
-    registration: Registration[Service] | None = None
+    registration: Registration[Service] = field(init=False)
     calls: set[asyncio.Future[Payload]] = field(default_factory=set)
 
     def close(self, reason: str = "") -> None:
@@ -216,8 +216,7 @@ class ServedServices:
         for response in served.calls:
             if not response.done():
                 response.set_exception(RmpaError(reason))
-        if served.registration is not None:
-            served.registration.end()
+        served.registration.end()
 
     def close(self) -> None:
         """End all."""

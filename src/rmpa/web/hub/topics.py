@@ -148,8 +148,8 @@ class _Latched:
 @dataclass(slots=True, eq=False)
 class _Topic:
     name: str
+    registration: Registration[Subscriber] = field(init=False)
     subscriptions: dict[ClientSubscription, None] = field(default_factory=dict)
-    registration: Registration[Subscriber] | None = None
     kind: MessageType | None = None
     """The type that it is registered with; ``None``: any."""
     linger: asyncio.TimerHandle | None = None
@@ -209,7 +209,7 @@ class HubTopics:
         there = self._topics.get(topic)
         if there is None:
             there = self._topics[topic] = _Topic(topic)
-            self._register_with(there, None)
+            there.registration = self._registration(there)
             if (own := self.publishers.latched(topic)) is not None:
                 self._keep(_Latched(own, {}))
         if there.linger is not None:
@@ -248,13 +248,9 @@ class HubTopics:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _register_with(self, there: _Topic, kind: MessageType | None) -> None:
-        if there.registration is not None:
-            there.registration.end()
-        there.kind = kind
+    def _registration(self, there: _Topic) -> Registration[Subscriber]:
         register = functools.partial(self._register, there)
-        refused = functools.partial(self._refused, there)
-        there.registration = Registration(self._link, "topic", there.name, register, refused)
+        return Registration(self._link, "topic", there.name, register, functools.partial(self._refused, there))
 
     async def _register(self, there: _Topic, node: Node) -> Subscriber:
         take = functools.partial(self._take, there)
@@ -283,7 +279,9 @@ class HubTopics:
         unfit = types and len(wanted) == 1 and not wanted & {None, *types}
         kind = self._types.at_hand(next(iter(wanted)) or "") if unfit else None
         if kind is not there.kind:
-            self._register_with(there, kind)
+            there.kind = kind
+            there.registration.end()
+            there.registration = self._registration(there)
 
     def _refused(self, there: _Topic, error: RmpaError) -> None:
         if self._topics.get(there.name) is there:
@@ -298,8 +296,7 @@ class HubTopics:
         for key in [key for key in self._latched if key[0] == there.name]:
             del self._latched[key]
         del self._topics[there.name]
-        if there.registration is not None:
-            there.registration.end()
+        there.registration.end()
         if not self._topics:
             self._buffers.clear()
 
@@ -342,7 +339,7 @@ class HubTopics:
         return latched
 
     def _replay(self, there: _Topic, subscription: ClientSubscription) -> None:
-        subscriber = there.registration.value if there.registration is not None else None
+        subscriber = there.registration.value
         connected = {OWN} | (subscriber.callers if subscriber is not None else set())
         if subscription in there.subscriptions:
             for (topic, source), latched in [*self._latched.items()]:
@@ -393,7 +390,7 @@ class _Publisher:
     users: set[ClientPublication]
     numbers: HeaderNumbers | None = None
     """Numbers its messages; ``None`` while its type is not known."""
-    registration: Registration[Publisher] | None = None
+    registration: Registration[Publisher] = field(init=False)
     linger: asyncio.TimerHandle | None = None
     early: deque[tuple[float, Payload]] | None = field(default_factory=deque)
     """What was published before subscribers were connected; ``None`` from then on."""
@@ -499,11 +496,10 @@ class Publishers:
         message = ReceivedMessage(there.topic, there.type, memoryview(payload), self._now_ns())
         if there.latch:
             there.latched = message
-        publisher = there.registration.value if there.registration is not None else None
-        if there.early is not None or publisher is None:
+        if there.early is not None or there.registration.value is None:
             self._wait(there, payload)  # also while the node is made anew: the newest messages wait for it
         else:
-            publisher.publish_raw(payload)
+            there.registration.value.publish_raw(payload)
         self._subscriptions.publish_own(message, latch=there.latch)
 
     def _wait(self, there: _Publisher, payload: Payload) -> None:
@@ -567,5 +563,4 @@ class Publishers:
             there.linger.cancel()
         del self._topics[there.topic]
         self._subscriptions.forget_own(there.topic)
-        if there.registration is not None:
-            there.registration.end()
+        there.registration.end()

@@ -66,6 +66,8 @@ class _Topic(ClientStream):
         kind: The type that is wanted; None for any.
     """
 
+    subscription: ClientSubscription
+
     def __init__(self, session: RosbridgeSession, name: str, topic: str, kind: str | None) -> None:
         self._session = session
         self.name = name
@@ -75,7 +77,6 @@ class _Topic(ClientStream):
         self.wishes: dict[Id, _Wish] = {}
         self.judged_at: float | None = None
         """When it fails, if the topic is not there by then."""
-        self.subscription: ClientSubscription | None = None
         self._compression = Compression.NONE
         self._fragment_size: int | None = None
         self._codecs: dict[tuple[str, str], MessageCodec] = {}
@@ -124,7 +125,7 @@ class _Publisher:
     type: str
     latch: bool
     codec: MessageCodec
-    publication: ClientPublication | None = None
+    publication: ClientPublication = field(init=False)
     ids: set[Id] = field(default_factory=set)
 
 
@@ -146,7 +147,7 @@ class _Served:
     spelling: str
     request: MessageCodec
     response: MessageCodec
-    service: ServedService | None = None
+    service: ServedService = field(init=False)
     calls: dict[str, asyncio.Future[Payload]] = field(default_factory=dict)
     """The response of each call that is open, by the id that the client got."""
 
@@ -365,8 +366,7 @@ class RosbridgeSession(Session):
         del self._topics[topic.name]
         topic.throttle.clear()
         self.connection.queue.end(topic)
-        if topic.subscription is not None:
-            topic.subscription.close()
+        topic.subscription.close()
 
     # --- publishers -------------------------------------------------------------------------------------------
 
@@ -417,8 +417,7 @@ class RosbridgeSession(Session):
         if written.missing:
             fields = ", ".join(written.missing)
             self.status("warning", f"publish {name}: these fields were not given: {fields}", id_)
-        if publisher.publication is not None:
-            publisher.publication.publish(written.payload)
+        publisher.publication.publish(written.payload)
 
     def _begin_publisher(self, name: str, kind: str, *, latch: bool) -> _Publisher:
         check_count(len(self._publishers), limits.ADVERTISED_MAX, "advertised topics")
@@ -438,8 +437,7 @@ class RosbridgeSession(Session):
 
     def _end_publisher(self, publisher: _Publisher) -> None:
         del self._publishers[publisher.topic]
-        if publisher.publication is not None:
-            publisher.publication.close()
+        publisher.publication.close()
 
     # --- calls ------------------------------------------------------------------------------------------------
 
@@ -582,8 +580,7 @@ class RosbridgeSession(Session):
 
     def _end_service(self, served: _Served, reason: str) -> None:
         del self._services[served.name]
-        if served.service is not None:
-            served.service.close(reason)
+        served.service.close(reason)
 
 
 def _fragment_size(size: float | None) -> int | None:
