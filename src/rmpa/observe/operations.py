@@ -279,6 +279,7 @@ class GraphRevisions:
 # --- the operations -------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True)
 class ControlOperations:
     """The operations of one agent.
 
@@ -291,26 +292,17 @@ class ControlOperations:
         sites: Answers questions about other sites.
     """
 
-    def __init__(
-        self,
-        name: str,
-        bridge: Bridge,
-        params: Params,
-        snapshots: SnapshotBuilder,
-        nodes: Nodes,
-        sites: SiteRequests,
-    ) -> None:
-        self._name = name
-        self._bridge = bridge
-        self._params = params
-        self._snapshots = snapshots
-        self._nodes = nodes
-        self._sites = sites
+    name: str
+    bridge: Bridge
+    params: Params
+    snapshots: SnapshotBuilder
+    nodes: Nodes
+    sites: SiteRequests
 
     def handlers(self) -> dict[str, Handler]:
         """The handlers of the operations of this class, for ``ControlServer``."""
         names = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
-        return {"site": self._sites.answer, **{name: getattr(self, name) for name in names}}
+        return {"site": self.sites.answer, **{name: getattr(self, name) for name in names}}
 
     def snapshot(self, args: Args) -> Snapshot:
         """A snapshot, or a part of it.
@@ -326,7 +318,7 @@ class ControlOperations:
             raise ConfigError("most", f"{most!r} is not a number of topics")
         names = frozenset(map(str, topics)) if topics is not None else None
         wanted = frozenset(map(str, services)) if isinstance(services, list) else services is True or None
-        return self._snapshots.build(names, services=wanted, peers=args.get("peers") is not False, most=most)
+        return self.snapshots.build(names, services=wanted, peers=args.get("peers") is not False, most=most)
 
     async def ping(self, args: Args) -> PingReply:
         """``peer``: its name or GUID; ``count``: the number of pings."""
@@ -347,8 +339,8 @@ class ControlOperations:
         inner: Args = {name: args[name] for name in ("key", "text") if name in args}
         if "/" in peer:
             site, module = read_site_module(peer)
-            return await self._sites.one(PARAM, {"site": site, "module": module, "what": what, **inner})
-        return await self._bridge.rpc.request(self._session(peer), what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+            return await self.sites.one(PARAM, {"site": site, "module": module, "what": what, **inner})
+        return await self.bridge.rpc.request(self._session(peer), what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
         """The parameters of other modules that this one follows."""
@@ -361,7 +353,7 @@ class ControlOperations:
                 size=len(entry.text) if entry.text is not None else None,
                 problem=entry.problem,
             )
-            for entry in self._params.followed
+            for entry in self.params.followed
         )
 
     async def node(self, args: Args) -> Any:
@@ -371,20 +363,20 @@ class ControlOperations:
         """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
         if peer is None and what == node_requests.INFO:
-            return await self._nodes.info(args)
+            return await self.nodes.info(args)
         if peer is None:
-            return await asyncio.gather(*map(self._nodes_of, self._bridge.sessions.linked()))
+            return await asyncio.gather(*map(self._nodes_of, self.bridge.sessions.linked()))
         session = self._session(peer)
         if what == node_requests.LIST:
             return [await self._nodes_of(session)]
         request = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self._bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
+        return await self.bridge.rpc.request(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
 
     async def _nodes_of(self, session: PeerSession) -> PeerNodes:
         """The nodes of a peer; where it does not answer, those of which this module has proxies."""
         peer = session.link.name
         try:
-            value = await self._bridge.rpc.request(session, node_requests.LIST, {})
+            value = await self.bridge.rpc.request(session, node_requests.LIST, {})
             return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
         except (RmpaError, msgspec.ValidationError) as error:
             nodes = tuple(NodeLine(name=node) for node, _ in session.proxies)
@@ -392,14 +384,14 @@ class ControlOperations:
 
     async def agent(self, args: Args) -> Any:
         """What the agent of a peer tells of itself: ``peer``, its name or GUID."""
-        return await self._bridge.rpc.request(self._session(args.get("peer", "")), AGENT_INFO, {})
+        return await self.bridge.rpc.request(self._session(args.get("peer", "")), AGENT_INFO, {})
 
     def contract(self, args: Args) -> dict[str, ContractTerm]:
         """The terms that this module's settings give a ``topic`` of a ``type_name``, by key; it need not exist."""
         topic, type_name = str(args.get("topic", "")), str(args.get("type_name", ""))
         if not is_global_name(topic):
             raise ConfigError("topic", f"{topic!r} is not a topic", "write /name")
-        return self._snapshots.topics.contract(topic, type_name)
+        return self.snapshots.topics.contract(topic, type_name)
 
     def _session(self, name: object) -> PeerSession:
         """The linked peer of a name or GUID.
@@ -409,12 +401,12 @@ class ControlOperations:
             UnreachableError: No such peer has it.
         """
         peer = str(name)
-        sessions = list(self._bridge.sessions.linked())
+        sessions = list(self.bridge.sessions.linked())
         fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
-            raise PeerRefused(self._name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
+            raise PeerRefused(self.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
         similar = did_you_mean(peer, [session.link.name for session in sessions])
         remedy = "`rmpa peer list` shows which modules are there, and why one is not linked"
         raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)

@@ -6,7 +6,7 @@ A field that is ``None`` is not known, or not yet. A text "ready to read" is for
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 
@@ -110,18 +110,10 @@ class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
     p99: float
 
     @classmethod
-    def of(cls, samples: SampleSummary, **more: float) -> Self:
+    def of(cls, samples: SampleSummary, **more: Any) -> Self:
         """The distribution that a summary holds; ``more`` are the fields of a subclass."""
-        return cls(
-            count=samples.count,
-            mean=samples.mean,
-            sd=samples.sd,
-            min=samples.minimum,
-            max=samples.maximum,
-            p50=samples.p50,
-            p99=samples.p99,
-            **more,
-        )
+        same: dict[str, Any] = {name: getattr(samples, name) for name in ("count", "mean", "sd", "p50", "p99")}
+        return cls(min=samples.minimum, max=samples.maximum, **same, **more)
 
 
 class LatencyInfo(SampleSpread, kw_only=True, frozen=True):

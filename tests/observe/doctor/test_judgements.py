@@ -13,7 +13,6 @@ from rmpa.observe.doctor.checks import is_beyond_loopback, judge_agents, judge_e
 from rmpa.observe.doctor.machine import NetworkInterface, judge_clock, judge_peer_clock, judge_rights, judge_sim_time
 from rmpa.observe.doctor.network import (
     MulticastEcho,
-    Port,
     judge_interfaces,
     judge_multicast,
     judge_port,
@@ -100,12 +99,12 @@ CASES: dict[str, tuple[Callable[[], Iterable[Check]], str]] = {
     "no routes": (partial(judge_routes, {}), "skipped"),
     "routes to many": (partial(judge_routes, ROUTES), "fail ok"),
     "a port that another program has": (
-        one(judge_port, Port("the ROS core", 11311, TAKEN, "roscore (pid 7)")),
+        one(judge_port, "the ROS core", 11311, TAKEN, "roscore (pid 7)"),
         "fail",
     ),
-    "a port of ours": (one(judge_port, Port("the mesh (TCP)", 40001, TAKEN, "agent base", ours=True)), "ok"),
-    "a free port": (one(judge_port, Port("beacons (UDP)", 11411)), "ok"),
-    "a shared port": (one(judge_port, Port("beacons (UDP)", 11412, owner="agent base")), "ok"),
+    "a port of ours": (one(judge_port, "the mesh (TCP)", 40001, TAKEN, "agent base", ours=True), "ok"),
+    "a free port": (one(judge_port, "beacons (UDP)", 11411), "ok"),
+    "a shared port": (one(judge_port, "beacons (UDP)", 11412, owner="agent base"), "ok"),
     "no radio": (partial(judge_radio, (), quick=False, bbr=False), "skipped"),
     "a radio and a quick kernel": (partial(judge_radio, [RADIO], quick=True, bbr=True), "ok"),
     "a radio whose losses are repeated late and whose queue is filled": (

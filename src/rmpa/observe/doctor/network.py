@@ -486,27 +486,7 @@ def judge_routes(routes: Mapping[str, str]) -> Iterator[Check]:
         yield Check("route", SKIPPED, "no peer and no seed is known whose way could be looked for")
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
-    """One port that an agent needs.
-
-    Args:
-        what: Its use, ready to read.
-        number: Its number.
-        taken: Why it cannot be bound, or empty.
-        owner: The program that has it, ready to read; empty if none or unknown. A port that is not ``taken`` may have
-            one too: agents share the port of the beacons.
-        ours: Whether the owner is an agent of this machine, or its core.
-    """
-
-    what: str
-    number: int
-    taken: str = ""
-    owner: str = ""
-    ours: bool = False
-
-
-def ports(given: DoctorInput) -> Iterable[Check]:
+def ports(given: DoctorInput) -> Iterator[Check]:
     """The check of the ports of an agent with these settings: they are bound for a moment."""
     settings, ours, processes = given.settings, {}, {}
     for name, snapshot in given.snapshots.items():
@@ -516,30 +496,28 @@ def ports(given: DoctorInput) -> Iterable[Check]:
         for text, what in ((core, "the core of agent"), (mesh, "agent")):
             if text.isdecimal():
                 ours[int(text)] = f"{what} {name}"
-    found = []
     if settings.core_mode == "embedded":  # an external core has its port already
-        found.append(_tcp("the ROS core", settings.core_host, settings.core_port, ours))
+        yield _tcp("the ROS core", settings.core_host, settings.core_port, ours)
     if settings.port:
-        found.append(_tcp("the mesh (TCP)", "", settings.port, ours))
+        yield _tcp("the mesh (TCP)", "", settings.port, ours)
     number = settings.discovery_port
     try:
         open_receiver(settings.multicast.group, number).close()
     except OSError as error:
-        found.append(Port("beacons (UDP)", number, error.strerror or str(error), program_at(number)))
+        yield judge_port("beacons (UDP)", number, error.strerror or str(error), program_at(number))
     else:
-        found.append(Port("beacons (UDP)", number, owner=_users(number, processes)))
-    return map(judge_port, found)
+        yield judge_port("beacons (UDP)", number, owner=_users(number, processes))
 
 
-def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Port:
+def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Check:
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, number))
         except OSError as error:
-            owner = ours.get(number, "")
-            return Port(what, number, error.strerror or str(error), owner or program_at(number), ours=bool(owner))
-    return Port(what, number)
+            owner, why = ours.get(number, ""), error.strerror or str(error)
+            return judge_port(what, number, why, owner or program_at(number), ours=bool(owner))
+    return judge_port(what, number)
 
 
 def _users(number: int, agents: Mapping[int, str]) -> str:
@@ -564,14 +542,22 @@ def _users(number: int, agents: Mapping[int, str]) -> str:
     return " and ".join(names)
 
 
-def judge_port(port: Port) -> Check:
-    """Whether an agent can bind a port that it needs."""
-    check = partial(Check, "port", where=str(port.number))
-    if not port.taken:
-        text = f"used by {port.owner}; others may use it too" if port.owner else "free"
-        return check(OK, f"{port.what}: {text}")
-    if port.ours:
-        return check(OK, f"{port.what}: {port.owner} has it")
-    text = f"{port.what}: taken{f' by {port.owner}' if port.owner else ''} ({port.taken})"
-    remedy = f"end that program (`ss -lptun | grep :{port.number}` names it), or choose another port"
+def judge_port(what: str, number: int, taken: str = "", owner: str = "", *, ours: bool = False) -> Check:
+    """Whether an agent can bind a port that it needs.
+
+    Args:
+        what: Its use, ready to read.
+        number: Its number.
+        taken: Why it cannot be bound, or empty.
+        owner: The program that has it, ready to read; empty if none or unknown. A port that is not ``taken`` may have
+            one too: agents share the port of the beacons.
+        ours: Whether the owner is an agent of this machine, or its core.
+    """
+    check = partial(Check, "port", where=str(number))
+    if not taken:
+        return check(OK, f"{what}: used by {owner}; others may use it too" if owner else f"{what}: free")
+    if ours:
+        return check(OK, f"{what}: {owner} has it")
+    text = f"{what}: taken{f' by {owner}' if owner else ''} ({taken})"
+    remedy = f"end that program (`ss -lptun | grep :{number}` names it), or choose another port"
     return check(FAIL, text, remedy)
