@@ -73,8 +73,8 @@ _PARAM: Final = Needs(
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
-QUESTIONS: Final = {REPORT: _SOURCES, INFO: _SOURCES, PARAM: _PARAM, WHY: _WAYS}
-"""The questions about other sites, with what a peer needs to ask them."""
+QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
+"""The questions about other sites."""
 
 
 class SiteAnswerer(Protocol):
@@ -107,9 +107,11 @@ class SiteRequests:
 
     def serve(self, gateway: SiteAnswerer) -> None:
         """Answer as a gateway from now on."""
-        self.answerer = gateway
-        for what, needs in QUESTIONS.items():
-            self._bridge.rpc.on_request(what, partial(self._answer_peer, gateway, what), needs)
+        self.answerer, rpc = gateway, self._bridge.rpc
+        rpc.on_request(REPORT, partial(self._answer_peer, gateway, REPORT), _SOURCES)
+        rpc.on_request(INFO, partial(self._answer_peer, gateway, INFO), _SOURCES)
+        rpc.on_request(PARAM, partial(self._answer_peer, gateway, PARAM), _PARAM)
+        rpc.on_request(WHY, partial(self._answer_peer, gateway, WHY), _WAYS)
 
     async def answer(self, args: Args) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
