@@ -15,7 +15,7 @@ import click
 
 from lab.experiments.registry import EXPERIMENTS, find_experiment
 from rmpa.cli.options import json_option
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, warn
+from rmpa.cli.output import Table, duration, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, StartError
 
 if TYPE_CHECKING:
@@ -94,12 +94,9 @@ def list_(as_json: bool) -> None:
     if as_json:
         print_json({"experiments": rows, "why_not": why_not()})
         return
-    right = [Column(title, right=True) for title in ("CELLS", "TIME", "SHORT")]
-    print_table(
-        (Column("NAME"), *right, Column("WHAT IT MEASURES")),
-        [(row.name, str(row.cells), duration(row.seconds), duration(row.seconds_short), row.about) for row in rows],
-    )
-    print_line()
+    times = [(duration(row.seconds), duration(row.seconds_short)) for row in rows]
+    lines = [(row.name, str(row.cells), *both, row.about) for row, both in zip(rows, times, strict=True)]
+    print_text(Table("NAME, >CELLS, >TIME, >SHORT, WHAT IT MEASURES", lines), "")
     if why := why_not():
         warn(f"cannot run here: {why}")
 
@@ -155,8 +152,8 @@ def run(
     waiting = runner.to_measure(jobs, store)
     if not as_json:
         seconds = sum(cell.seconds for _, cell in waiting)
-        print_line(f"{_shown(store.plan)}; {len(waiting)} cells, about {duration(seconds)}")
-        print_line(f"into {store.directory}")
+        print_text(f"{_shown(store.plan)}; {len(waiting)} cells, about {duration(seconds)}")
+        print_text(f"into {store.directory}")
     namespaces.remove_stale()
     try:
         with (
@@ -218,19 +215,12 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
         print_json(found)
         return
     if found.differences:
-        print_table(
-            (Column("WHAT DIFFERS"), Column("A"), Column("B")),
-            [tuple(map(printable, (one.what, one.a, one.b))) for one in found.differences],
-        )
-        print_line()
-    right = [Column(title, right=True) for title in ("A", "B", "B/A")]
-    print_table(
-        (Column("EXPERIMENT"), Column("FIGURE"), *right),
-        [
-            (one.experiment, one.text, quantity(one.a, one.unit), quantity(one.b, one.unit), number(one.ratio))
-            for one in found.claims
-        ],
-    )
+        print_text(Table("WHAT DIFFERS, A, B", [(one.what, one.a, one.b) for one in found.differences]), "")
+    rows = [
+        (one.experiment, one.text, quantity(one.a, one.unit), quantity(one.b, one.unit), number(one.ratio))
+        for one in found.claims
+    ]
+    print_text(Table("EXPERIMENT, FIGURE, >A, >B, >B/A", rows))
 
 
 # --- what is asked for ----------------------------------------------------------------------------------------------
@@ -329,25 +319,13 @@ def _print_report(written: Report) -> None:
 
     claims = list(_claims(written.findings))
     if claims:
-        right = [Column(title, right=True) for title in ("MEASURED", "WANTED", "PAPER")]
-        print_table(
-            (Column("EXPERIMENT"), Column("REACHED"), *right, Column("WHAT")),
-            [
-                (
-                    name,
-                    _REACHED[claim.reached],
-                    measured(claim),
-                    wanted(claim),
-                    quantity(claim.paper, claim.unit),
-                    claim.text,
-                )
-                for name, claim in claims
-            ],
-            colours=[_COLOURS[claim.reached] for _, claim in claims],
-        )
-        print_line()
-    print_line(f"report: {written.html}")
-    print_line(f"        {written.markdown}")
+        rows = [
+            (name, _REACHED[each.reached], measured(each), wanted(each), quantity(each.paper, each.unit), each.text)
+            for name, each in claims
+        ]
+        colours = [_COLOURS[claim.reached] for _, claim in claims]
+        print_text(Table("EXPERIMENT, REACHED, >MEASURED, >WANTED, >PAPER, WHAT", rows, colours), "")
+    print_text(f"report: {written.html}", f"        {written.markdown}")
     if written.missing:
         warn(f"left out: {written.missing}")
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from rmpa.bridge import limits
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
-from rmpa.cli.trust import check
+from rmpa.cli.trust import trust_check
 from rmpa.config.peer_rules import Access, PermissionRule
 from rmpa.config.read import load_settings
 from rmpa.config.settings import TrustSettings
@@ -107,7 +107,7 @@ def test_trust_check_says_what_is_enforced(seed: int, tmp_path: Path) -> None:
     gate = PermissionGate(Permissions(settings.trust))
     for _ in range(20):
         module, word, name = rng.choice(MODULES), rng.choice(WORDS), rng.choice(NAMES)
-        answer = CliRunner().invoke(check, [module, word, name, "--config", str(file), "--json"])
+        answer = CliRunner().invoke(trust_check, [module, word, name, "--config", str(file), "--json"])
         if word == "action":
             asked = [(Access.PUBLISH, "goal cancel"), (Access.SUBSCRIBE, "status feedback result")]
         elif word == "action_serve":

@@ -64,6 +64,7 @@ def test_an_option_that_is_gone_says_what_to_use(command: str, capfd: pytest.Cap
 
 WORDS = {"values": "{}", "value": "1"}
 QUIET = {
+    "rmpa config show",
     "rmpa doctor",
     "rmpa trust init",
     "rmpa trust status",

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
+from rmpa.cli.graph import read_name
 from rmpa.cli.messages import fill_stamps, flatten, pick, read_values, shorten, to_text
-from rmpa.cli.output import Column, duration, print_error, print_table, printable, read_name, size
+from rmpa.cli.output import Table, duration, print_error, print_text, printable, size
 from rmpa.cli.topic import facts
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.observe.snapshot import RouteInfo
@@ -150,6 +151,6 @@ def test_a_table_measures_its_columns_once(capsys: pytest.CaptureFixture[str]) -
             return super().__iter__()
 
     rows = Counting(["/a", str(number)] for number in range(300))
-    print_table((Column("TOPIC"), Column("MESSAGES", right=True)), rows)
+    print_text(Table("TOPIC, >MESSAGES", rows))
     assert len(capsys.readouterr().out.splitlines()) == 301
     assert rows.looks < 10, "not once for each row"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits
 from rmpa.bridge.params import rules as transfer
-from rmpa.cli.param import read_documents, read_yaml, show_yaml, write_yaml
+from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe.control_server import ControlServer
 from rmpa.observe.snapshot import FollowedInfo
@@ -157,7 +157,6 @@ def test_what_is_written_is_read_again(value: Any) -> None:
     back = read_yaml(write_yaml(value), "x")
     assert back == value
     assert type(back) is type(value)
-    assert read_yaml(show_yaml(value), "x") == value
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,10 @@ def test_in_a_pipe_a_list_is_complete(place: Place, agent: Callable[..., None]) 
 
 def test_names_and_modules_are_selected_by_patterns() -> None:
     of = {"/a/scan": ["arm1"], "/b/scan": ["arm2"], "/cmd": []}
-    assert Selection(match="*/scan", peer="*2").with_peers(of, of.__getitem__) == ["/b/scan"]
-    assert Selection().with_peers(of, of.__getitem__) == [*of]
-    assert not Selection(peer="arm*").wants_peer(None)
+    chosen = Selection(match="*/scan", peer="*2")
+    assert [name for name, peers in of.items() if chosen.wants(name, peers)] == ["/b/scan"]
+    assert all(Selection().wants(name, peers) for name, peers in of.items())
+    assert not Selection(peer="arm*").wants("/cmd", (None,))
 
 
 def test_a_terminal_shows_the_first_of_many_unless_all_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

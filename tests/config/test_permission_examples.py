@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from rmpa.cli.trust import check
+from rmpa.cli.trust import trust_check
 from rmpa.config.peer_rules import NAME_KEYS, Access
 from rmpa.config.read import load_settings
 
@@ -31,7 +31,7 @@ def test_each_example_is_read(text: str, tmp_path: Path) -> None:
 def test_what_is_said_of_the_first_example_is_so(words: str, answer: str, tmp_path: Path) -> None:
     file = tmp_path / "rmpa.toml"
     file.write_text(EXAMPLES[0])
-    result = CliRunner().invoke(check, [*shlex.split(words), "--config", str(file)])
+    result = CliRunner().invoke(trust_check, [*shlex.split(words), "--config", str(file)])
     assert result.output.strip() == answer
     assert result.exit_code == (0 if answer.startswith("yes") else 1)
 

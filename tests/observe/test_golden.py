@@ -12,10 +12,7 @@ import click
 import msgspec
 import pytest
 
-from rmpa.cli.agent import _json as doctor_json
-from rmpa.cli.agent import _lines as doctor_lines
-from rmpa.cli.agent import _stage_lines as why_lines
-from rmpa.cli.agent import _summary as doctor_summary
+from rmpa.cli.agent import check_json, check_lines, checks_summary, stage_lines
 from rmpa.observe.doctor.machine import judge_shell
 from rmpa.observe.doctor.network import judge_rules
 from rmpa.observe.health import Health, diagnostic_status
@@ -51,10 +48,10 @@ def checks() -> Iterator[tuple[str, list[Check]]]:
 def doctor() -> bytes:
     """The lines of a terminal, and a result of ``--json``."""
     found = [*checks()]
-    lines = [(name, [line for check in results for line in doctor_lines(check)]) for name, results in found]
+    lines = [(name, [line for check in results for line in check_lines(check)]) for name, results in found]
     every = [check for _, results in found for check in results]
-    some = [msgspec.json.encode(doctor_json(check)).decode() for check in every[:3]]
-    return document((*lines, ("the summary", [doctor_summary(every)]), ("JSON", some)))
+    some = [msgspec.json.encode(check_json(check)).decode() for check in every[:3]]
+    return document((*lines, ("the summary", [checks_summary(every)]), ("JSON", some)))
 
 
 def why() -> bytes:
@@ -68,7 +65,7 @@ def why() -> bytes:
     for name, (here, there, _) in (test_services.FLOWING | test_services.FAILURES).items():
         ways[f"service: {name}"] = (test_services.walk(here, there),)
     ways |= {f"module: {name}": (found,) for name, (found, _) in test_services.MODULES.items()}
-    lines = [(name, [line for way in found for line in why_lines(way)]) for name, found in ways.items()]
+    lines = [(name, [line for way in found for line in stage_lines(way)]) for name, found in ways.items()]
     some = [msgspec.json.encode(ways[name]).decode() for name in ("a topic", "direct", "service: a service")]
     return document((*lines, ("transports", test_transport_text.words()), ("JSON", some)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import threading
@@ -11,21 +10,15 @@ from typing import TYPE_CHECKING, Final
 import click
 from click.shell_completion import BashComplete, get_completion_class
 
+from rmpa.cli.options import Options, argument, verb
 from rmpa.core.errors import RmpaError
+from rmpa.core.identity import proxied_node, proxied_peer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.cli.output import Graph, Master
+    from rmpa.cli.graph import Graph
 
-EPILOG = """\
-\b
-Examples:
-  eval "$(rmpa completion bash)"             in this shell; in ~/.bashrc for all
-  rmpa completion zsh > "${fpath[1]}/_rmpa"
-  mkdir -p ~/.config/fish/completions
-  rmpa completion fish > ~/.config/fish/completions/rmpa.fish
-"""
 ANSWER: Final = 0.3
 """Seconds that the agent or master has for its answer: a person waits with the key pressed."""
 _BASH: Final = """\
@@ -51,10 +44,18 @@ complete -o nosort -F %(complete_func)s %(prog_name)s
 """
 
 
-@click.command(epilog=EPILOG)
-@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+@verb(argument("shell", type=click.Choice(["bash", "zsh", "fish"])))
 def completion(shell: str) -> None:
-    """Print the script that completes commands, options, and the names that the agent knows, in a shell."""
+    """Print the script that completes commands, options, and the names that the agent knows, in a shell.
+
+    ---
+
+    Examples:
+      eval "$(rmpa completion bash)"             in this shell; in ~/.bashrc for all
+      rmpa completion zsh > "${fpath[1]}/_rmpa"
+      mkdir -p ~/.config/fish/completions
+      rmpa completion fish > ~/.config/fish/completions/rmpa.fish
+    """
     from rmpa.cli.main import cli
 
     kind = get_completion_class(shell)
@@ -80,10 +81,10 @@ def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
             found.extend(name for name in _FIND[kind](ctx, incomplete) if name.startswith(incomplete))
 
     # Imported here, not in the thread: the time that this takes is not the agent's.
-    from rmpa.cli import output, param, resource  # noqa: F401
+    from rmpa.cli import param, resource  # noqa: F401
 
-    if kind in _BY_NODE:
-        from rmpa.ros.node import node  # noqa: F401
+    if kind in ("profile", "context"):
+        from rmpa.ros.node import node  # noqa: F401 - it subscribes to a resource's description
 
     # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
     asked = threading.Thread(target=ask, daemon=True)
@@ -92,22 +93,16 @@ def names(kind: str, ctx: click.Context, incomplete: str) -> list[str]:
     return sorted({*found})
 
 
-def _master(ctx: click.Context) -> Master:
-    from rmpa.cli.output import choose_master
-
-    return choose_master(ctx.params.get("master"), ctx.params.get("agent"), os.environ)
+def _options(ctx: click.Context) -> Options:
+    return Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
 
 
 def _graph(ctx: click.Context) -> Graph:
-    from rmpa.cli.output import read_graph
-
-    return asyncio.run(read_graph(_master(ctx)))
+    return _options(ctx).graph()[1]
 
 
 def _of_peer(name: str, node: str) -> str:
     """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
-    from rmpa.core.identity import proxied_peer
-
     peer = proxied_peer(node)
     return name if peer is None else f"{peer}:{name}"
 
@@ -120,50 +115,33 @@ def _with_peers(found: dict[str, list[str]], incomplete: str) -> Iterable[str]:
             yield from (_of_peer(name, node) for node in nodes)
 
 
-def _agents(ctx: click.Context, _: str) -> Iterable[str]:  # noqa: ARG001 - as the others
+def _agents() -> Iterable[str]:
     from rmpa.observe.control_client import find_agents
 
     return [agent.name for agent in find_agents(os.environ)]
 
 
-def _peers(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.observe.control_client import ControlClient, choose_agent
-
-    with ControlClient(choose_agent(os.environ, ctx.params.get("agent")).path, timeout=ANSWER) as client:
+def _peers(ctx: click.Context) -> Iterable[str]:
+    with _options(ctx).client(ANSWER) as client:
         return [peer.name for peer in client.snapshot(topics=()).peers]
 
 
-def _topics(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    graph = _graph(ctx)
-    return _with_peers({**graph.subscribers, **graph.publishers}, incomplete)
-
-
-def _services(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    return _with_peers(_graph(ctx).services, incomplete)
-
-
-def _nodes(ctx: click.Context, _: str) -> Iterable[str]:
-    from rmpa.core.identity import proxied_node
-
+def _nodes(ctx: click.Context) -> Iterable[str]:
     for node in _graph(ctx).nodes:
         proxy = proxied_node(node)
         yield node if proxy is None else _of_peer(proxy[1], node)
 
 
 def _params(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    from rmpa.cli.options import GraphOptions
-    from rmpa.cli.param import open_store, split_peer
+    from rmpa.cli.param import open_store, split_peer, with_namespaces
 
     before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
     peer, _ = split_peer(ctx.params.get("peer"), incomplete)
-    store = open_store(peer, GraphOptions(False, ctx.params.get("agent"), ctx.params.get("master")))
-    for name in store.names():
-        parts = name.split("/")
-        # Namespaces too: rosparam's verbs take them.
-        yield from (before + "/".join(parts[:end]) for end in range(2, len(parts) + 1))
+    for name in open_store(peer, _options(ctx)).names():
+        yield from (before + each for each in with_namespaces(name))  # rosparam's verbs take namespaces too
 
 
-def _resources(ctx: click.Context, _: str) -> Iterable[str]:
+def _resources(ctx: click.Context) -> Iterable[str]:
     from rmpa.resource.descriptor import TOPIC
 
     ending = f"/{TOPIC}"
@@ -174,7 +152,7 @@ def _resources(ctx: click.Context, _: str) -> Iterable[str]:
 
 def _choices(ctx: click.Context, what: str) -> Iterable[str]:
     """The profiles or contexts of the resource that stands before them in the line."""
-    from rmpa.cli.resource import ResourceGraph, with_resources
+    from rmpa.cli.resource import ResourceGraph, run_with_resources
 
     found: list[str] = []
 
@@ -182,20 +160,18 @@ def _choices(ctx: click.Context, what: str) -> Iterable[str]:
         one = graph.pick(ctx.params.get("resource")).descriptor
         found.extend(each.name for each in (one.profiles if what == "profile" else one.contexts))
 
-    asyncio.run(with_resources(_master(ctx), body))
+    run_with_resources(_options(ctx), body)
     return found
 
 
 _FIND: Final[dict[str, Callable[[click.Context, str], Iterable[str]]]] = {
-    "agent": _agents,
-    "peer": _peers,
-    "topic": _topics,
-    "service": _services,
-    "node": _nodes,
+    "agent": lambda _ctx, _: _agents(),
+    "peer": lambda ctx, _: _peers(ctx),
+    "topic": lambda ctx, text: _with_peers((graph := _graph(ctx)).subscribers | graph.publishers, text),
+    "service": lambda ctx, text: _with_peers(_graph(ctx).services, text),
+    "node": lambda ctx, _: _nodes(ctx),
     "param": _params,
-    "resource": _resources,
+    "resource": lambda ctx, _: _resources(ctx),
     "profile": lambda ctx, _: _choices(ctx, "profile"),
     "context": lambda ctx, _: _choices(ctx, "context"),
 }
-_BY_NODE: Final = frozenset({"profile", "context"})
-"""Kinds of names for which a node subscribes to a resource's description."""

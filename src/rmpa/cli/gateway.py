@@ -1,7 +1,4 @@
-"""Programs beside the agent: ``rmpa gateway`` (with ``zenoh-config``), ``rmpa web`` and ``rmpa core``.
-
-``rmpa gateway``: joins this network's modules with other sites and with ROS 2, over Zenoh.
-"""
+"""Programs beside the agent: ``rmpa gateway`` (with ``zenoh-config``), ``rmpa web`` and ``rmpa core``."""
 
 from __future__ import annotations
 
@@ -14,14 +11,14 @@ import signal
 import socket
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.agent import find_module, find_name
 from rmpa.cli.main import LazyGroup
-from rmpa.cli.options import agent_option, config_option, json_option, setting_options
-from rmpa.cli.output import warn
+from rmpa.cli.options import Options, agent_verb, config_option, flag, setting_options, verb
+from rmpa.cli.output import print_text, warn
+from rmpa.cli.trust import find_module
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import load_settings
 from rmpa.config.settings import WebSettings
@@ -36,68 +33,68 @@ from rmpa.trust.permissions import TrustStatus
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.cli.agent import Module
+    from rmpa.cli.trust import Module
     from rmpa.config.read import Given, Loaded
     from rmpa.config.settings import Settings
     from rmpa.web.server.process import TokenAccess, WebSetup
 
 _log = logging.getLogger("rmpa.gateway")
-_LIBRARIES: Final = {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"}
-"""What the extra installs: the name in Python, and that of the package."""
+_web_log = logging.getLogger("rmpa.web")
 _OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled", "trust.insecure")
 """Settings whose options a gateway has not: its core is its own, and only for its proxies; it has an --insecure."""
-COMMANDS: Final = {
-    "zenoh-config": ("rmpa.cli.gateway", "Print a configuration for zenohd, Zenoh's own router."),
-}
-GATEWAY_EPILOG = """\
-\b
-The gateway is a peer of the mesh with a core of its own, beside this machine's agent. It reads the same rmpa.toml and
-RMPA_* variables, but its name, its core's address and the mesh's port only from its own options.
-What may cross: [[gateway.rule]] (docs/sites.md), mapping files of ROS 2 (docs/ros2.md).
-\b
-Exit codes: 0 it was ended; 1 it cannot start; 2 a wrong option or setting, or a library that is not installed.
+_OF_THE_PROCESS: Final = (
+    *("gateway.rank", "gateway.router", "gateway.site"),
+    *("gateway.ros2.distribution", "gateway.ros2.mapping"),
+)
+"""Settings of a gateway that a router has no use for."""
+_DEFAULTS: Final = WebSettings()
 
-\b
-Examples:
-  rmpa gateway --site warehouse --connect tls/fleet.example:7447     one site of a fleet
-  rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that they meet at
-  rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  stands by for the one with rank 100
-  rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
-  rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
-"""
-_options = setting_options(
+
+@click.group(cls=LazyGroup, path="gateway", invoke_without_command=True)
+@setting_options(
     "gateway",
     "up",
     without=_OF_THE_AGENT,
     defaults={"name": "the module's name, then _gateway", "core_port": "any free one"},
 )
-
-
-@click.group(cls=LazyGroup, commands_at=COMMANDS, epilog=GATEWAY_EPILOG, invoke_without_command=True)
-@_options
 @config_option
 @click.pass_context
 def gateway(context: click.Context, /, **options: object) -> int:
     """Join this network's modules with other sites and with ROS 2, over Zenoh.
 
     Topics, services, actions and parameters cross once a node at the other side asks for them.
+
+    ---
+    The gateway is a peer of the mesh with a core of its own, beside this machine's agent. It reads the same rmpa.toml
+    and RMPA_* variables, but its name, its core's address and the mesh's port only from its own options.
+    What may cross: [[gateway.rule]] (docs/sites.md), mapping files of ROS 2 (docs/ros2.md).
+
+    Exit codes: 0 it was ended; 1 it cannot start; 2 a wrong option or setting, or a library that is not installed.
+
+    Examples:
+      rmpa gateway --site warehouse --connect tls/fleet.example:7447     one site of a fleet
+      rmpa gateway --router --listen tls/0.0.0.0:7447                    the router that they meet at
+      rmpa gateway --site b --rank 200 --connect tls/fleet.example:7447  stands by for the one with rank 100
+      rmpa gateway --ros2 --connect tcp/localhost:7447                   ROS 2 nodes beside rmw_zenohd
+      rmpa gateway zenoh-config --listen tls/0.0.0.0:7447 > zenohd.json5 a router with zenohd instead
     """
     if context.invoked_subcommand is not None:
         given = [name for name, value in options.items() if value not in (None, ())]
         if given:
-            flag = f"--{given[0].replace('_', '-')}"
-            raise ConfigError(flag, f"stands before {context.invoked_subcommand}", "write it behind that")
+            option = f"--{given[0].replace('_', '-')}"
+            raise ConfigError(option, f"stands before {context.invoked_subcommand}", "write it behind that")
         return 0
-    check_libraries()
-    found = None if options["name"] else find_name(None, {"config": options.get("config")}, _own(os.environ))
-    beside = found.chosen.name if found is not None else ""
+    _check_libraries("rmpa gateway", "rmpa[zenoh]", {"zenoh": "eclipse-zenoh", "xxhash": "xxhash"})
+    beside = ""
+    if not options["name"]:
+        beside = find_module(None, {"config": options.get("config")}, _own(os.environ)).name
 
     def load() -> Loaded:
         return load_gateway(options, dict(os.environ), socket.gethostname(), beside)
 
     loaded = load()
-    check_settings(loaded.settings)
-    check_agents(loaded.settings, os.environ)
+    _check_settings(loaded.settings)
+    _check_agents(loaded.settings)
     writer = LogWriter(sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
     for note in loaded.notes:
@@ -106,7 +103,7 @@ def gateway(context: click.Context, /, **options: object) -> int:
     from rmpa.gateway.gateway import run
 
     try:
-        return run(loaded.settings, load, lambda: check_agents(loaded.settings, os.environ))
+        return run(loaded.settings, load, lambda: _check_agents(loaded.settings))
     finally:
         writer.close()
 
@@ -128,9 +125,12 @@ def load_gateway(
     loaded = load_settings(options, _own(environ), host_name=host_name)
     settings, given = loaded.settings, loaded.given
     defaults = type(settings)()
+    module = beside or settings.name
+    # Where a gateway has a state directory of its own, its name may be kept there.
+    name = module if module.endswith(GATEWAY_SUFFIX) else peer_name_from(module + GATEWAY_SUFFIX)
     settings = replace(
         settings,
-        name=settings.name if _is_option(given, "name") else _gateway_name(beside or settings.name),
+        name=settings.name if _is_option(given, "name") else name,
         core_mode=defaults.core_mode,
         core_master=defaults.core_master,
         core_keep="never",
@@ -147,12 +147,11 @@ def _own(environ: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environ.items() if name != "ROS_MASTER_URI"}
 
 
-def _gateway_name(module: str) -> str:
-    """The gateway's name beside a module; where it has a state directory of its own, it may be kept there."""
-    return module if module.endswith(GATEWAY_SUFFIX) else peer_name_from(module + GATEWAY_SUFFIX)
+def _is_option(given: Mapping[str, Given], name: str) -> bool:
+    return name in given and given[name].source.startswith("--")
 
 
-def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
+def _check_agents(settings: Settings) -> None:
     """Check that a gateway is no less secure than the agents of this machine.
 
     Raises:
@@ -164,7 +163,7 @@ def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
     store = trust_store(settings)
     if settings.trust.insecure or (store is not None and store.exists):
         return
-    for agent in find_agents(environ):
+    for agent in find_agents(os.environ):
         with ControlClient(agent.path) as client:
             secured = client.call("trust", TrustStatus, what="status").agent == "secured"
         if secured:
@@ -173,11 +172,7 @@ def check_agents(settings: Settings, environ: Mapping[str, str]) -> None:
             raise StartError(f"the gateway {settings.name}", problem, remedy)
 
 
-def _is_option(given: Mapping[str, Given], name: str) -> bool:
-    return name in given and given[name].source.startswith("--")
-
-
-def check_settings(settings: Settings) -> None:
+def _check_settings(settings: Settings) -> None:
     """Check that there is something to join, and a way to it.
 
     Raises:
@@ -193,16 +188,20 @@ def check_settings(settings: Settings) -> None:
         raise ConfigError("rmpa gateway", "there is no way to the others", f"add --connect, such as {example}")
 
 
-def check_libraries() -> None:
-    """Check that the libraries of the extra are there.
+def _check_libraries(program: str, extra: str, libraries: Mapping[str, str]) -> None:
+    """Check that the libraries of an extra are there.
+
+    Args:
+        program: The command.
+        extra: What installs them.
+        libraries: The name in Python, and that of the package.
 
     Raises:
         ConfigError: One is missing.
     """
-    missing = [package for name, package in _LIBRARIES.items() if not _is_there(name)]
+    missing = [package for name, package in libraries.items() if not _is_there(name)]
     if missing:
-        problem = f"{' and '.join(missing)} not installed"
-        raise ConfigError("rmpa gateway", problem, "run pip install 'rmpa[zenoh]'")
+        raise ConfigError(program, f"{' and '.join(missing)} not installed", f"run pip install '{extra}'")
 
 
 def _is_there(name: str) -> bool:
@@ -212,117 +211,82 @@ def _is_there(name: str) -> bool:
         return False
 
 
-# ``rmpa web``: this module's state for browsers and programs, over HTTP.
-
-
-_web_log = logging.getLogger("rmpa.web")
-_WEB_LIBRARIES = ("aiohttp", "cbor2")
-_DEFAULTS = WebSettings()
-WEB_EPILOG = """\
-\b
-[web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
-It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by its
-[[permission]], and begins anew where the agent comes back secured.
-
-\b
-Examples:
-  rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
-  rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
-  rmpa up --web                   the agent starts it, and again if it ends
-  curl -s localhost:8480/api/v1/peers | jq '.[].name'
-"""
-
-
-@click.command(epilog=WEB_EPILOG)
-@click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]")
-@click.option(
-    "--listen",
-    metavar="ADDRESS",
-    help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
+@agent_verb(
+    click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]"),
+    click.option(
+        "--listen",
+        metavar="ADDRESS",
+        help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
+    ),
+    click.option(
+        "--token-file",
+        metavar="FILE",
+        help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
+    ),
+    click.option(
+        "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
+    ),
+    flag(
+        "--control",
+        help="Let clients publish, call and offer services, and set parameters; they then need the token.",
+    ),
+    click.option(
+        "--cert", metavar="FILE", help="HTTPS with this certificate (PEM). [default: the module's, if secured]"
+    ),
+    click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]"),
+    flag("--drive", help="Let the joystick of its pages command a robot; they need the token."),
+    config_option,
+    click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends."),
+    flag("--insecure", help="Start without an agent although other modules here have keys."),
 )
-@click.option(
-    "--token-file",
-    metavar="FILE",
-    help="Ask clients for the token of this file; made if it is not there. [default: in the state directory]",
-)
-@click.option(
-    "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
-)
-@click.option(
-    "--control",
-    is_flag=True,
-    help="Let clients publish, call and offer services, and set parameters; they then need the token.",
-)
-@click.option(
-    "--cert",
-    metavar="FILE",
-    help="HTTPS with this certificate (PEM). [default: the module's, if secured]",
-)
-@click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]")
-@click.option("--drive", is_flag=True, help="Let the joystick of its pages command a robot; they need the token.")
-@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
-@click.option("--with-agent", is_flag=True, hidden=True, help="End when standard input ends.")
-@click.option("--insecure", is_flag=True, help="Start without an agent although other modules here have keys.")
-@agent_option
-@json_option
-def web(
-    port: int | None,
-    listen: str | None,
-    token_file: str | None,
-    hosts: tuple[str, ...],
-    control: bool,
-    cert: str | None,
-    key: str | None,
-    drive: bool,
-    config: str | None,
-    with_agent: bool,
-    insecure: bool,
-    agent: str | None,
-    as_json: bool,
-) -> int:
+def web(config: str | None, with_agent: bool, insecure: bool, options: Options, **given: Any) -> int:
     """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.
 
     It is a process of its own: the agent does not depend on it. It starts without an agent too, and finds it later.
-    """
-    _check_libraries()
 
-    def with_options(given: WebSettings) -> WebSettings:
-        return replace(
-            given,
-            port=given.port if port is None else port,
-            listen=given.listen if listen is None else _host("--listen", listen),
-            token_file=given.token_file if token_file is None else token_file,
-            control=given.control or control,
-            cert=given.cert if cert is None else cert,
-            key=given.key if key is None else key,
-            drive=given.drive or drive,
-            hosts=(*given.hosts, *(_host("--host", name) for name in hosts)),
-        )
+    ---
+    [web] of rmpa.toml and the variables RMPA_WEB_* give the same; options are stronger.
+    It is as secure as the agent: beside one in a secured mesh it serves HTTPS with the certificate of that module, by
+    its [[permission]], and begins anew where the agent comes back secured.
+
+    Examples:
+      rmpa web                        for this machine: http://127.0.0.1:8480/, https:// in a secured mesh
+      rmpa web --listen 0.0.0.0       for the network; prints the URL with its token once
+      rmpa up --web                   the agent starts it, and again if it ends
+      curl -s localhost:8480/api/v1/peers | jq '.[].name'
+    """
+    _check_libraries("rmpa web", "rmpa[web]", {name: name for name in ("aiohttp", "cbor2")})
 
     def make() -> tuple[Module, WebSetup]:
-        module = find_module(agent, {"config": config}, os.environ, "--agent")
+        module = find_module(options.agent, {"config": config}, os.environ, "--agent")
         settings = module.loaded.settings
-        settings = replace(settings, web=with_options(settings.web))
+        said = {name: value for name, value in given.items() if value not in (None, False, ())}
+        if "listen" in said:
+            said["listen"] = _host("--listen", said["listen"])
+        said["hosts"] = (*settings.web.hosts, *(_host("--host", name) for name in given["hosts"]))
+        settings = replace(settings, web=replace(settings.web, **said))
         if insecure:
             settings = replace(settings, trust=replace(settings.trust, insecure=True))
         return module, _setup(module, settings)
 
     module, setup = make()
-    log = setup.settings
-    configure_logging(log.log_level, sys.stderr, as_json=log.log_json)
+    configure_logging(setup.settings.log_level, sys.stderr, as_json=setup.settings.log_json)
     for note in module.loaded.notes:
         _web_log.warning("%s", note)
     from rmpa.web.server.process import serve
 
     def announce(url: str, access: TokenAccess) -> None:
-        _announce(url, access, as_json=as_json)
-
-    def load() -> WebSetup:
-        return make()[1]
+        lines = [url]
+        if access.is_new:
+            lines.append(f"the token is kept in {access.file}; it is not printed again")
+        elif access.file:
+            lines.append(f"clients need the token of {access.file}")
+        options.show({"url": url, "token_file": str(access.file or "")}, lines)
+        sys.stdout.flush()
 
     while True:
         pinned = module.name if module.chosen.source.said else None
-        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=load)):
+        if not asyncio.run(serve(setup, pinned, announce, with_agent=with_agent, load=lambda: make()[1])):
             return 0
         module, setup = make()
 
@@ -333,11 +297,11 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     Raises:
         RmpaError: A file cannot be used; or no agent runs, the module has no keys, and others have some.
     """
-    from rmpa.trust.store import TrustStore, check_open
+    from rmpa.trust.store import check_open
     from rmpa.web.server.process import WebSetup, access_of, certificate_files
 
-    store = TrustStore(module.state, module.name) if module.state is not None else None
-    trusted = module.secured or (store is not None and store.exists)
+    store = module.store if module.state is not None else None
+    trusted = module.agent == "secured" or (store is not None and store.exists)
     if not trusted and module.socket is None:
         check_open(settings.trust, module.state, module.name, os.environ, "--agent")
     own_file = str(settings.config_file.absolute()) if settings.config_file is not None else ""
@@ -350,34 +314,11 @@ def _setup(module: Module, settings: Settings) -> WebSetup:
     return WebSetup(settings, access, files, trusted, module.name, folder)
 
 
-def _check_libraries() -> None:
-    missing = [name for name in _WEB_LIBRARIES if not _is_there(name)]
-    if missing:
-        raise ConfigError("rmpa web", f"{' and '.join(missing)} not installed", "run pip install 'rmpa[web]'")
-
-
 def _host(option: str, text: str) -> str:
     try:
         return HOST.read(text)
     except BadValue as error:
         raise ConfigError(option, error.problem, error.remedy) from None
-
-
-def _announce(url: str, access: TokenAccess, *, as_json: bool) -> None:
-    if as_json:
-        from rmpa.cli.output import print_json
-
-        print_json({"url": url, "token_file": str(access.file or "")})
-    else:
-        click.echo(url)
-        if access.is_new:
-            click.echo(f"the token is kept in {access.file}; it is not printed again")
-        elif access.file:
-            click.echo(f"clients need the token of {access.file}")
-    sys.stdout.flush()
-
-
-# ``rmpa core``: the ROS core alone, in place of ``roscore``.
 
 
 def _default_port() -> int:
@@ -392,27 +333,32 @@ def _default_port() -> int:
     return port if is_own_name(host) or host.startswith("127.") else DEFAULT_PORT
 
 
-@click.command()
-@click.option(
-    "-p",
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=None,
-    help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
+@verb(
+    click.option(
+        "-p",
+        "--port",
+        type=click.IntRange(0, 65535),
+        help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
+    ),
+    click.option(
+        "--host",
+        default="127.0.0.1",
+        show_default=True,
+        help="Address to listen at; 0.0.0.0 opens it to the network.",
+    ),
+    click.option(
+        "--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host."
+    ),
+    click.option(
+        "--keep",
+        type=click.Choice(["auto", "always", "never"]),
+        default="auto",
+        show_default=True,
+        help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
+    ),
+    flag("-v", "--verbose", help="Log every registration."),
+    flag("--debug", help="Log every call."),
 )
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
-)
-@click.option("--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host.")
-@click.option(
-    "--keep",
-    type=click.Choice(["auto", "always", "never"]),
-    default="auto",
-    show_default=True,
-    help="Take up nodes and parameters of the run before: auto, if a node of it still runs or the core died.",
-)
-@click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
-@click.option("--debug", is_flag=True, help="Log every call.")
 def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
     from rmpa.runtime.accept import raise_file_limit
@@ -420,10 +366,10 @@ def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, 
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
     raise_file_limit()
-    asyncio.run(_run(host, _default_port() if port is None else port, advertise, keep=keep))
+    asyncio.run(_run_core(host, _default_port() if port is None else port, advertise, keep))
 
 
-async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
+async def _run_core(host: str, port: int, advertised: str, keep: str) -> None:
     from rmpa import __version__
     from rmpa.config.module_name import core_file
     from rmpa.ros.core.embedded import ROS_VERSION, RosCore
@@ -432,56 +378,40 @@ async def _run(host: str, port: int, advertise: str, *, keep: str) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    core = RosCore(
-        host,
-        port,
-        advertised_host=advertise,
-        on_shutdown=lambda _: ended.set(),
-        state=core_file(os.environ, port),
-        keep=keep,
-    )
+    state = core_file(os.environ, port)
+    core = RosCore(host, port, advertised_host=advertised, on_shutdown=lambda _: ended.set(), state=state, keep=keep)
     await core.start()
-    click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")
-    click.echo(f"ROS_MASTER_URI={core.uri}")
-    click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
-    click.echo("started core service [/rosout]")
-    if core.stored is not None and (text := core.stored.restored()):
-        click.echo(text)
+    print_text(
+        f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}",
+        f"ROS_MASTER_URI={core.uri}",
+        f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}",
+        "started core service [/rosout]",
+        [text] if core.stored is not None and (text := core.stored.restored()) else [],
+    )
     sys.stdout.flush()
     await ended.wait()
-    click.echo("shutting down")
+    print_text("shutting down")
     await core.close()
 
 
-# ``rmpa gateway zenoh-config``: a configuration for zenohd as the router of a fleet.
-
-
-_OF_THE_PROCESS = (
-    "gateway.rank",
-    "gateway.router",
-    "gateway.site",
-    "gateway.ros2.distribution",
-    "gateway.ros2.mapping",
+@verb(
+    setting_options("gateway", without=_OF_THE_PROCESS),
+    click.option(
+        "--name", metavar="NAME", help="Whose certificate it has. [default: the module's name, then _gateway]"
+    ),
+    config_option,
 )
-"""Settings of a gateway that a router has no use for."""
-ZENOH_CONFIG_EPILOG = """\
-\b
-The certificate is that of the gateway's name in the secured mesh (--name); the rules of access are made from
-[[permission]] and [trust] of rmpa.toml. Print it again and restart zenohd when a rule has changed.
+def gateway_zenoh_config(**options: object) -> None:
+    """Print a configuration for zenohd, Zenoh's own router: endpoints, certificates, rules of access.
 
-\b
-Examples:
-  rmpa gateway zenoh-config --name fleet > zenohd.json5 && zenohd -c zenohd.json5
-  rmpa gateway zenoh-config --listen tcp/0.0.0.0:7447 --insecure     in a network of your own
-"""
+    ---
+    The certificate is that of the gateway's name in the secured mesh (--name); the rules of access are made from
+    [[permission]] and [trust] of rmpa.toml. Print it again and restart zenohd when a rule has changed.
 
-
-@click.command(name="zenoh-config", epilog=ZENOH_CONFIG_EPILOG)
-@setting_options("gateway", without=_OF_THE_PROCESS)
-@click.option("--name", metavar="NAME", help="Whose certificate it has. [default: the module's name, then _gateway]")
-@config_option
-def zenoh_config(**options: object) -> None:
-    """Print a configuration for zenohd, Zenoh's own router: endpoints, certificates, rules of access."""
+    Examples:
+      rmpa gateway zenoh-config --name fleet > zenohd.json5 && zenohd -c zenohd.json5
+      rmpa gateway zenoh-config --listen tcp/0.0.0.0:7447 --insecure     in a network of your own
+    """
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())
     for note in loaded.notes:
         warn(note)

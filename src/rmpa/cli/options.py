@@ -1,7 +1,4 @@
-"""Options and choices that several commands share.
-
-Flags that several commands share.
-"""
+"""How a verb is declared: its docstring, its own arguments, and the options that verbs share."""
 
 from __future__ import annotations
 
@@ -9,24 +6,62 @@ import functools
 import importlib
 import math
 import os
-import re
 import sys
 from collections import Counter
 from dataclasses import dataclass
-from fnmatch import translate
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from rmpa.cli.main import help_of
 from rmpa.config.settings import SETTINGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable
 
-    from rmpa.cli.output import Graph, Master
+    from rmpa.cli.graph import Graph, Master
+    from rmpa.cli.output import Text
     from rmpa.config.schema import Setting
+    from rmpa.observe.control_client import ControlClient
 
 _T = TypeVar("_T")
+_Function = TypeVar("_Function", bound="Callable[..., Any]")
+LINES: Final = 100
+"""Lines of a long list that a terminal shows."""
+
+
+def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a command of a function: ``help_of`` its docstring, and these arguments and options in order."""
+
+    def decorate(function: Callable[..., Any]) -> click.Command:
+        command = function
+        for parameter in reversed(parameters):
+            command = parameter(command)
+        made: click.Command = click.command(**help_of(function.__doc__), **settings)(command)
+        return made
+
+    return decorate
+
+
+def json_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """A ``verb`` with ``--json`` behind its own parameters, as its argument ``options``."""
+    return verb(*parameters, _as_options(json_option), **settings)
+
+
+def agent_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """A ``json_verb`` with ``--agent`` too."""
+    return verb(*parameters, _as_options(json_option, agent_option), **settings)
+
+
+def graph_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """An ``agent_verb`` with ``--master`` too."""
+    return verb(*parameters, _as_options(json_option, agent_option, _master_option), **settings)
+
+
+def argument(name: str, kind: str = "", **settings: Any) -> Callable[[_Function], _Function]:
+    """An argument that a shell completes with names of a kind, if one is given."""
+    return click.argument(name, shell_complete=completes(kind) if kind else None, **settings)
 
 
 def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
@@ -45,18 +80,6 @@ def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list
     return complete
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
-agent_option = click.option(
-    "--agent",
-    metavar="NAME",
-    shell_complete=completes("agent"),
-    help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
-)
-_master_option = click.option(
-    "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
-)
-
-
 class FiniteRange(click.FloatRange):
     """A number in a range. Unlike click's own type it refuses ``nan``, which lies in every range, and ``inf``."""
 
@@ -72,13 +95,64 @@ class FiniteRange(click.FloatRange):
         return found
 
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
+agent_option = click.option(
+    "--agent",
+    metavar="NAME",
+    shell_complete=completes("agent"),
+    help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
+)
+_master_option = click.option(
+    "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
+)
+config_option = click.option(
+    "--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
+)
+
+
+def flag(*names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
+    """An option that is given or not."""
+    return click.option(*names, is_flag=True, help=help)
+
+
+def count_option(what: str) -> Callable[[_Function], _Function]:
+    """``--count``: the end of a stream."""
+    return click.option("-n", "--count", type=click.IntRange(1), help=f"Stop after so many {what}.")
+
+
+def ping_options(function: _Function) -> _Function:
+    """Decorate with ``--count`` and ``--interval`` of a ping."""
+    every = click.option(
+        "-i", "--interval", type=FiniteRange(0.01), default=1.0, show_default=True, help="Seconds between."
+    )
+    count = click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
+    return count(every(function))
+
+
 @dataclass(frozen=True, slots=True)
-class GraphOptions:
+class Options:
     """The values of ``--json``, ``--agent`` and ``--master`` of one command line."""
 
     as_json: bool
-    agent: str | None
-    master_uri: str | None
+    agent: str | None = None
+    master_uri: str | None = None
+
+    def show(self, value: object, *text: Text) -> None:
+        """Print a result: the value as JSON, or the text."""
+        from rmpa.cli.output import show
+
+        show(value, *text, as_json=self.as_json)
+
+    def client(self, timeout: float | None = None) -> ControlClient:
+        """A connection to the agent that is meant.
+
+        Raises:
+            RmpaError: As ``choose_agent``.
+        """
+        from rmpa.observe.control_client import ControlClient, choose_agent
+        from rmpa.observe.limits import CONTROL_CALL_TIMEOUT
+
+        return ControlClient(choose_agent(os.environ, self.agent).path, timeout or CONTROL_CALL_TIMEOUT)
 
     def master(self) -> Master:
         """The master that is meant.
@@ -86,7 +160,7 @@ class GraphOptions:
         Raises:
             RmpaError: As ``choose_master``.
         """
-        from rmpa.cli.output import choose_master
+        from rmpa.cli.graph import choose_master
 
         return choose_master(self.master_uri, self.agent, os.environ)
 
@@ -98,33 +172,30 @@ class GraphOptions:
         """
         import asyncio
 
-        from rmpa.cli.output import read_graph
+        from rmpa.cli.graph import read_graph
 
         master = self.master()
         return master, asyncio.run(read_graph(master))
 
 
-def graph_options(function: Callable[..., _T]) -> Callable[..., _T]:
-    """Decorate a command with ``--json``, ``--agent`` and ``--master``: it gets them as its argument ``options``."""
+def _as_options(*declared: Callable[..., Any]) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
+    """Decorate with options whose values a command gets as its argument ``options``."""
 
-    @functools.wraps(function)
-    def command(*, as_json: bool, agent: str | None, master: str | None, **arguments: object) -> _T:
-        return function(**arguments, options=GraphOptions(as_json, agent, master))
+    def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
+        @functools.wraps(function)
+        def command(*, as_json: bool, agent: str | None = None, master: str | None = None, **arguments: object) -> _T:
+            return function(**arguments, options=Options(as_json, agent, master))
 
-    return json_option(agent_option(_master_option(command)))
+        for option in reversed(declared):
+            command = option(command)
+        return command
 
-
-# Options of commands that follow from the declarations of the settings.
-
-
-config_option = click.option(
-    "--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
-)
+    return decorate
 
 
 def setting_options(
     *commands: str, without: Collection[str] = (), defaults: dict[str, str] | None = None
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+) -> Callable[[_Function], _Function]:
     """Decorate a command with an option for each setting that has one, in the order of their declarations.
 
     Args:
@@ -134,15 +205,15 @@ def setting_options(
     """
     settings = [s for command in commands for s in SETTINGS if s.option and s.command == command]
 
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(command: _Function) -> _Function:
         for setting in reversed([setting for setting in settings if setting.name not in without]):
-            command = _option(setting, (defaults or {}).get(setting.name))(command)
+            command = _setting_option(setting, (defaults or {}).get(setting.name))(command)
         return command
 
     return decorate
 
 
-def _option(setting: Setting, default: str | None) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def _setting_option(setting: Setting, default: str | None) -> Callable[[_Function], _Function]:
     if default is None:
         default = setting.shown_default or ("" if setting.is_switch or setting.is_list else str(setting.default))
     shown = setting.help + (" Repeatable." if setting.is_list else "")
@@ -156,22 +227,12 @@ def _option(setting: Setting, default: str | None) -> Callable[[Callable[..., An
     )
 
 
-# What a list shows of very many things: those that the user asks for, the first of them, and what was left out.
-#
-# On a terminal a long list shows its first lines and says how to see the others. In a pipe, with ``--all`` and as
-# JSON
-# it is complete.
-
-
-_R = TypeVar("_R")
-
-LINES: Final = 100
-"""Lines of a long list that a terminal shows."""
-
-
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The values of ``--match``, ``--peer``, ``--limit`` and ``--all`` of one command line.
+    """What a list shows of very many things: the values of ``--match``, ``--peer``, ``--limit`` and ``--all``.
+
+    On a terminal a long list shows its first lines and says how to see the others. In a pipe, with ``--all`` and as
+    JSON it is complete.
 
     Args:
         match: Pattern of a shell for the name; empty: every name.
@@ -185,48 +246,33 @@ class Selection:
     limit: int | None = None
     everything: bool = False
 
-    def names(self, names: Iterable[str]) -> list[str]:
-        """Those of the names that match, in order."""
-        fits = _matcher(self.match)
-        return [name for name in names if fits(name)]
-
-    def with_peers(self, names: Iterable[str], peers: Callable[[str], Iterable[str]]) -> list[str]:
-        """Those of the names that match and that a wanted module has; ``peers`` returns the modules of a name."""
-        fits = _matcher(self.peer)
-        return [name for name in self.names(names) if not self.peer or any(map(fits, peers(name)))]
-
-    def wants_peer(self, peer: str | None) -> bool:
-        """Whether what this module has is wanted; ``None``: this agent's own."""
-        return not self.peer or (peer is not None and _matcher(self.peer)(peer))
+    def wants(self, name: str, peers: Iterable[str | None]) -> bool:
+        """Whether a name is selected that these modules have; ``None``: this one."""
+        return fnmatchcase(name, self.match or "*") and (
+            not self.peer or any(peer is not None and fnmatchcase(peer, self.peer) for peer in peers)
+        )
 
     @property
     def lines(self) -> int | None:
         """How many lines are shown; ``None``: all."""
         if self.everything:
             return None
-        if self.limit is not None:
-            return self.limit
-        return LINES if sys.stdout.isatty() else None
+        return self.limit or (LINES if sys.stdout.isatty() else None)
 
-    def shown(self, items: Sequence[_T]) -> Sequence[_T]:
-        """The first ones, as many as are shown."""
-        return items if self.lines is None else items[: self.lines]
-
-    def is_long(self, items: Sequence[object]) -> bool:
+    def is_long(self, items: Collection[object]) -> bool:
         """Whether some of the items are left out."""
         return self.lines is not None and len(items) > self.lines
 
-    def print_rest(self, items: Sequence[object], what: str, filters: str) -> None:
-        """Say what was left out, and how to see it; nothing if all are shown.
+    def rest(self, items: Collection[object], what: str, filters: str) -> list[str]:
+        """A line that says what was left out, and how to see it; none if all are shown.
 
         Args:
             items: All of them.
             what: What they are, in the plural.
             filters: Options that select fewer, for the user to try.
         """
-        if self.is_long(items):
-            left = len(items) - (self.lines or 0)
-            click.secho(f"... {left:,} more {what}; fewer: {filters}; all: --all", fg="yellow")
+        left = len(items) - (self.lines or 0)
+        return [f"... {left:,} more {what}; fewer: {filters}; all: --all"] if self.is_long(items) else []
 
 
 def summary(total: int, what: str, counts: Iterable[str]) -> str:
@@ -235,28 +281,25 @@ def summary(total: int, what: str, counts: Iterable[str]) -> str:
     return f"{total:,} {what}: {', '.join(parts)}"
 
 
-def selection_options(function: Callable[..., _R]) -> Callable[..., _R]:
+limit_options: Final = (
+    click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]"),
+    flag("--all", "everything", help="Leave nothing out on a terminal."),
+)
+
+
+def selection_options(function: Callable[..., _T]) -> Callable[..., _T]:
     """Decorate a list with ``--match``, ``--peer``, ``--limit`` and ``--all``; it gets them as ``selection``."""
 
     @functools.wraps(function)
-    def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _R:
+    def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _T:
         return function(**arguments, selection=Selection(match, peer, limit, everything))
 
-    options = [
-        click.option("--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."),
-        click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this."),
-        click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]"),
-        click.option("--all", "everything", is_flag=True, help="Leave nothing out on a terminal."),
-    ]
-    decorated: Callable[..., _R] = command
-    for option in reversed(options):
-        decorated = option(decorated)
-    return decorated
-
-
-@functools.lru_cache(maxsize=8)
-def _matcher(pattern: str) -> Callable[[str], bool]:
-    if not pattern:
-        return lambda _: True
-    compiled = re.compile(translate(pattern))
-    return lambda name: compiled.match(name) is not None
+    for option in reversed(
+        (
+            click.option("--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."),
+            click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this."),
+            *limit_options,
+        )
+    ):
+        command = option(command)
+    return command

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import asyncio
-import base64
 import math
 import operator
 import os
@@ -13,19 +12,18 @@ import sys
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import click
 import yaml
 
 from rmpa.bridge.params.rules import key_problem
-from rmpa.cli.options import GraphOptions, agent_option, completes, graph_options, json_option
-from rmpa.cli.output import Column, json_text, print_json, print_line, print_table, printable, size, warn
+from rmpa.cli.options import Options, agent_verb, argument, completes, flag, graph_verb
+from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
-from rmpa.core.identity import is_legal_name
+from rmpa.core.identity import is_legal_name, resolve_name
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control_client import ControlClient, choose_agent
 from rmpa.observe.operations import PeerParams, parameters_in
 from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros import limits as ros_limits
@@ -33,25 +31,40 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.cli.output import Master
+    from rmpa.cli.graph import Master
+    from rmpa.cli.output import Text
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
-
-
-# The parameters that ``rmpa param`` reads and writes: a ROS master's, or a peer's through this machine's agent.
-
 
 _CALLER: Final = "/rmpa_param"
 _FOR_ALL: Final = 30.0
 """Seconds for one call of a master: it may bring megabytes of XML, from a busy machine."""
+_INT_MAX: Final = (1 << 31) - 1
+_OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+peer_option: Final = click.option(
+    "--peer",
+    metavar="PEER",
+    shell_complete=completes("peer"),
+    help="The parameters of this peer's module (or its GUID); SITE/MODULE: of another site's.",
+)
 
 
-class ParamStore(Protocol):
-    """The parameters of one master."""
+@dataclass
+class MasterParams:
+    """The parameters of a ROS master, an agent's core or any other; as ``PeerParams``."""
+
+    master: Master
 
     @property
     def title(self) -> str:
-        """The master or peer, for error texts."""
-        ...
+        """The master, for error texts."""
+        return self.master.uri
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or a namespace.
@@ -59,15 +72,24 @@ class ParamStore(Protocol):
         Raises:
             RmpaError: There is none; the text offers the nearest name.
         """
-        ...
+        return self._known("getParam", key).value
 
     def names(self) -> list[str]:
         """The names of all parameters, in order."""
-        ...
+        value = self._call("getParamNames").value
+        return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
         """Set a parameter, or each member of a namespace; return the number. If one cannot be set, none is."""
-        ...
+        from rmpa.ros.wire.xmlrpc import serialize_response
+
+        parameters = parameters_in(key, value)
+        serialize_response(value)  # a value that XML-RPC cannot hold is an error before anything is set
+        for name, one in parameters:
+            reply = self._call("setParam", name, one)
+            if reply.code != 1:
+                raise RmpaError(f"{self.title} does not set {name}: {reply.status}")
+        return len(parameters)
 
     def delete(self, key: str) -> None:
         """Delete a parameter or namespace.
@@ -75,10 +97,36 @@ class ParamStore(Protocol):
         Raises:
             RmpaError: There is none.
         """
-        ...
+        self._known("deleteParam", key)
+
+    def _known(self, method: str, key: str) -> RosReply:
+        reply = self._call(method, key)
+        if reply.code != 1:
+            known = {name for full in self.names() for name in with_namespaces(full)}
+            near = did_you_mean(key, known)
+            hint = f"did you mean {near}?" if near else "`rmpa param list`"
+            raise RmpaError(f"{self.title} has no parameter {key}; {hint}")
+        return reply
+
+    def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
+        from rmpa.ros.http.rpc import call_api
+
+        try:
+            return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
+        except UnreachableError:
+            raise self.master.unreachable() from None
 
 
-def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
+ParamStore: TypeAlias = MasterParams | PeerParams
+
+
+def with_namespaces(name: str) -> list[str]:
+    """A parameter's name, and those of the namespaces that it is in."""
+    parts = name.split("/")
+    return ["/".join(parts[:end]) for end in range(2, len(parts) + 1)]
+
+
+def open_store(peer: str | None, options: Options) -> ParamStore:
     """The parameters that the options name.
 
     Args:
@@ -90,11 +138,10 @@ def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
         RmpaError: There is no such agent.
     """
     if peer is None:
-        return _MasterStore(options.master())
+        return MasterParams(options.master())
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
-    agent = choose_agent(os.environ, options.agent)
-    return PeerParams(ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT), peer)
+    return PeerParams(options.client(observe_limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
 def split_peer(peer: str | None, text: str) -> tuple[str | None, str]:
@@ -126,8 +173,6 @@ def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> st
     Raises:
         ConfigError: It is no parameter's name.
     """
-    from rmpa.core.identity import resolve_name
-
     namespace = environ.get("ROS_NAMESPACE") or "/"
     if not text and root:
         return resolve_name("", namespace if is_legal_name(namespace) else "/")
@@ -138,77 +183,6 @@ def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> st
     if problem := key_problem(key):
         raise ConfigError("KEY", problem, "one looks like /robot_description")
     return key
-
-
-def absent(key: str, names: list[str], title: str) -> RmpaError:
-    """The error for a parameter that is not there."""
-    known = {name for full in names for name in _with_namespaces(full)}
-    near = did_you_mean(key, known)
-    return RmpaError(f"{title} has no parameter {key}; " + (f"did you mean {near}?" if near else "`rmpa param list`"))
-
-
-def _with_namespaces(name: str) -> list[str]:
-    parts = name.split("/")
-    return ["/".join(parts[:end]) for end in range(2, len(parts) + 1)]
-
-
-@dataclass
-class _MasterStore:
-    """The parameters of a ROS master, an agent's core or any other."""
-
-    master: Master
-
-    @property
-    def title(self) -> str:
-        return self.master.uri
-
-    def get(self, key: str) -> XmlRpcValue:
-        reply = self._call("getParam", key)
-        if reply.code != 1:
-            raise absent(key, self.names(), self.title)
-        return reply.value
-
-    def names(self) -> list[str]:
-        value = self._call("getParamNames").value
-        return sorted(str(name) for name in value) if isinstance(value, list) else []
-
-    def set(self, key: str, value: XmlRpcValue) -> int:
-        from rmpa.ros.wire.xmlrpc import serialize_response
-
-        parameters = parameters_in(key, value)
-        serialize_response(value)  # a value that XML-RPC cannot hold is an error before anything is set
-        for name, one in parameters:
-            reply = self._call("setParam", name, one)
-            if reply.code != 1:
-                raise RmpaError(f"{self.title} does not set {name}: {reply.status}")
-        return len(parameters)
-
-    def delete(self, key: str) -> None:
-        reply = self._call("deleteParam", key)
-        if reply.code != 1:
-            raise absent(key, self.names(), self.title)
-
-    def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
-        from rmpa.ros.http.rpc import call_api
-
-        try:
-            return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
-        except UnreachableError:
-            raise self.master.unreachable() from None
-
-
-# Parameters as YAML: PyYAML with the additions of rosparam (angles), and errors that name line and column.
-
-
-_INT_MAX: Final = (1 << 31) - 1
-_OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.USub: operator.neg,
-    ast.UAdd: operator.pos,
-}
 
 
 class _Loader(yaml.SafeLoader):
@@ -356,80 +330,56 @@ def write_yaml(value: XmlRpcValue) -> str:
     return yaml.dump(value, Dumper=_Dumper, default_flow_style=False)
 
 
-def show_yaml(value: XmlRpcValue) -> str:
-    """A value as ``rosparam get`` prints it: without the ``...`` that ends a document of one scalar."""
-    return write_yaml(value).removesuffix("...\n").rstrip("\n") + "\n"
+def param_verb(*parameters: Any, **settings: Any) -> Callable[[Callable[..., None]], click.Command]:
+    """A ``graph_verb`` with ``--peer``."""
+    return graph_verb(*parameters, peer_option, **settings)
 
 
-peer_option = click.option(
-    "--peer",
-    metavar="PEER",
-    shell_complete=completes("peer"),
-    help="The parameters of this peer's module (or its GUID); SITE/MODULE: of another site's.",
+@param_verb(
+    argument("key", "param"),
+    flag("-p", "--pretty", help="A string as it is, without YAML's quotes and folding."),
 )
+def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> None:
+    """Print the parameter KEY, or all of the namespace KEY, as YAML.
 
+    ---
 
-def _json(value: Any) -> Any:
-    """A value for JSON: binary data in base64, dates in ISO 8601."""
-    if isinstance(value, dict):
-        return {name: _json(member) for name, member in value.items()}
-    if isinstance(value, list):
-        return [_json(member) for member in value]
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode()
-    return value.isoformat() if isinstance(value, datetime) else value
-
-
-@click.command(
-    epilog="""\
-\b
-Examples:
-  rmpa param get /robot_description
-  rmpa param get /base --json
-  rmpa param get base:/run_id          as --peer base /run_id
-"""
-)
-@click.argument("key", shell_complete=completes("param"))
-@click.option("-p", "--pretty", is_flag=True, help="A string as it is, without YAML's quotes and folding.")
-@peer_option
-@graph_options
-def get(key: str, pretty: bool, peer: str | None, options: GraphOptions) -> None:
-    """Print the parameter KEY, or all of the namespace KEY, as YAML."""
+    Examples:
+      rmpa param get /robot_description
+      rmpa param get /base --json
+      rmpa param get base:/run_id          as --peer base /run_id
+    """
     peer, key = split_peer(peer, key)
     value = open_store(peer, options).get(read_key(key, os.environ))
-    if options.as_json:
-        print_json(_json(value))
-    elif pretty and isinstance(value, str):
-        click.echo("\n".join(printable(line) for line in value.split("\n")))
+    if pretty and isinstance(value, str):
+        options.show(value, value.split("\n"))
     else:
-        click.echo(show_yaml(value), nl=False)
+        # As rosparam get: without the "..." that ends a document of one scalar.
+        options.show(value, Painted(write_yaml(value).removesuffix("...\n").rstrip("\n")))
 
 
-@click.command(
-    "set",
+@param_verb(
+    argument("key", "param"),
+    argument("value", required=False),
+    click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text."),
+    click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes."),
     context_settings={"ignore_unknown_options": True},
-    epilog="""\
-\b
-Examples:
-  rmpa param set /speed 1.5
-  rmpa param set /gains '{p: 1.0, i: 0.1}'
-  rmpa param set /angle 'deg(90)'
-  rmpa param set --peer base /base/max_speed 0.4
-  rmpa param set /robot_description -t robot.urdf
-""",
 )
-@click.argument("key", shell_complete=completes("param"))
-@click.argument("value", required=False)
-@click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text.")
-@click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes.")
-@peer_option
-@graph_options
-def set_(
-    key: str, value: str | None, textfile: str | None, binfile: str | None, peer: str | None, options: GraphOptions
+def param_set(
+    key: str, value: str | None, textfile: str | None, binfile: str | None, peer: str | None, options: Options
 ) -> None:
     """Set the parameter KEY to the YAML VALUE.
 
     A dictionary sets each of its members; others of the namespace stay as they are.
+
+    ---
+
+    Examples:
+      rmpa param set /speed 1.5
+      rmpa param set /gains '{p: 1.0, i: 0.1}'
+      rmpa param set /angle 'deg(90)'
+      rmpa param set --peer base /base/max_speed 0.4
+      rmpa param set /robot_description -t robot.urdf
     """
     peer, key = split_peer(peer, key)
     given = [word for word in (value, textfile, binfile) if word is not None]
@@ -443,99 +393,85 @@ def set_(
     else:
         found = read_yaml(value or "", "VALUE")
     name = read_key(key, os.environ, root=True)
-    count = open_store(peer, options).set(name, found)
-    if options.as_json:
-        print_json({"key": name, "set": count})
+    options.show({"key": name, "set": open_store(peer, options).set(name, found)})
 
 
-@click.command(
-    "list", epilog="\b\nExamples:\n  rmpa param list\n  rmpa param list /base\n  rmpa param list --peer base --json\n"
-)
-@click.argument("namespace", default="", shell_complete=completes("param"))
-@peer_option
-@graph_options
-def list_(namespace: str, peer: str | None, options: GraphOptions) -> None:
-    """List the names of all parameters, or of those in NAMESPACE."""
+@param_verb(argument("namespace", "param", default=""))
+def param_list(namespace: str, peer: str | None, options: Options) -> None:
+    """List the names of all parameters, or of those in NAMESPACE.
+
+    ---
+
+    Examples:
+      rmpa param list
+      rmpa param list /base
+      rmpa param list --peer base --json
+    """
     peer, namespace = split_peer(peer, namespace)
     key = read_key(namespace, os.environ) if namespace else "/"
     begin = "/" if key == "/" else f"{key}/"
     names = [name for name in open_store(peer, options).names() if name.startswith(begin)]
-    if options.as_json:
-        print_json(names)
-    else:
-        for name in names:
-            print_line(name)
+    options.show(names, names)
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa param delete /speed\n  rmpa param delete --peer base /base/trial\n")
-@click.argument("key", shell_complete=completes("param"))
-@peer_option
-@graph_options
-def delete(key: str, peer: str | None, options: GraphOptions) -> None:
-    """Delete the parameter KEY, or all of the namespace KEY."""
+@param_verb(argument("key", "param"))
+def param_delete(key: str, peer: str | None, options: Options) -> None:
+    """Delete the parameter KEY, or all of the namespace KEY.
+
+    ---
+
+    Examples:
+      rmpa param delete /speed
+      rmpa param delete --peer base /base/trial
+    """
     peer, key = split_peer(peer, key)
     name = read_key(key, os.environ)
     if name == "/":
         raise ConfigError("KEY", "the root holds every parameter", "name the one that you mean")
     open_store(peer, options).delete(name)
-    if options.as_json:
-        print_json({"key": name, "deleted": True})
+    options.show({"key": name, "deleted": True})
 
 
-@click.command(
-    epilog="""\
-\b
-Examples:
-  rmpa param dump robot.yaml
-  rmpa param dump - /base | less
-  rmpa param dump --peer base base.yaml /base
-"""
-)
-@click.argument("file", default="-")
-@click.argument("namespace", default="", shell_complete=completes("param"))
-@peer_option
-@graph_options
-def dump(file: str, namespace: str, peer: str | None, options: GraphOptions) -> None:
-    """Write all parameters, or those in NAMESPACE, as YAML to FILE, or to standard output (-)."""
+@param_verb(argument("file", default="-"), argument("namespace", "param", default=""))
+def param_dump(file: str, namespace: str, peer: str | None, options: Options) -> None:
+    """Write all parameters, or those in NAMESPACE, as YAML to FILE, or to standard output (-).
+
+    ---
+
+    Examples:
+      rmpa param dump robot.yaml
+      rmpa param dump - /base | less
+      rmpa param dump --peer base base.yaml /base
+    """
     peer, namespace = split_peer(peer, namespace)
     value = open_store(peer, options).get(read_key(namespace, os.environ, root=True))
+    text = json_text(value) + "\n" if options.as_json else write_yaml(value)
     if file == "-":
-        if options.as_json:
-            print_json(_json(value))
-        else:
-            click.echo(write_yaml(value), nl=False)
+        click.echo(text, nl=False)
         return
-    text = json_text(_json(value)) + "\n" if options.as_json else write_yaml(value)
     try:
         Path(file).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RmpaError(f"{file} cannot be written: {error.strerror}") from None
 
 
-@click.command(
-    epilog="""\
-\b
-Examples:
-  rmpa param load robot.yaml
-  rmpa param load gains.yaml /base
-  rmpa param dump --peer base - | rmpa param load - /copy_of_base
-"""
-)
-@click.argument("file")
-@click.argument("namespace", default="", shell_complete=completes("param"))
-@peer_option
-@graph_options
-def load(file: str, namespace: str, peer: str | None, options: GraphOptions) -> None:
+@param_verb(argument("file"), argument("namespace", "param", default=""))
+def param_load(file: str, namespace: str, peer: str | None, options: Options) -> None:
     """Set the parameters of a YAML FILE (- for standard input), below NAMESPACE if one is given.
 
     As in rosparam, a key _ns of a document is a namespace for all of it.
+
+    ---
+
+    Examples:
+      rmpa param load robot.yaml
+      rmpa param load gains.yaml /base
+      rmpa param dump --peer base - | rmpa param load - /copy_of_base
     """
     peer, namespace = split_peer(peer, namespace)
     documents = [_placed(document, namespace, file) for document in read_documents(_text(file), file)]
     store = open_store(peer, options)
-    count = sum(store.set(key, value) for key, value in documents)
-    if options.as_json:
-        print_json({"set": count})
+    options.show({"set": sum(store.set(key, value) for key, value in documents)})
 
 
 def _placed(document: XmlRpcValue, namespace: str, file: str) -> tuple[str, XmlRpcValue]:
@@ -566,23 +502,28 @@ def _text(file: str) -> str:
         raise RmpaError(f"{file}: byte {error.start} is not UTF-8; set binary data with -b") from None
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa param followed\n  rmpa param followed --json\n")
-@json_option
-@agent_option
-def followed(as_json: bool, agent: str | None) -> None:
-    """List the parameters of other modules that this one follows ([[param]] and [time] of rmpa.toml)."""
-    with ControlClient(choose_agent(os.environ, agent).path) as client:
+@agent_verb()
+def param_followed(options: Options) -> None:
+    """List the parameters of other modules that this one follows ([[param]] and [time] of rmpa.toml).
+
+    ---
+
+    Examples:
+      rmpa param followed
+      rmpa param followed --json
+    """
+    with options.client() as client:
         found = client.call("followed", tuple[FollowedInfo, ...])
-    if as_json:
-        print_json(found)
-        return
-    if not found:
-        click.echo(f"{client.name} follows no parameters: [[param]] in rmpa.toml names some")
-        return
-    columns = (Column("KEY"), Column("STATE"), Column("OWNER"), Column("SIZE", right=True))
-    colours = [{"followed": "green", "refused": "red"}.get(one.state, "yellow") for one in found]
-    rows = [[one.key, one.state, f"{one.owner}:{one.owner_key}", size(one.size)] for one in found]
-    print_table(columns, rows, colours=colours)
-    for one in found:
-        if one.problem:
-            warn(f"{one.key}: {one.problem}")
+
+    def text() -> Iterator[Text]:
+        if not found:
+            yield f"{client.name} follows no parameters: [[param]] in rmpa.toml names some"
+            return
+        colours = [{"followed": "green", "refused": "red"}.get(one.state, "yellow") for one in found]
+        rows = [[one.key, one.state, f"{one.owner}:{one.owner_key}", size(one.size)] for one in found]
+        yield Table("KEY, STATE, OWNER, >SIZE", rows, colours)
+        for one in found:
+            if one.problem:
+                warn(f"{one.key}: {one.problem}")
+
+    options.show(found, text())

@@ -1,82 +1,66 @@
-"""``rmpa peer list|info|ping``: the peers that this machine's agent knows."""
+"""``rmpa peer``: the peers that this machine's agent knows; ``rmpa site``: other sites that gateways join."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import time
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
+import msgspec
 
-from rmpa.cli.options import LINES, FiniteRange, Selection, agent_option, completes, json_option, summary
-from rmpa.cli.output import Column, duration, find_peer, print_json, print_line, print_table, size, warn
+from rmpa.cli.graph import find_peer
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    agent_verb,
+    argument,
+    flag,
+    limit_options,
+    ping_options,
+    summary,
+)
+from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.cli.topic import shown_state
+from rmpa.config.values import did_you_mean
 from rmpa.core.counters import SampleSummary
-from rmpa.core.errors import PeerRefused
-from rmpa.observe.control_client import ControlClient, choose_agent
-from rmpa.observe.peer_info import FOREIGN
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.observe import limits
+from rmpa.observe.control import GATEWAY_REPORT
+from rmpa.observe.operations import INFO, REPORT
+from rmpa.observe.peer_info import FOREIGN, SitesReport
 from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator
 
-    from rmpa.observe.peer_info import LaneInfo, LinkInfo, PeerInfo
+    from rmpa.cli.output import Text
+    from rmpa.observe.control_client import ControlClient
+    from rmpa.observe.peer_info import PeerInfo, SiteInfo
     from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
+_T = TypeVar("_T")
 _COLOURS: Final = {
-    "linked": "green",
-    "relayed": "green",
-    "linking": "yellow",
-    "refused": "red",
-    "conflict": "red",
-    "foreign": "yellow",
+    **dict.fromkeys(("linked", "relayed", "this site", "joined"), "green"),
+    **dict.fromkeys(("linking", "foreign", "no gateway"), "yellow"),
+    **dict.fromkeys(("refused", "conflict", "unreachable"), "red"),
 }
+"""By the state of a peer or site."""
 _USUAL: Final = frozenset({"linked", "relayed"})
 """States that are no problem."""
-_COLUMNS: Final = tuple(
-    Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
-    for title in ("PEER", "STATE", "SINCE", "ADDRESS", "RTT", "DIALLED", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
-)
-_BRIEF: Final = 5
+_BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, >RTT"
 """Columns that are shown without ``-v``: they fit 80 characters."""
-_ROUTES: Final = (
-    *map(Column, ("  TOPIC", "TYPE", "NODE", "ROUTE")),
-    *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
+
+
+@agent_verb(
+    argument("pattern", "peer", default=""),
+    flag("-v", "--verbose", help="With the side that dialled, clock, traffic, queue and drops."),
+    click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again."),
+    *limit_options,
 )
-
-
-def connect(agent: str | None) -> ControlClient:
-    """A connection to the agent of that name, or to the only one of this machine."""
-    return ControlClient(choose_agent(os.environ, agent).path)
-
-
-@click.command(
-    "list",
-    epilog="""\
-\b
-Examples:
-  rmpa peer list
-  rmpa peer list -v
-  rmpa peer list 'arm*' --state linked --state refused
-  rmpa peer list --json | jq '.[].name'
-""",
-)
-@click.argument("pattern", default="", shell_complete=completes("peer"))
-@click.option("-v", "--verbose", is_flag=True, help="With the side that dialled, clock, traffic, queue and drops.")
-@click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again.")
-@click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]")
-@click.option("--all", "everything", is_flag=True, help="Leave nothing out on a terminal.")
-@json_option
-@agent_option
-def list_(
-    pattern: str,
-    verbose: bool,
-    states: tuple[str, ...],
-    limit: int | None,
-    everything: bool,
-    as_json: bool,
-    agent: str | None,
+def peer_list(
+    pattern: str, verbose: bool, states: tuple[str, ...], limit: int | None, everything: bool, options: Options
 ) -> None:
     """List the peers, all or those with names like PATTERN, and how their links are.
 
@@ -85,44 +69,52 @@ def list_(
 
     CLOCK is the peer's wall clock less ours, with the bound of its error. Of very many peers a terminal shows a
     summary and the first ones: those with a problem, then those with most traffic.
+
+    ---
+
+    Examples:
+      rmpa peer list
+      rmpa peer list -v
+      rmpa peer list 'arm*' --state linked --state refused
+      rmpa peer list --json | jq '.[].name'
     """
-    with connect(agent) as client:
+    with options.client() as client:
         snapshot = client.snapshot(topics=())
     selection = Selection(pattern, limit=limit, everything=everything)
     known = (*snapshot.peers, *snapshot.strangers)
-    fitting = set(selection.names(peer.name for peer in known))
-    peers = [p for p in known if p.name in fitting and (not states or p.state in states)]
-    if as_json:
-        print_json(peers)
-        return
-    if not known:
-        where = ", ".join(snapshot.agent.interfaces) or "no interface"
-        click.echo(f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})")
-    elif not peers:
-        click.echo(summary(len(known), "peers", (p.state for p in known)) + "; none of them fits")
-    else:
-        if selection.is_long(peers):
-            peers.sort(key=_urgency)
-            click.echo(summary(len(peers), "peers", (p.state for p in peers)) + "\n")
-        shown = selection.shown(peers)
-        width = len(_COLUMNS) if verbose else _BRIEF
-        colours = [_COLOURS.get(p.state, "") for p in shown]
-        print_table(_COLUMNS[:width], [_row(p)[:width] for p in shown], colours=colours)
-        selection.print_rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
-    troubles = _troubles(snapshot, peers)
-    told = selection.shown(troubles)
-    for trouble in told:
-        warn(trouble)
-    if len(told) < len(troubles):
-        warn(f"... {len(troubles) - len(told):,} more of this kind; all: rmpa peer list --all")
+    peers = [p for p in known if selection.wants(p.name, ()) and (not states or p.state in states)]
+
+    def text() -> Iterator[Text]:
+        shown = peers
+        if not known:
+            where = ", ".join(snapshot.agent.interfaces) or "no interface"
+            yield f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})"
+        elif not peers:
+            yield summary(len(known), "peers", (p.state for p in known)) + "; none of them fits"
+        else:
+            if selection.is_long(peers):
+                yield summary(len(peers), "peers", (p.state for p in peers))
+                yield ""
+                shown = sorted(peers, key=_urgency)
+            titles = _BRIEF + (", DIALLED, >CLOCK, >IN, >OUT, >QUEUE, >DROPS" if verbose else "")
+            shown = shown[: selection.lines]
+            rows = [_row(p)[: titles.count(",") + 1] for p in shown]
+            yield Table(titles, rows, [_COLOURS.get(p.state, "") for p in shown])
+            yield selection.rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
+        troubles = _troubles(snapshot, sorted(peers, key=_urgency) if selection.is_long(peers) else peers)
+        for trouble in troubles[: selection.lines]:
+            warn(trouble)
+        if selection.is_long(troubles):
+            left = len(troubles) - (selection.lines or 0)
+            warn(f"... {left:,} more of this kind; all: rmpa peer list --all")
+
+    options.show(peers, text())
 
 
 def _urgency(info: PeerInfo) -> tuple[int, int, str]:
     """The order of a list that is not shown whole: problems first, then by traffic."""
-    link = info.link
-    problem = info.conflicts or info.beyond
-    usual = info.state in _USUAL and not problem
-    return int(usual), 0 if link is None else -(link.bytes_in + link.bytes_out), info.name
+    usual = info.state in _USUAL and not (info.conflicts or info.beyond)
+    return int(usual), 0 if info.link is None else -(info.link.bytes_in + info.link.bytes_out), info.name
 
 
 def _row(info: PeerInfo) -> list[str]:
@@ -140,14 +132,12 @@ def _row(info: PeerInfo) -> list[str]:
         duration(link.rtt),
         "by us" if link.dialled else "by it",
         clock,
-        size(link.bytes_in),
-        size(link.bytes_out),
-        size(link.queued),
+        *map(size, (link.bytes_in, link.bytes_out, link.queued)),
         str(link.dropped),
     ]
 
 
-def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
+def _troubles(snapshot: Snapshot, peers: list[PeerInfo]) -> list[str]:
     found = list(snapshot.notes)
     for info in peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
@@ -158,35 +148,38 @@ def _troubles(snapshot: Snapshot, peers: Sequence[PeerInfo]) -> list[str]:
     return found
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa peer info base\n")
-@click.argument("name", shell_complete=completes("peer"))
-@json_option
-@agent_option
-def info(name: str, as_json: bool, agent: str | None) -> None:
+@agent_verb(argument("name", "peer"))
+def peer_info(name: str, options: Options) -> None:
     """Show all that is known of the peer NAME (or of one by its GUID).
 
     Clock is its wall clock less ours, with the bound of what is known of it. Of each topic that comes from it: how
     often it came in the last minute, and the median and 99th percentile of its one-way latency, true within ±.
+
+    ---
+
+    Examples:
+      rmpa peer info base
     """
-    with connect(agent) as client:
+    with options.client() as client:
         snapshot = client.snapshot()
     found = find_peer(snapshot, name)
-    if as_json:
-        print_json(found)
-        return
-    for label, text in _facts(found):
-        print_line(f"{label + ':':<13} {text}")
-    for direction, title in (("in", "it publishes"), ("out", "we publish to it")):
-        routes = [
-            (t, r) for t in snapshot.topics for r in t.routes if r.peer == found.name and r.direction == direction
-        ]
-        if routes:
-            click.echo(f"\nTopics that {title}:")
-            columns = _ROUTES if direction == "in" else _ROUTES[:5]
-            print_table(columns, [_route_row(t, r)[: len(columns)] for t, r in routes])
+
+    def text() -> Iterator[Text]:
+        yield (f"{label + ':':<13} {text}" for label, text in _facts(found))
+        for direction, title in (("in", "it publishes"), ("out", "we publish to it")):
+            of_topics = [(topic, route) for topic in snapshot.topics for route in topic.routes]
+            rows = [_route(t, r) for t, r in of_topics if r.peer == found.name and r.direction == direction]
+            titles = "  TOPIC, TYPE, NODE, ROUTE, >MESSAGES"
+            if direction == "in":
+                titles += ", >RATE, >LATENCY, >P99, >LOST"
+            if rows:
+                yield from ("", f"Topics that {title}:")
+                yield Table(titles, [row[: titles.count(",") + 1] for row in rows])
+
+    options.show(found, text())
 
 
-def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
+def _route(topic: TopicInfo, route: RouteInfo) -> list[str]:
     latency = route.latency
     return [
         *(f"  {topic.name}", route.type or topic.type or "-", route.node, shown_state(route)),
@@ -198,107 +191,207 @@ def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
     ]
 
 
-def _lane_state(lane: LaneInfo) -> str:
-    if lane.connected:
-        return "connected"
-    return "connected when a message wants it" if lane.unneeded else "no connection"
-
-
-def _pace_text(link: LinkInfo) -> str:
-    if link.rests:
-        return f"at rest: nothing depends on the link, and its silence is noticed after {link.lease:.0f} s"
-    return "in use: its silence is noticed within 1 s"
-
-
-def _facts(info: PeerInfo) -> list[tuple[str, str]]:
+def _facts(info: PeerInfo) -> Iterator[tuple[str, str]]:
+    yield "Peer", info.name
+    yield "GUID", info.guid
     if info.via:
-        topics = f"{info.topics_in} topics that it publishes"
-        return [("Peer", info.name), ("GUID", info.guid), ("State", f"relayed: {info.via} passes on {topics}")]
-    strange = info.state == FOREIGN
-    facts = [
-        ("Peer", info.name),
-        ("GUID", info.guid),
-        ("State", f"{info.state} for {duration(info.since_ago)}"),
-        ("Addresses", ", ".join(info.addresses) or "-"),
-        ("Found", f"{duration(info.found_ago)} ago by {info.source or ('a beacon' if strange else 'a link')}"),
-        ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
-    ]
-    link = info.link
-    if link is not None:
+        yield "State", f"relayed: {info.via} passes on {info.topics_in} topics that it publishes"
+        return
+    yield "State", f"{info.state} for {duration(info.since_ago)}"
+    yield "Addresses", ", ".join(info.addresses) or "-"
+    source = info.source or ("a beacon" if info.state == FOREIGN else "a link")
+    yield "Found", f"{duration(info.found_ago)} ago by {source}"
+    yield "Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"
+    if (link := info.link) is not None:
         who = "dialled by us" if link.dialled else "dialled by it"
         clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ± {duration(link.clock_error)}"
-        facts += [
-            ("Link", f"{link.remote}, {who}, up for {duration(link.up_ago)}, heard {duration(link.heard_ago)} ago"),
-            ("Pace", _pace_text(link)),
-            *(("Lane", f"{lane.name}: {_lane_state(lane)}") for lane in link.lanes),
-            ("Round trip", duration(link.rtt)),
-            ("Clock", f"{clock} (its clock less ours)"),
-            ("Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"),
-            ("Drops", f"{link.dropped} messages"),
-        ]
+        rest = f"at rest: nothing depends on the link, and its silence is noticed after {link.lease:.0f} s"
+        yield "Link", f"{link.remote}, {who}, up for {duration(link.up_ago)}, heard {duration(link.heard_ago)} ago"
+        yield "Pace", rest if link.rests else "in use: its silence is noticed within 1 s"
+        for lane in link.lanes:
+            idle = "connected when a message wants it" if lane.unneeded else "no connection"
+            yield "Lane", f"{lane.name}: {'connected' if lane.connected else idle}"
+        yield "Round trip", duration(link.rtt)
+        yield "Clock", f"{clock} (its clock less ours)"
+        yield "Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"
+        yield "Drops", f"{link.dropped} messages"
         if info.direct_in or info.direct_out:
             ours = f"{info.direct_in} of the subscribers here to its nodes"
-            facts.append(("Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"))
+            yield "Direct", f"{ours}, {info.direct_out} of its subscribers to nodes here"
     if info.last_error:
-        facts.append(("Last error", info.last_error))
+        yield "Last error", info.last_error
     if info.next_attempt is not None:
-        facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
-    facts += [("Limit", bound.text) for bound in info.beyond]
-    return facts + [("Conflict", conflict) for conflict in info.conflicts]
+        yield "Next attempt", f"in {duration(info.next_attempt)}"
+    yield from (("Limit", bound.text) for bound in info.beyond)
+    yield from (("Conflict", conflict) for conflict in info.conflicts)
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")
-@click.argument("name", shell_complete=completes("peer"))
-@click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
-@click.option("-i", "--interval", type=FiniteRange(0.01), default=1.0, show_default=True, help="Seconds between.")
-@json_option
-@agent_option
-def ping(name: str, count: int | None, interval: float, as_json: bool, agent: str | None) -> int:
+@agent_verb(argument("name", "peer"), ping_options)
+def peer_ping(name: str, count: int | None, interval: float, options: Options) -> int:
     """Measure the round trip to the peer NAME over the mesh.
 
     Exits 1 if no answer came.
+
+    ---
+
+    Examples:
+      rmpa peer ping base
+      rmpa peer ping base -c 10 -i 0.1
     """
     times: list[float] = []
     sent = 0
-    with connect(agent) as client:
+    with options.client() as client:
         found = find_peer(client.snapshot(topics=()), name)
         with contextlib.suppress(KeyboardInterrupt):
             while count is None or sent < count:
                 if sent:
                     time.sleep(interval)
                 sent += 1
-                _ping_once(client, found, sent, times, as_json=as_json)
-    _ping_summary(found.name, sent, times, as_json=as_json)
+                times += _ping_once(client, found, sent, options)
+    of = SampleSummary.of(times)
+    figures = {"min": of.minimum, "avg": of.mean, "max": of.maximum, "sd": of.sd}
+    lost = 100 * (sent - len(times)) / sent if sent else 0
+    lines = [f"--- {found.name} ping statistics ---", f"{sent} sent, {len(times)} received, {lost:.0f} % lost"]
+    if times:
+        lines.append(f"rtt min/avg/max/sd = {'/'.join(f'{v * 1e3:.3f}' for v in figures.values())} ms")
+    options.show({"peer": found.name, "sent": sent, "received": len(times), **figures}, "", lines)
     return 0 if times else 1
 
 
-def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[float], *, as_json: bool) -> None:
-    name = peer.name
+def _ping_once(client: ControlClient, peer: PeerInfo, number: int, options: Options) -> list[float]:
+    """Ping a peer and print the result; return its time, or nothing."""
+    reply, problem = PingReply(times=()), "no answer"
     try:
-        # By GUID: two peers may have the same name.
-        reply = client.call("ping", PingReply, peer=peer.guid, count=1)
-        elapsed, problem = (reply.times[0] if reply.times else None), "no answer"
+        reply = client.call("ping", PingReply, peer=peer.guid, count=1)  # by GUID: two peers may have the same name
     except PeerRefused as error:
-        reply, elapsed, problem = PingReply(times=()), None, error.reason
-    if elapsed is not None:
-        times.append(elapsed)
-    if as_json:
-        answer = {"peer": name, "seq": number, "time": elapsed, "remote": reply.remote}
-        print_json(answer if elapsed is not None else answer | {"error": problem})
-    elif elapsed is None:
-        print_line(f"{name}: seq={number} {problem}")
-    else:
-        print_line(f"{name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
+        problem = error.reason
+    elapsed = reply.times[0] if reply.times else None
+    told = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
+    if elapsed is None:
+        options.show(told | {"error": problem}, f"{peer.name}: seq={number} {problem}")
+        return []
+    options.show(told, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
+    return [elapsed]
 
 
-def _ping_summary(name: str, sent: int, times: list[float], *, as_json: bool) -> None:
-    summary = SampleSummary.of(times)
-    figures = {"min": summary.minimum, "avg": summary.mean, "max": summary.maximum, "sd": summary.sd}
-    if as_json:
-        print_json({"peer": name, "sent": sent, "received": len(times), **figures})
-        return
-    lost = 100 * (sent - len(times)) / sent if sent else 0
-    click.echo(f"\n--- {name} ping statistics ---")
-    click.echo(f"{sent} sent, {len(times)} received, {lost:.0f} % lost")
-    if times:
-        click.echo(f"rtt min/avg/max/sd = {'/'.join(f'{v * 1e3:.3f}' for v in figures.values())} ms")
+name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
+
+
+def _connect(options: Options, name: str | None) -> ControlClient:
+    return replace(options, agent=name or options.agent).client(limits.CONTROL_HANDLER_TIMEOUT)
+
+
+def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
+    try:
+        value: object = client.call("site", object, what=what, args=args)
+    except PeerRefused as error:
+        raise RmpaError(error.reason) from None  # the agent only passes on what a gateway says
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise RemoteProtocolError(f"the gateway answers in another way: {error}; is it another version?") from None
+
+
+@agent_verb(name_option)
+def site_list(name: str | None, options: Options) -> int:
+    """List this site and the others that its gateways join.
+
+    SOURCES are the topics (one for each publisher) and services that a site offers, SHOWN those that are in the
+    graph here. BY is the gateway that was asked; one that stands by shows nothing.
+
+    ---
+    Exit codes: 0 each site is joined; 1 one is not, or no gateway answers.
+
+    Examples:
+      rmpa site list
+      rmpa site list --name store-gateway
+      rmpa site list --json | jq -r '.[].sites[].name'
+    """
+    with _connect(options, name) as client:
+        reports = _ask(client, REPORT, tuple[SitesReport, ...])
+        if not reports:
+            warn(_why_none(client))
+
+    def text() -> Iterator[Text]:
+        rows = [(report, site) for report in reports for site in report.sites]
+        titles = "SITE, STATE, >SINCE, >GATEWAYS, >MODULES, >SOURCES, >SHOWN, BY"
+        if reports:
+            yield Table(titles, [_site_row(*row) for row in rows], [_COLOURS.get(s.state, "") for _, s in rows])
+        for report in reports:
+            if report.problem:
+                warn(f"{report.gateway}: {report.problem}")
+            if not any(site.state != "this site" for site in report.sites):
+                where = ": it is connected to nothing; is the router of gateway.connect there?"
+                if report.endpoints:
+                    where = f": it is connected to {', '.join(report.endpoints)}, where no other gateway is"
+                warn(f"{report.gateway} of site {report.site} knows no other site{where}")
+
+    options.show(reports, text())
+    well = all(s.state in ("this site", "joined") for report in reports for s in report.sites)
+    return 0 if reports and well and not any(report.problem for report in reports) else 1
+
+
+def _why_none(client: ControlClient) -> str:
+    """Why no gateway answers: this agent is a gateway whose session is not open, or it knows none."""
+    with contextlib.suppress(RmpaError):  # no gateway: it has no such operation
+        problem = str(client.call(GATEWAY_REPORT, dict[str, object]).get("problem", ""))
+        return f"{client.name} joins no site: {problem or 'it is a gateway without --site'}"
+    start = "start one with `rmpa gateway --site NAME`; in a secured mesh `relays` of [trust] names it"
+    return f"{client.name} is no gateway, and is linked to none: {start}"
+
+
+def _site_row(report: SitesReport, site: SiteInfo) -> list[str]:
+    modules = len({module.name for module in site.modules})
+    sources = sum(module.topics + module.services for module in site.modules)
+    shown = sum(module.shown for module in site.modules)
+    counts = map(str, (site.gateways, modules, sources, shown))
+    by = report.gateway + ("" if report.leads else " (stands by)")
+    return [site.name, site.state, duration(site.since_ago), *counts, by]
+
+
+@agent_verb(argument("site"), name_option)
+def site_info(site: str, name: str | None, options: Options) -> int:
+    """Show the modules of SITE, what they offer, its name here, and why something does not cross.
+
+    ---
+    Exit codes: 0 the site is joined, or this one; 1 it is not there, or not known.
+
+    Examples:
+      rmpa site info warehouse
+      rmpa site info warehouse --json | jq '.sites[0].sources[] | select(.here == "")'
+    """
+    with _connect(options, name) as client:
+        report = _ask(client, INFO, SitesReport, site=site)
+    found = next((each for each in report.sites if each.name == site), None)
+    if found is None:
+        known = [each.name for each in report.sites]
+        near = did_you_mean(site, known)
+        hint = f"did you mean {near}?" if near else f"known are {', '.join(known)}"
+        raise RmpaError(f"{report.gateway} knows no site {printable(site)!r}; {hint}")
+    options.show(report, _site_text(report, found))
+    return 0 if found.state in ("this site", "joined") else 1
+
+
+def _site_text(report: SitesReport, site: SiteInfo) -> Iterator[Text]:
+    since = f" for {duration(site.since_ago)}" if site.since_ago is not None else ""
+    stands_by = "" if report.leads else ", which stands by"
+    yield f"Site:      {site.name}"
+    yield f"State:     {site.state}{since}"
+    yield f"Gateways:  {site.gateways}"
+    yield f"Seen by:   {report.gateway} of site {report.site}{stands_by}"
+    yield f"Connected: {', '.join(report.endpoints) or 'to nothing'}"
+    if site.not_shown:
+        yield f"Kept out:  {site.not_shown} topics and services, by rules or for their names"
+    if site.beyond:
+        yield f"Limit:     {site.beyond} topics and services were left out: the site has too many"
+    if site.modules:
+        rows = [[f"  {m.name}", str(m.topics), str(m.services), str(m.shown)] for m in site.modules]
+        yield from ("", "Modules:")
+        yield Table("  MODULE, >TOPICS, >SERVICES, >SHOWN", rows)
+    if site.sources:
+        rows = [[f"  {s.name}", s.kind, s.type, s.module, s.node, s.here or "-"] for s in site.sources]
+        yield from ("", "Topics and services:")
+        yield Table("  NAME, KIND, TYPE, MODULE, NODE, HERE", rows)
+    for source in site.sources:
+        if source.problem:
+            warn(f"{source.name} of {source.module}: {source.problem}")

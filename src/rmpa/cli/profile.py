@@ -1,243 +1,178 @@
-"""``rmpa profile`` and ``rmpa resource info``: what a resource has chosen, and choices by hand.
-
-``rmpa profile list|get|set|explain``.
-"""
+"""``rmpa resource info``, ``rmpa profile`` and ``rmpa context``: what one resource says, and choices by hand."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-import click
+import msgspec
 
-from rmpa.cli.options import GraphOptions, completes, graph_options
-from rmpa.cli.output import Column, print_json, print_line, print_table, warn
-from rmpa.cli.resource import decision_of, known_name, run_with_resources
+from rmpa.cli.options import Options, argument, flag, graph_verb
+from rmpa.cli.output import Table, warn
+from rmpa.cli.resource import known_name, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.quality import MEASURED
-from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.definitions import ARRAY_TYPE
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    import click
+
+    from rmpa.cli.output import Text
     from rmpa.cli.resource import ResourceGraph, SeenResource
-    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
+    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
+
+_TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 
 
-# The commands ``get`` and ``set`` of ``rmpa profile`` and ``rmpa context``.
-
-
-@dataclass(frozen=True, slots=True)
-class ManualChoice:
-    """A choice that a resource offers.
-
-    Args:
-        what: ``profile`` or ``context``: the word for it, and the parameter that chooses it.
-        names: The names to choose from, by the resource's descriptor.
-        present: Reads the present one: an object for JSON with the keys ``what`` and ``chosen`` (by hand).
-    """
-
-    what: str
-    names: Callable[[Descriptor], Iterable[str]]
-    present: Callable[[ResourceGraph, SeenResource], Awaitable[Mapping[str, Any]]]
-
-    def get_command(self, text: str) -> click.Command:
-        """The command ``get`` with its help text."""
-
-        @click.command("get", help=text, epilog=f"\b\nExamples:\n  rmpa {self.what} get /sonar\n")
-        @click.argument("resource", shell_complete=completes("resource"), required=False)
-        @graph_options
-        def get(resource: str | None, options: GraphOptions) -> None:
-            async def body(graph: ResourceGraph) -> None:
-                one = graph.pick(resource)
-                present = await self.present(graph, one)
-                if options.as_json:
-                    print_json({**resource_json(one), **present})
-                else:
-                    print_line(str(present[self.what]))
-
-            run_with_resources(options, body)
-
-        return get
-
-    def set_command(self, text: str, auto_text: str, example: str) -> click.Command:
-        """The command ``set`` with its help text, that of ``--auto``, and a name for its examples."""
-        examples = f"  rmpa {self.what} set /sonar {example}\n  rmpa {self.what} set base:/sonar --auto\n"
-
-        @click.command("set", help=text, epilog=f"\b\nExamples:\n{examples}")
-        @click.argument("resource", shell_complete=completes("resource"))
-        @click.argument("name", required=False, metavar=f"[{self.what.upper()}]", shell_complete=completes(self.what))
-        @click.option("--auto", is_flag=True, help=auto_text)
-        @graph_options
-        def set_(resource: str, name: str | None, auto: bool, options: GraphOptions) -> None:
-            if (name is None) != auto:
-                raise ConfigError(self.what.upper(), "say which one, or --auto", "one of both")
-
-            async def body(graph: ResourceGraph) -> None:
-                one = graph.pick(resource)
-                names = list(self.names(one.descriptor))
-                if not names:
-                    raise ConfigError("RESOURCE", f"{one} has no {self.what}s", "")
-                if name is not None:
-                    known_name(self.what, name, names)
-                await graph.configure(one, {self.what: name or ""})
-                if options.as_json:
-                    print_json({**resource_json(one), "chosen": name or ""})
-
-            run_with_resources(options, body)
-
-        return set_
-
-
-def resource_json(one: SeenResource) -> dict[str, str | None]:
-    """The resource of an answer, for JSON."""
-    return {"resource": one.path, "peer": one.peer}
-
-
-def shown(value: object, unit: str) -> str:
+def _shown(value: object, unit: str) -> str:
     """A value with its unit; ``-`` for none."""
     if value is None:
         return "-"
     return f"{value:.6g} {unit}".rstrip() if isinstance(value, int | float) else str(value)
 
 
-def offers(descriptor: Descriptor, values: dict[str, float | str]) -> str:
+def _offers(descriptor: Descriptor, values: dict[str, float | str]) -> str:
     """The qualities that a profile offers, in one line."""
     units = {attribute.name: attribute.unit for attribute in descriptor.attributes}
-    return ", ".join(f"{name} {shown(value, units.get(name, ''))}" for name, value in values.items())
+    return ", ".join(f"{name} {_shown(value, units.get(name, ''))}" for name, value in values.items()) or "-"
 
 
 async def _decision(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
+    """A resource's account of its last decision.
+
+    Raises:
+        RmpaError: There is none, or it is no JSON object.
+    """
     (said,) = await graph.texts([one], "decision")
     if not said.get(one):
         raise RmpaError(f"{one} has decided nothing yet; is it active?")
-    return decision_of(said[one])
+    try:
+        return msgspec.json.decode(said[one], type=dict[str, Any])
+    except msgspec.DecodeError as error:
+        raise RmpaError(f"it says something strange about its decision: {error}") from None
 
 
-@click.command("list", epilog="\b\nExamples:\n  rmpa profile list\n  rmpa profile list base:/sonar --json\n")
-@click.argument("resource", required=False, shell_complete=completes("resource"))
-@graph_options
-def list_(resource: str | None, options: GraphOptions) -> None:
-    """List a RESOURCE's profiles and what they offer."""
+@resource_verb()
+async def profile_list(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """List a RESOURCE's profiles and what they offer.
+
+    ---
+
+    Examples:
+      rmpa profile list
+      rmpa profile list base:/sonar --json
+    """
+    decision = await _decision(graph, one)
+    said, runs, chosen = one.descriptor, decision.get("profile", ""), decision.get("chosen", "")
+    scores = ((str(s.get("profile")), str(s.get("excluded", ""))) for s in decision.get("scores", ()))
+    left_out = {name: why for name, why in scores if why}
+    rows, colours = [], []
+    for each in said.profiles:
+        why = left_out.get(each.name, "")
+        state = ("runs, by hand" if each.name == chosen else "runs") if each.name == runs else ""
+        colours.append("green" if state else "yellow" if why else "")
+        notes = "; ".join(filter(None, ("best effort" if each.best_effort else "", each.description)))
+        state = state or ("left out" if why else "-")
+        rows.append((each.name, state, _offers(said, each.offers), f"{each.cost:g}", why or notes))
+    about = {**one.named, "profile": runs, "chosen": chosen, "profiles": said.profiles, "left_out": left_out}
+    options.show(about, Table("PROFILE, STATE, OFFERS, >COST, NOTES", rows, colours))
+
+
+@resource_verb()
+async def profile_get(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """Print the profile of a RESOURCE that runs.
+
+    ---
+
+    Examples:
+      rmpa profile get /sonar
+    """
+    decision = await _decision(graph, one)
+    present = {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
+    options.show({**one.named, **present}, str(present["profile"]))
+
+
+def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Command]:
+    """A verb that chooses a profile or context by hand, or lets the resource decide again."""
+    name = argument("name", what, required=False, metavar=f"[{what.upper()}]")
+    return graph_verb(argument("resource", "resource"), name, flag("--auto", help=auto))
+
+
+def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Options) -> None:
+    if (name is None) != auto:
+        raise ConfigError(what.upper(), "say which one, or --auto", "one of both")
 
     async def body(graph: ResourceGraph) -> None:
         one = graph.pick(resource)
-        decision = await _decision(graph, one)
-        runs, chosen = decision.get("profile", ""), decision.get("chosen", "")
-        left_out = {str(s.get("profile")): str(s.get("excluded", "")) for s in decision.get("scores", ())}
-        if options.as_json:
-            print_json(
-                {
-                    **resource_json(one),
-                    "profile": runs,
-                    "chosen": chosen,
-                    "profiles": one.descriptor.profiles,
-                    "left_out": {name: why for name, why in left_out.items() if why},
-                }
-            )
-            return
-        rows, colours = [], []
-        for each in one.descriptor.profiles:
-            why = left_out.get(each.name, "")
-            state = ("runs, by hand" if each.name == chosen else "runs") if each.name == runs else ""
-            colours.append("green" if state else "yellow" if why else "")
-            notes = "; ".join(filter(None, ("best effort" if each.best_effort else "", each.description)))
-            cells = (
-                each.name,
-                state or ("left out" if why else "-"),
-                offers(one.descriptor, each.offers) or "-",
-                f"{each.cost:g}",
-                why or notes,
-            )
-            rows.append(cells)
-        columns = (Column("PROFILE"), Column("STATE"), Column("OFFERS"), Column("COST", right=True), Column("NOTES"))
-        print_table(columns, rows, colours=colours)
+        offered: Sequence[Any] = one.descriptor.profiles if what == "profile" else one.descriptor.contexts
+        if not offered:
+            raise ConfigError("RESOURCE", f"{one} has no {what}s", "")
+        if name is not None:
+            known_name(what, name, (each.name for each in offered))
+        await graph.configure(one, {what: name or ""})
+        options.show({**one.named, "chosen": name or ""})
 
     run_with_resources(options, body)
 
 
-async def _present(graph: ResourceGraph, one: SeenResource) -> dict[str, Any]:
-    decision = await _decision(graph, one)
-    return {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
-
-
-_CHOICE = ManualChoice("profile", lambda descriptor: (each.name for each in descriptor.profiles), _present)
-get = _CHOICE.get_command("Print the profile of a RESOURCE that runs.")
-set_ = _CHOICE.set_command(
+@_set_verb("profile", "Let the resource decide again.")
+def profile_set(resource: str, name: str | None, auto: bool, options: Options) -> None:
     """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
 
     It runs whatever clients ask, until --auto. If it cannot be applied, what was chosen before stays.
-    """,
-    "Let the resource decide again.",
-    "fine",
-)
+
+    ---
+
+    Examples:
+      rmpa profile set /sonar fine
+      rmpa profile set base:/sonar --auto
+    """
+    _set("profile", resource, name, auto=auto, options=options)
 
 
-@click.command(
-    epilog="""\
-\b
-D is the distance of a profile from what is asked: sqrt(sum(weight * shortfall^2) / sum(weight)) over its terms,
-and a little for its cost. A shortfall of 1 is the tolerance of the attribute, or the range over all profiles. The
-smallest D that falls short of nothing hard is taken.
+@resource_verb()
+async def profile_explain(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """Show each term of a RESOURCE's last decision.
 
-\b
-Examples:
-  rmpa profile explain /sonar
-  rmpa profile explain base:/sonar --json
-"""
-)
-@click.argument("resource", required=False, shell_complete=completes("resource"))
-@graph_options
-def explain(resource: str | None, options: GraphOptions) -> None:
-    """Show each term of a RESOURCE's last decision."""
+    ---
+    D is the distance of a profile from what is asked: sqrt(sum(weight * shortfall^2) / sum(weight)) over its terms,
+    and a little for its cost. A shortfall of 1 is the tolerance of the attribute, or the range over all profiles. The
+    smallest D that falls short of nothing hard is taken.
 
-    async def body(graph: ResourceGraph) -> None:
-        one = graph.pick(resource)
-        decision = await _decision(graph, one)
-        if options.as_json:
-            print_json({**resource_json(one), **decision})
-        else:
-            _print_explained(one, decision)
-
-    run_with_resources(options, body)
+    Examples:
+      rmpa profile explain /sonar
+      rmpa profile explain base:/sonar --json
+    """
+    decision = await _decision(graph, one)
+    options.show({**one.named, **decision}, _explained(one, decision))
 
 
-def _print_explained(one: SeenResource, decision: dict[str, Any]) -> None:
+def _explained(one: SeenResource, decision: dict[str, Any]) -> Iterator[Text]:
     runs, chosen = str(decision.get("profile", "")), str(decision.get("chosen", ""))
-    clients = ", ".join(map(str, decision.get("clients", ()))) or "no client"
-    print_line(f"{one}: profile {runs or 'none'}" + (", chosen by hand" if chosen else ""))
-    print_line(f"asked by {clients}")
-    for conflict in decision.get("conflicts", ()):
-        print_line(f"conflict: {conflict}")
+    yield f"{one}: profile {runs or 'none'}" + (", chosen by hand" if chosen else "")
+    yield f"asked by {', '.join(map(str, decision.get('clients', ()))) or 'no client'}"
+    yield from (f"conflict: {conflict}" for conflict in decision.get("conflicts", ()))
     if decision.get("alarm"):
-        print_line(f"alarm: {str(decision['alarm']).replace('_', '-')}")
+        yield f"alarm: {str(decision['alarm']).replace('_', '-')}"
     if decision.get("reaction") is not None:
-        print_line(f"last reconfiguration took {decision['reaction']:.3g} s")
-    print_line()
+        yield f"last reconfiguration took {decision['reaction']:.3g} s"
+    yield ""
     units = {attribute.name: attribute.unit for attribute in one.descriptor.attributes}
     rows, colours = [], []
     for score in decision.get("scores", ()):
         name = str(score.get("profile"))
         head = (name, _verdict(score, runs, chosen), f"{score.get('distance', 0.0):.4g}")
-        terms: list[dict[str, Any]] = score.get("terms") or [{}]
-        for term in terms:
-            attribute = str(term.get("attribute", "-"))
-            shortfall = term.get("delta")
-            cells = (
-                *head,
-                attribute,
-                f"{term.get('wanted', '-')}" + (" hard" if term.get("hard") else ""),
-                shown(term.get("offered"), units.get(attribute, "")),
-                f"{shortfall:.4g}" if shortfall is not None else "-",
-                f"{term['weight']:g}" if "weight" in term else "-",
-            )
-            rows.append(cells)
+        for term in score.get("terms") or [{}]:
+            attribute, shortfall = str(term.get("attribute", "-")), term.get("delta")
+            wanted = f"{term.get('wanted', '-')}" + (" hard" if term.get("hard") else "")
+            cells = (attribute, wanted, _shown(term.get("offered"), units.get(attribute, "")))
+            weight = f"{term['weight']:g}" if "weight" in term else "-"
+            rows.append((*head, *cells, f"{shortfall:.4g}" if shortfall is not None else "-", weight))
             colours.append("green" if name == runs else "yellow" if score.get("excluded") else "")
             head = ("", "", "")
-    titles = ("PROFILE", "VERDICT", "D", "ATTRIBUTE", "WANTED", "OFFERED", "SHORTFALL", "WEIGHT")
-    columns = [Column(title, right=title in ("D", "SHORTFALL", "WEIGHT")) for title in titles]
-    print_table(columns, rows, colours=colours)
+    yield Table("PROFILE, VERDICT, >D, ATTRIBUTE, WANTED, OFFERED, >SHORTFALL, >WEIGHT", rows, colours)
 
 
 def _verdict(score: dict[str, Any], runs: str, chosen: str) -> str:
@@ -250,105 +185,135 @@ def _verdict(score: dict[str, Any], runs: str, chosen: str) -> str:
     return "can serve" if score.get("feasible") else "falls short"
 
 
-# ``rmpa resource info``: all that a resource publishes about itself.
+@resource_verb()
+async def context_list(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """List a RESOURCE's contexts, their rules and what they require.
+
+    ---
+
+    Examples:
+      rmpa context list
+      rmpa context list base:/sonar --json
+    """
+    present = await _context(graph, one)
+    rows = []
+    for each in one.descriptor.contexts:
+        now = "by hand" if each.name == present["chosen"] else "yes"
+        requires = ", ".join(f"{key} {bound}" for key, bound in each.requires.items()) or "-"
+        outputs = ", ".join(each.outputs) or "none" if each.outputs is not None else "all"
+        ends = (requires, ", ".join(each.profiles) or "any", outputs)
+        rows.append((each.name, now if each.name == present["context"] else "", each.when or "by hand", *ends))
+    table = Table("CONTEXT, NOW, WHEN, REQUIRES, PROFILES, OUTPUTS", rows)
+    options.show({**one.named, **present, "contexts": one.descriptor.contexts}, table)
 
 
-_TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
+async def _context(graph: ResourceGraph, one: SeenResource) -> dict[str, str]:
+    """The present context, and the one chosen by hand."""
+    if not one.descriptor.contexts:
+        return {"context": "", "chosen": ""}
+    (said,), values = await asyncio.gather(graph.texts([one], "context"), graph.configuration(one))
+    if one not in said:
+        raise RmpaError(f"{one} does not say its context; does it run?")
+    return {"context": said[one], "chosen": str(values.get("context", ""))}
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")
-@click.argument("resource", required=False, shell_complete=completes("resource"))
-@graph_options
-def info(resource: str | None, options: GraphOptions) -> None:
-    """Show all of a RESOURCE: topics, parameters, qualities, profiles, contexts, tasks, what it asks, and clients."""
+@resource_verb()
+async def context_get(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """Print the present context of a RESOURCE; an empty line for none.
 
-    async def body(graph: ResourceGraph) -> None:
-        one = graph.pick(resource)
-        texts, values, quality, responses = await asyncio.gather(
-            graph.texts([one], "state", "profile", "context"),
-            graph.configuration(one),
-            graph.hear([one], "quality", ARRAY_TYPE),
-            graph.hear([one], "responses", ARRAY_TYPE),
-        )
-        state, profile, context = (said.get(one, "") for said in texts)
-        health, *_ = [*_statuses(quality.get(one)), None]
-        about: dict[str, Any] = {
-            "name": one.path,
-            "peer": one.peer,
-            "node": one.caller,
-            "state": state,
-            "profile": profile,
-            "context": context,
-            "health": health,
-            "parameters": values,
-            "clients": _statuses(responses.get(one)),
-        }
-        if options.as_json:
-            print_json(about | {"descriptor": one.descriptor})
-        else:
-            _print_info(one, about)
+    ---
 
-    run_with_resources(options, body)
+    Examples:
+      rmpa context get /sonar
+    """
+    present = await _context(graph, one)
+    options.show({**one.named, **present}, present["context"])
 
 
-def _statuses(message: Any) -> list[dict[str, Any]]:
+@_set_verb("context", "Let the rules decide again.")
+def context_set(resource: str, name: str | None, auto: bool, options: Options) -> None:
+    """Choose the CONTEXT of a RESOURCE by hand; returns when it is there.
+
+    ---
+
+    Examples:
+      rmpa context set /sonar docked
+      rmpa context set base:/sonar --auto
+    """
+    _set("context", resource, name, auto=auto, options=options)
+
+
+@resource_verb()
+async def resource_info(graph: ResourceGraph, one: SeenResource, options: Options) -> None:
+    """Show all of a RESOURCE: topics, parameters, qualities, profiles, contexts, tasks, what it asks, and clients.
+
+    ---
+
+    Examples:
+      rmpa resource info /sonar
+      rmpa resource info base:/arm --json
+    """
+    texts, values, quality, responses = await asyncio.gather(
+        graph.texts([one], "state", "profile", "context"),
+        graph.configuration(one),
+        graph.hear([one], "quality", ARRAY_TYPE),
+        graph.hear([one], "responses", ARRAY_TYPE),
+    )
+    state, profile, context = (said.get(one, "") for said in texts)
+    about: dict[str, Any] = {"name": one.path, "peer": one.peer, "node": one.caller}
+    about |= {"state": state, "profile": profile, "context": context}
+    about |= {"health": next(_statuses(quality.get(one)), None), "parameters": values}
+    about |= {"clients": [*_statuses(responses.get(one))]}
+    options.show(about | {"descriptor": one.descriptor}, _info(one, about))
+
+
+def _statuses(message: Any) -> Iterator[dict[str, Any]]:
     """The elements of a ``DiagnosticArray``."""
-    if message is None:
-        return []
-    return [
-        {
-            "name": str(status.name),
-            "level": DiagnosticLevel(int(status.level) & 3).name,
-            "message": str(status.message),
-            "values": {str(pair.key): str(pair.value) for pair in status.values},
-        }
-        for status in message.status
-    ]
+    for status in message.status if message is not None else ():
+        yield {"name": str(status.name), **status_of(status)}
 
 
-def _print_info(one: SeenResource, about: dict[str, Any]) -> None:
-    said, health = one.descriptor, about["health"]
-    kind = "device" if said.physical else "simulated"
-    _line("Resource", f"{one} ({said.role}, {kind})")
+def _info(one: SeenResource, about: dict[str, Any]) -> Iterator[Text]:
+    said, health, values = one.descriptor, about["health"], about["parameters"]
+    yield f"Resource: {one} ({said.role}, {'device' if said.physical else 'simulated'})"
     if said.description:
-        _line("Description", said.description)
+        yield f"Description: {said.description}"
     if one.peer is not None:
         whose = "module" if "/" in one.peer else "peer"
-        _line("Node", f"{said.node} of {whose} {one.peer}, by its proxy {one.caller}")
-    _line("State", about["state"] or "does not answer")
-    _line("Profile", about["profile"] or "none runs")
+        yield f"Node: {said.node} of {whose} {one.peer}, by its proxy {one.caller}"
+    yield f"State: {about['state'] or 'does not answer'}"
+    yield f"Profile: {about['profile'] or 'none runs'}"
     if said.contexts:
-        _line("Context", about["context"] or "none")
+        yield f"Context: {about['context'] or 'none'}"
     if health is None:
         warn(f"{one} has sent no quality while we listened")
     else:
-        _line("Health", f"{health['level']}: {health['message']}")
-    _topics("OUTPUT", said.outputs)
-    _topics("INPUT", said.inputs)
-    _table(
-        ("PARAMETER", "VALUE", "RANGE", "DESCRIPTION"), (_parameter(p, about["parameters"]) for p in said.parameters)
-    )
-    _table(("QUALITY", "NOW", "BETTER", "CLASS"), _qualities(said, health["values"] if health else {}))
-    _table(
-        ("PROFILE", "COST", "OFFERS", "DESCRIPTION"),
-        ((p.name, f"{p.cost:g}", offers(said, p.offers) or "-", p.description) for p in said.profiles),
-    )
-    _table(("CONTEXT", "WHEN"), ((c.name, c.when or "by hand") for c in said.contexts))
-    _table(("TASK", "RUNS"), ((t.name, _runs(t, about["parameters"])) for t in said.tasks))
-    _table(
-        ("ASKS OF", "FOR", "PRIORITY"),
-        (
-            (a.resource, "; ".join(f"{k} {v}" for k, v in a.wishes.items()) or "nothing at present", str(a.priority))
-            for a in said.asks
+        yield f"Health: {health['level']}: {health['message']}"
+    tables: dict[str, Iterable[Sequence[str]]] = {
+        "OUTPUT, TYPE, CONTRACT": ((t.topic, t.type, _terms(t.contract)) for t in said.outputs),
+        "INPUT, TYPE, CONTRACT": ((t.topic, t.type, _terms(t.contract)) for t in said.inputs),
+        "PARAMETER, VALUE, RANGE, DESCRIPTION": (_parameter(p, values) for p in said.parameters),
+        "QUALITY, NOW, BETTER, CLASS": _qualities(said, health["values"] if health else {}),
+        "PROFILE, COST, OFFERS, DESCRIPTION": (
+            (p.name, f"{p.cost:g}", _offers(said, p.offers), p.description) for p in said.profiles
         ),
-    )
-    _table(
-        ("CLIENT", "IS TOLD", "ASKS"),
-        (
-            (c["name"], f"{c['level']}: {c['message']}", "; ".join(f"{k} {v}" for k, v in c["values"].items()) or "-")
-            for c in about["clients"]
+        "CONTEXT, WHEN": ((c.name, c.when or "by hand") for c in said.contexts),
+        "TASK, RUNS": ((t.name, _runs(t, values)) for t in said.tasks),
+        "ASKS OF, FOR, PRIORITY": (
+            (a.resource, _pairs(a.wishes) or "nothing at present", str(a.priority)) for a in said.asks
         ),
-    )
+        "CLIENT, IS TOLD, ASKS": (
+            (c["name"], f"{c['level']}: {c['message']}", _pairs(c["values"]) or "-") for c in about["clients"]
+        ),
+    }
+    for titles, rows in tables.items():
+        if made := list(rows):
+            yield ""
+            yield Table(titles, made)
+
+
+def _pairs(values: dict[str, str]) -> str:
+    return "; ".join(f"{key} {value}" for key, value in values.items())
 
 
 def _runs(task: TaskDescriptor, values: dict[str, Any]) -> str:
@@ -362,36 +327,18 @@ def _parameter(one: ParameterDescriptor, values: dict[str, Any]) -> Sequence[str
     low, high = ("" if bound is None else f"{bound:g}" for bound in (one.low, one.high))
     within = " | ".join(map(str, one.choices)) or (f"{low} .. {high}" if low or high else one.type)
     value = values.get(one.name, one.default)
-    text = str(value).lower() if isinstance(value, bool) else shown(value, one.unit)
+    text = str(value).lower() if isinstance(value, bool) else _shown(value, one.unit)
     return one.name, text, within, one.description
 
 
-def _qualities(said: Descriptor, values: dict[str, str]) -> list[Sequence[str]]:
+def _qualities(said: Descriptor, values: dict[str, str]) -> Iterator[Sequence[str]]:
     """The declared attributes, and the general ones that are measured."""
-    return [
-        (each.name, values.get(each.name, "not measured"), each.better, each.category)
-        for each in said.attributes
-        if each.name in values or each.name.rpartition(".")[2] not in MEASURED
-    ]
+    for each in said.attributes:
+        if each.name in values or each.name.rpartition(".")[2] not in MEASURED:
+            yield each.name, values.get(each.name, "not measured"), each.better, each.category
 
 
-def _topics(title: str, topics: Sequence[TopicDescriptor]) -> None:
-    _table(
-        (title, "TYPE", "CONTRACT"),
-        ((t.topic, t.type, ", ".join(_term(key, value) for key, value in t.contract.items()) or "-") for t in topics),
-    )
-
-
-def _term(key: str, value: object) -> str:
-    """A term of a contract; times are in seconds."""
-    return f"{key} {value:g} s" if isinstance(value, float) and key in _TIMES else f"{key} {value}"
-
-
-def _line(title: str, text: str) -> None:
-    print_line(f"{title}: {text}")
-
-
-def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    if made := list(rows):
-        print_line()
-        print_table(tuple(map(Column, titles)), made)
+def _terms(contract: dict[str, str | int | float | None]) -> str:
+    """The terms of a contract; times are in seconds."""
+    timed = {key for key, value in contract.items() if isinstance(value, float) and key in _TIMES}
+    return ", ".join(f"{k} {v:g} s" if k in timed else f"{k} {v}" for k, v in contract.items()) or "-"

@@ -1,153 +1,57 @@
-"""``rmpa resource list``, and how commands find Smart Resources and listen to them.
-
-Finds the Smart Resources of the graph, of this module and of others, and reads what they publish.
-"""
+"""How verbs find Smart Resources and listen to them; ``rmpa resource list`` and ``rmpa alarm``."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import functools
-import signal
+import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-import click
-import msgspec
-
 from rmpa.bridge.policy import OUTSIDE_GUID
-from rmpa.cli.options import GraphOptions, graph_options
-from rmpa.cli.output import Column, GraphName, print_json, print_table, printable, read_graph, read_name, warn
+from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, with_node
+from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
+from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.config.rules import ROS2
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
 from rmpa.resource.descriptor import TOPIC, Descriptor
+from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
-    from rmpa.cli.output import Graph, Master
+    import click
+
+    from rmpa.cli.graph import Graph, Master
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
-    from rmpa.ros.node.node import Received as NodeReceived
 
-
-# Runs commands that end at Ctrl-C, at a count, or with their master: one anonymous ROS node, closed cleanly.
-
-
-class Enough(Exception):  # noqa: N818 - not an error
-    """``--count`` is reached: raised by a command's callback, caught around ``watch_topic``."""
-
-
-class StreamWatch:
-    """The end of a running command, and the error that its callbacks report."""
-
-    def __init__(self) -> None:
-        self._end = asyncio.Event()
-        self._error: BaseException | None = None
-
-    def finish(self, error: BaseException | None = None) -> None:
-        """End the command; it fails with the first error that is given."""
-        self._error = self._error or error
-        self._end.set()
-
-    async def finished(self, seconds: float | None = None) -> bool:
-        """Wait for the end, or for so many seconds; return whether the command ends.
-
-        Raises:
-            BaseException: The error that ``finish`` was given.
-        """
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._end.wait()
-        if self._error is not None:
-            raise self._error
-        return self._end.is_set()
-
-
-def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
-    """Run a coroutine to its end; Ctrl-C and SIGTERM cancel it, and its own clean-up runs."""
-    from rmpa.runtime.accept import raise_file_limit
-
-    async def run() -> None:
-        task = asyncio.current_task()
-        assert task is not None  # noqa: S101 - it is this one
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-        await body()
-
-    with contextlib.suppress(KeyboardInterrupt, asyncio.CancelledError):
-        raise_file_limit()
-        asyncio.run(run())
-
-
-async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[None]]) -> None:
-    """Run ``body`` with a node of a unique name at a master.
-
-    Raises:
-        UnreachableError: The master does not answer.
-    """
-    from rmpa.ros.node.node import Node
-
-    node = Node(name, master_uri=master.uri, anonymous=True)
-    try:
-        await node.__aenter__()
-    except UnreachableError:
-        raise master.unreachable() from None
-    try:
-        await body(node)
-    finally:
-        await node.close()
-
-
-async def watch_topic(
-    master: Master,
-    wanted: GraphName,
-    on_message: Callable[[NodeReceived], None],
-    body: Callable[[StreamWatch], Awaitable[None]],
-) -> None:
-    """Subscribe to a topic and run ``body``.
-
-    Args:
-        master: The master to ask.
-        wanted: The topic; with a peer only messages of that peer's nodes count.
-        on_message: Called for each message; an exception ends the command and is raised by ``watch.finished``.
-        body: Runs until the watch is finished.
-    """
-    watch = StreamWatch()
-
-    def take(received: NodeReceived) -> None:
-        if not wanted.matches(received.caller_id):
-            return
-        try:
-            on_message(received)
-        except BaseException as error:  # noqa: BLE001 - carried over to the command, which fails with it
-            watch.finish(error)
-
-    async def listen(node: Node) -> None:
-        subscriber = await node.subscribe(wanted.name, None, take)
-        stopped = asyncio.get_running_loop().create_task(_end_with(node, watch))
-        try:
-            await body(watch)
-        finally:
-            stopped.cancel()
-            for refusal in subscriber.refusals.values():
-                warn(refusal)
-
-    await with_node(master, "rmpa_topic", listen)
-
-
-async def _end_with(node: Node, watch: StreamWatch) -> None:
-    await node.stopped.wait()
-    watch.finish()
-
-
-TEXT: Final = "std_msgs/String"
+_TEXT: Final = "std_msgs/String"
 _ANSWER: Final = 3.0
 """Seconds for a latched message: the route of another module's topic has to open first."""
-_NODE: Final = "rmpa_resource"
+_LOOK: Final = 1.0
+"""Seconds between two searches for new resources."""
+_COLOURS: Final = {
+    "active": "green",
+    "inactive": "yellow",
+    "unconfigured": "yellow",
+    "finalized": "red",
+    "OK": "green",
+    "WARN": "yellow",
+    "ERROR": "red",
+    "STALE": "magenta",
+}
+"""By state, or by level of an alarm."""
+_SILENT: Final[dict[str, Any]] = {
+    "level": "STALE",
+    "message": "it has sent no quality while we listened",
+    "values": {},
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +73,11 @@ class SeenResource:
     def __str__(self) -> str:
         """As a user writes it."""
         return str(GraphName(self.path, self.peer))
+
+    @property
+    def named(self) -> dict[str, str | None]:
+        """The resource of an answer, for JSON."""
+        return {"resource": self.path, "peer": self.peer}
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,40 +101,32 @@ class ResourceGraph:
             ConfigError: It is no name.
             RmpaError: There is none, or there are several.
         """
-        if text is None:
-            own = [each for each in self.seen if each.peer is None] or list(self.seen)
-            return _only(own, "say which resource is meant")
-        wanted = read_name(text, "resource")
-        found = [s for s in self.seen if s.path == wanted.name and wanted.matches(s.caller)]
+        found, remedy = self.seen, "say which resource is meant"
+        if text is not None:
+            wanted, remedy = read_name(text, "resource"), "say whose is meant"
+            found = tuple(s for s in self.seen if s.path == wanted.name and wanted.matches(s.caller))
+            if not found:
+                near = did_you_mean(str(wanted), map(str, self.seen))
+                hint = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
+                raise RmpaError(f"no resource {printable(str(wanted))}; {hint}")
+        found = tuple(each for each in found if each.peer is None) or found
         if not found:
-            near = did_you_mean(str(wanted), map(str, self.seen))
-            remedy = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
-            raise RmpaError(f"no resource {printable(str(wanted))}; {remedy}")
-        return _only([each for each in found if each.peer is None] or found, "say whose is meant")
+            raise RmpaError("there is no resource; `rmpa run` runs one, `rmpa resource list` shows all")
+        if len(found) > 1:
+            raise RmpaError(f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}")
+        return found[0]
 
-    async def hear(
-        self,
-        each: Iterable[SeenResource],
-        name: str,
-        kind: str = TEXT,
-        timeout: float = _ANSWER,  # noqa: ASYNC109
-    ) -> dict[SeenResource, Any]:
-        """The first message of a topic of each resource; without those that send none in time.
+    async def hear(self, each: Iterable[SeenResource], name: str, kind: str = _TEXT) -> dict[SeenResource, Any]:
+        """The first message of a topic below each resource; without those that send none in time.
 
         Args:
             each: Which resources.
             name: The topic below them.
             kind: Its type.
-            timeout: Seconds.
         """
-        found: dict[SeenResource, Any] = {}
-        callers: dict[str, dict[str, SeenResource]] = {}
-        for one in each:
-            callers.setdefault(f"{one.path}/{name}", {})[one.caller] = one
-        messages = await first_messages(self.node, {t: set(c) for t, c in callers.items()}, kind, timeout)
-        for (topic, caller), received in messages.items():
-            found[callers[topic][caller]] = received.message
-        return found
+        wanted = {(f"{one.path}/{name}", one.caller): one for one in each}
+        messages = await _first_messages(self.node, wanted, kind)
+        return {wanted[key]: message for key, message in messages.items()}
 
     async def texts(self, each: Sequence[SeenResource], *names: str) -> list[dict[SeenResource, str]]:
         """The texts of ``std_msgs/String`` topics: by topic, then by resource."""
@@ -253,22 +154,13 @@ class ResourceGraph:
         if one.peer is None and proxied_peer(server) is not None:
             raise RmpaError(f"service {service} is another module's; {one} does not offer it")
         pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
-        kind = ServiceType(SERVICE_TYPE)
         try:
-            await self.node.call_service(service.name, kind, {"config": {"strs": pairs}})
+            await self.node.call_service(service.name, ServiceType(SERVICE_TYPE), {"config": {"strs": pairs}})
         except PeerRefused as error:
             raise RmpaError(printable(f"{one}: {error.reason}")) from None
 
 
-def _only(found: Sequence[SeenResource], remedy: str) -> SeenResource:
-    if len(found) == 1:
-        return found[0]
-    if not found:
-        raise RmpaError("there is no resource; `rmpa run` runs one, `rmpa resource list` shows all")
-    raise RmpaError(f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}")
-
-
-def run_with_resources(options: GraphOptions, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
+def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
     """Find all resources of the graph that the options name, and run ``body`` with them."""
     asyncio.run(with_resources(options.master(), body))
 
@@ -276,102 +168,229 @@ def run_with_resources(options: GraphOptions, body: Callable[[ResourceGraph], Aw
 async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
     """Find all resources of a master's graph, and run ``body`` with them."""
     graph = await read_graph(master)
-    sites = await asyncio.to_thread(_sites, master)
+    snapshot = await asyncio.to_thread(master.snapshot, topics=())
+    peers = snapshot.peers if snapshot is not None else ()
+    sites = {peer.name for peer in peers if peer.guid == OUTSIDE_GUID} - {ROS2}  # other sites that a gateway joins
 
     async def within(node: Node) -> None:
         await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
-    await with_node(master, _NODE, within)
+    await with_node(master, "rmpa_resource", within)
 
 
-def _sites(master: Master) -> frozenset[str]:
-    """The names of the other sites that a gateway joins, as the master's agent knows them."""
-    snapshot = master.snapshot(topics=())
-    peers = snapshot.peers if snapshot is not None else ()
-    return frozenset(peer.name for peer in peers if peer.guid == OUTSIDE_GUID) - {ROS2}
-
-
-async def find_resources(node: Node, graph: Graph, sites: frozenset[str] = frozenset()) -> tuple[SeenResource, ...]:
+async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) -> tuple[SeenResource, ...]:
     """All resources that publish a descriptor, this module's first.
 
     Args:
         node: This command's own node.
         graph: The master's graph.
-        sites: The names of other sites, whose modules are told apart.
+        sites: The names of other sites, whose modules are told apart: ``site/module``.
     """
     ending = f"/{TOPIC}"
-    topics = {
-        topic: set(nodes)
+    wanted = [
+        (topic, caller)
         for topic, nodes in graph.publishers.items()
-        if topic.endswith(ending) and graph.types.get(topic) == TEXT
-    }
+        for caller in nodes
+        if topic.endswith(ending) and graph.types.get(topic) == _TEXT
+    ]
     found = []
-    for (topic, caller), received in (await first_messages(node, topics, TEXT, _ANSWER)).items():
+    for (topic, caller), message in (await _first_messages(node, wanted, _TEXT)).items():
         try:
-            descriptor = Descriptor.parse(str(received.message.data))
+            descriptor = Descriptor.parse(str(message.data))
         except RmpaError:
             continue  # another program's topic of that name
-        found.append(SeenResource(topic.removesuffix(ending), _peer(caller, sites), caller, descriptor))
+        peer, name = proxied_node(caller) or (None, "")
+        if peer is not None and peer in sites:
+            peer = f"{peer}/{name.split('/')[1]}"
+        found.append(SeenResource(topic.removesuffix(ending), peer, caller, descriptor))
     return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
 
 
-def _peer(caller: str, sites: frozenset[str]) -> str | None:
-    """The peer whose node a proxy stands for; ``site/module`` if it is of another site."""
-    proxy = proxied_node(caller)
-    if proxy is None or proxy[0] not in sites:
-        return proxy[0] if proxy is not None else None
-    return f"{proxy[0]}/{proxy[1].split('/')[1]}"
-
-
-async def first_messages(
-    node: Node,
-    callers: Mapping[str, set[str]],
-    kind: str,
-    timeout: float,  # noqa: ASYNC109 - a time-out is no error here
-) -> dict[tuple[str, str], Received]:
+async def _first_messages(node: Node, wanted: Iterable[tuple[str, str]], kind: str) -> dict[tuple[str, str], Any]:
     """The first message of each publisher, by topic and publisher; without those that send none in time."""
-    found: dict[tuple[str, str], Received] = {}
-    missing = {(topic, caller) for topic, names in callers.items() for caller in names}
-    change = asyncio.Event()
+    found: dict[tuple[str, str], Any] = {}
+    missing = set(wanted)
+    topics = {topic for topic, _ in missing}
+    complete = asyncio.Event()
 
     def take(topic: str, received: Received) -> None:
         key = topic, received.caller_id
         if key in missing:
             missing.discard(key)
-            found[key] = received
+            found[key] = received.message
             if not missing:
-                change.set()
+                complete.set()
 
     type_ = MessageType(kind)
-    subscribers = [await node.subscribe(topic, type_, functools.partial(take, topic)) for topic in callers]
+    subscribers = [await node.subscribe(topic, type_, functools.partial(take, topic)) for topic in topics]
     try:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout):
-                while missing:
-                    await change.wait()
+            async with asyncio.timeout(_ANSWER):
+                if missing:
+                    await complete.wait()
     finally:
         for subscriber in subscribers:
             await subscriber.close()
     return found
 
 
-def decision_of(text: str) -> dict[str, Any]:
-    """Parse a resource's account of its last decision, a JSON object.
+def resource_verb(*parameters: Any) -> Callable[[Callable[..., Awaitable[None]]], click.Command]:
+    """A ``graph_verb`` about one resource: its function gets the graph, the resource, the options, and parameters."""
 
-    Raises:
-        RmpaError: It is none.
+    def decorate(function: Callable[..., Awaitable[None]]) -> click.Command:
+        @functools.wraps(function)
+        def command(resource: str | None, options: Options, **given: Any) -> None:
+            run_with_resources(options, lambda graph: function(graph, graph.pick(resource), options, **given))
+
+        return graph_verb(argument("resource", "resource", required=False), *parameters)(command)
+
+    return decorate
+
+
+@graph_verb()
+def resource_list(options: Options) -> None:
+    """List the resources of this module, and those of peers with the peers' names.
+
+    ---
+
+    Examples:
+      rmpa resource list
+      rmpa resource list --json | jq -r '.[].name'
     """
-    try:
-        found = msgspec.json.decode(text)
-    except msgspec.DecodeError as error:
-        raise RmpaError(f"it says something strange about its decision: {error}") from None
-    if not isinstance(found, dict):
-        raise RmpaError("it says something strange about its decision")
-    return found
+
+    async def body(graph: ResourceGraph) -> None:
+        for path, count in Counter(one.path for one in graph.seen).items():
+            if count > 1:
+                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
+                warn(f"{count} modules have a resource {path}: {text}")
+        states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
+        found: list[dict[str, Any]] = []
+        rows = []
+        for one in graph.seen:
+            said = one.descriptor
+            about = {"name": one.path, "peer": one.peer, "role": said.role, "physical": said.physical}
+            about |= {"description": said.description, "state": states.get(one)}
+            found.append(about | {"profile": profiles.get(one), "context": contexts.get(one)})
+            kind = "device" if said.physical else "simulated"
+            ends = [profiles.get(one) or "-", contexts.get(one) or "-", said.description]
+            rows.append([str(one), states.get(one) or "does not answer", said.role, kind, *ends])
+        colours = [_COLOURS.get(each["state"], "") for each in found]
+        options.show(found, Table("RESOURCE, STATE, ROLE, KIND, PROFILE, CONTEXT, DESCRIPTION", rows, colours))
+
+    run_with_resources(options, body)
 
 
-def known_name(what: str, text: str, known: Iterable[str]) -> str:
-    """Check that a resource has a profile or context of that name; return the name.
+def status_of(status: Any) -> dict[str, Any]:
+    """A ``DiagnosticStatus``, for JSON."""
+    return {
+        "level": DiagnosticLevel(int(status.level) & 3).name,
+        "message": str(status.message),
+        "values": {str(pair.key): str(pair.value) for pair in status.values},
+    }
+
+
+@graph_verb(flag("-a", "--all", "everything", help="Those that are well too."))
+def alarm_list(everything: bool, options: Options) -> None:
+    """List the resources that are not well at present, here and at peers.
+
+    WARN: adaptation, or a task that fails; ERROR: non-adaptable; STALE: an input that it needs has no publisher.
+
+    ---
+
+    Examples:
+      rmpa alarm list
+      rmpa alarm list --all
+    """
+
+    async def body(graph: ResourceGraph) -> None:
+        heard = await graph.hear(graph.seen, "quality", ARRAY_TYPE)
+        found = []
+        for one in graph.seen:
+            statuses = heard[one].status if one in heard else ()
+            health = status_of(statuses[0]) if statuses else _SILENT
+            if everything or health["level"] != "OK":
+                found.append((one, health))
+        rows = [(str(one), health["level"], health["message"]) for one, health in found]
+        table = Table("RESOURCE, LEVEL, MESSAGE", rows, [_COLOURS[health["level"]] for _, health in found])
+        options.show([{**one.named, **health} for one, health in found], table)
+
+    run_with_resources(options, body)
+
+
+@graph_verb(argument("resource", "resource", required=False), count_option("alarms"))
+def alarm_echo(resource: str | None, count: int | None, options: Options) -> None:
+    """Print alarms as they are raised and cleared, of all resources or of one RESOURCE, until Ctrl-C.
+
+    ---
+
+    Examples:
+      rmpa alarm echo                   of all resources, those to come included
+      rmpa alarm echo base:/sonar -n 1  wait for one
+      rmpa alarm echo --json | jq -r .message
+    """
+    master = options.master()
+    run_stream(lambda: _echo(master, resource, count, as_json=options.as_json))
+
+
+async def _echo(master: Master, resource: str | None, count: int | None, *, as_json: bool) -> None:
+    only: list[SeenResource] = []
+    if resource is not None:
+
+        async def pick(graph: ResourceGraph) -> None:
+            only.append(graph.pick(resource))
+
+        await with_resources(master, pick)
+    printed = 0
+    enough = asyncio.get_running_loop().create_future()
+
+    def take(path: str, received: Received) -> None:
+        nonlocal printed
+        if only and received.caller_id != only[0].caller:
+            return
+        for status in received.message.status:
+            if enough.done():
+                return
+            _print_alarm(path, received, status_of(status), as_json=as_json)
+            printed += 1
+            if printed == count:
+                enough.set_result(None)
+
+    async def look(node: Node) -> None:
+        """Subscribe to the alarms of all resources, those that start later included."""
+        known: set[str] = set()
+        warned = False
+        while not enough.done():
+            with contextlib.suppress(RmpaError):
+                graph = await read_graph(master)
+                for topic in graph.publishers.keys() - known:
+                    path = topic.removesuffix("/alarms")
+                    found = path != topic and graph.types.get(topic) == ARRAY_TYPE
+                    if found and f"{path}/{TOPIC}" in graph.publishers and (not only or path == only[0].path):
+                        known.add(topic)
+                        await node.subscribe(topic, MessageType(ARRAY_TYPE), functools.partial(take, path))
+            if not known and not warned:
+                warned = True
+                warn("there is no resource yet; waiting")
+            await asyncio.wait((enough,), timeout=_LOOK)
+
+    await with_node(master, "rmpa_alarm", look)
+
+
+def _print_alarm(path: str, received: Received, alarm: dict[str, Any], *, as_json: bool) -> None:
+    peer = proxied_peer(received.caller_id)
+    seconds = received.stamp_ns / 1e9
+    if as_json:
+        print_json({"resource": path, "peer": peer, "at": seconds, **alarm})
+        return
+    at, level = time.strftime("%H:%M:%S", time.localtime(seconds)), paint(alarm["level"], _COLOURS[alarm["level"]])
+    print_text(Painted(f"{at} {level} {printable(str(GraphName(path, peer)))}: {printable(alarm['message'])}"))
+    for key, value in alarm["values"].items():
+        if value.startswith("wanted "):
+            print_text(f"    {key}: {value}")
+
+
+def known_name(what: str, text: str, known: Iterable[str]) -> None:
+    """Check that a resource has a profile or context of that name.
 
     Raises:
         ConfigError: It has none.
@@ -381,57 +400,3 @@ def known_name(what: str, text: str, known: Iterable[str]) -> str:
         near = did_you_mean(text, names)
         remedy = f"did you mean {printable(near)}?" if near else f"there are {printable(', '.join(names)) or 'none'}"
         raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)
-    return text
-
-
-# ``rmpa resource list``: the resources of the graph.
-
-
-_COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
-_TITLES: Final = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
-_EXAMPLES: Final = """\
-\b
-Examples:
-  rmpa resource list
-  rmpa resource list --json | jq -r '.[].name'
-"""
-
-
-@click.command("list", epilog=_EXAMPLES)
-@graph_options
-def list_(options: GraphOptions) -> None:
-    """List the resources of this module, and those of peers with the peers' names."""
-
-    async def body(graph: ResourceGraph) -> None:
-        for path, count in Counter(one.path for one in graph.seen).items():
-            if count > 1:
-                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
-                warn(f"{count} modules have a resource {path}: {text}")
-        states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
-        found: list[dict[str, Any]] = [
-            {
-                "name": one.path,
-                "peer": one.peer,
-                "role": one.descriptor.role,
-                "physical": one.descriptor.physical,
-                "description": one.descriptor.description,
-                "state": states.get(one),
-                "profile": profiles.get(one),
-                "context": contexts.get(one),
-            }
-            for one in graph.seen
-        ]
-        if options.as_json:
-            print_json(found)
-        else:
-            rows = [_row(str(one), each) for one, each in zip(graph.seen, found, strict=True)]
-            colours = [_COLOURS.get(each["state"], "") for each in found]
-            print_table(tuple(map(Column, _TITLES)), rows, colours=colours)
-
-    run_with_resources(options, body)
-
-
-def _row(name: str, each: dict[str, Any]) -> list[str]:
-    kind = "device" if each["physical"] else "simulated"
-    ends = [each["profile"] or "-", each["context"] or "-", each["description"]]
-    return [name, each["state"] or "does not answer", each["role"], kind, *ends]

@@ -1,7 +1,4 @@
-"""``rmpa run`` runs the Smart Resources of a Python file; ``rmpa context`` switches their contexts.
-
-``rmpa run``: runs the Smart Resources of a Python file, with the agent of their module.
-"""
+"""``rmpa run``: runs the Smart Resources of a Python file, with the agent of their module."""
 
 from __future__ import annotations
 
@@ -17,23 +14,20 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
 
-from rmpa.cli.options import GraphOptions, completes, graph_options
-from rmpa.cli.output import Column, print_error, print_json, print_table, printable
-from rmpa.cli.profile import ManualChoice, resource_json
-from rmpa.cli.resource import run_with_resources
+from rmpa.cli.options import argument, flag, verb
+from rmpa.cli.output import print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
     from types import FrameType, TracebackType
 
-    from rmpa.cli.resource import ResourceGraph, SeenResource
     from rmpa.resource.declare import Parameter
     from rmpa.resource.resource import Resource
 
@@ -45,39 +39,33 @@ _ENDS: Final = 10.0
 _THREADS: Final = 1.0
 """Seconds that a user's function may go on after its resource has ended."""
 _PR_SET_PDEATHSIG: Final = 1
-EPILOG = """\
-\b
-The file declares one or more rmpa.resource.Resource; see docs/tutorials/resources.md.
-Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that name
-that runs already is used, and stays; else one is started with the options behind --, and ends with the resources.
-
-\b
-Examples:
-  rmpa run sonar.py                            with an agent of its own, named sonar
-  rmpa run sonar.py --name nose -- --interface wlan0 --realtime
-  rmpa run sonar.py --name base                on the agent base, if that runs
-  rmpa run sonar.py --set cone=0.2             with another value of a parameter
-  rmpa run sonar.py --master http://127.0.0.1:11311    on any ROS core, without an agent
-"""
 
 
-@click.command(epilog=EPILOG, context_settings={"ignore_unknown_options": False})
-@click.argument("file", type=click.Path(exists=True, dir_okay=False))
-@click.option("--name", metavar="NAME", help="The module's name. [default: as rmpa up, else the first resource's]")
-@click.option("--master", metavar="URI", help="Run on this ROS core; no agent is started.")
-@click.option(
-    "--set", "given", metavar="[RESOURCE.]PARAMETER=VALUE", multiple=True, help="Start with this value; repeatable."
+@verb(
+    argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path)),
+    click.option(
+        "--name", metavar="NAME", help="The module's name. [default: as rmpa up, else the first resource's]"
+    ),
+    click.option("--master", metavar="URI", help="Run on this ROS core; no agent is started."),
+    click.option(
+        "--set",
+        "given",
+        metavar="[RESOURCE.]PARAMETER=VALUE",
+        multiple=True,
+        help="Start with this value; repeatable.",
+    ),
+    click.option(
+        "--state",
+        metavar="DIR",
+        help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
+    ),
+    flag("--no-state", help="The resources store nothing; for an empty core add -- --keep never."),
+    click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"])),
+    argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]"),
+    context_settings={"ignore_unknown_options": False},
 )
-@click.option(
-    "--state",
-    metavar="DIR",
-    help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
-)
-@click.option("--no-state", is_flag=True, help="The resources store nothing; for an empty core add -- --keep never.")
-@click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
-@click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
 def run(
-    file: str,
+    file: Path,
     name: str | None,
     master: str | None,
     given: tuple[str, ...],
@@ -86,16 +74,27 @@ def run(
     log_level: str,
     options: tuple[str, ...],
 ) -> int:
-    """Run the Smart Resources of FILE as nodes of this module's own core."""
-    from pathlib import Path
+    """Run the Smart Resources of FILE as nodes of this module's own core.
 
+    ---
+    The file declares one or more rmpa.resource.Resource; see docs/tutorials/resources.md.
+    Without --name and --master the module is named as for rmpa up, or else as its first resource. An agent of that
+    name that runs already is used, and stays; else one is started with the options behind --, and ends with the
+    resources.
+
+    Examples:
+      rmpa run sonar.py                            with an agent of its own, named sonar
+      rmpa run sonar.py --name nose -- --interface wlan0 --realtime
+      rmpa run sonar.py --name base                on the agent base, if that runs
+      rmpa run sonar.py --set cone=0.2             with another value of a parameter
+      rmpa run sonar.py --master http://127.0.0.1:11311    on any ROS core, without an agent
+    """
     from rmpa.core.counters import configure_logging
 
     gc.disable()  # imports leave no garbage; collection is on again when the resources are active
     configure_logging(log_level, sys.stderr, as_json=False)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
-    path = Path(file)
 
     def state_of(module: str) -> Path | None:
         return None if no_state else _state_dir(module, state)
@@ -103,13 +102,13 @@ def run(
     if master is not None:
         if options:
             raise ConfigError("--", "options of an agent, but --master starts none", "leave one of them out")
-        resources = prepared(path, given)
+        resources = prepared(file, given)
         return asyncio.run(_run(resources, master, None, state_of(name or resources[0].name)))
     module = name or _module_name(options)
-    resources = prepared(path, given) if not module else []
+    resources = prepared(file, given) if not module else []
     with ModuleAgent(module or resources[0].name, options) as agent:
         if not resources:  # the agent starts meanwhile
-            resources = prepared(path, given)
+            resources = prepared(file, given)
         return asyncio.run(_run(resources, agent.core(), agent, state_of(agent.name)))
 
 
@@ -414,59 +413,3 @@ def _leave(code: int) -> NoReturn:
 def _interrupt(number: int, _frame: FrameType | None) -> NoReturn:
     """Handle a signal before there is a loop: unwind as at Ctrl-C, which ends a child agent."""
     raise KeyboardInterrupt(number)
-
-
-# ``rmpa context list|get|set``.
-
-
-@click.command("list", epilog="\b\nExamples:\n  rmpa context list\n  rmpa context list base:/sonar --json\n")
-@click.argument("resource", required=False, shell_complete=completes("resource"))
-@graph_options
-def list_(resource: str | None, options: GraphOptions) -> None:
-    """List a RESOURCE's contexts, their rules and what they require."""
-
-    async def body(graph: ResourceGraph) -> None:
-        one = graph.pick(resource)
-        present = await _present(graph, one)
-        contexts = one.descriptor.contexts
-        if options.as_json:
-            print_json({**resource_json(one), **present, "contexts": contexts})
-            return
-        columns = tuple(map(Column, ("CONTEXT", "NOW", "WHEN", "REQUIRES", "PROFILES", "OUTPUTS")))
-        rows = [
-            (
-                each.name,
-                _mark(each.name, **present),
-                each.when or "by hand",
-                ", ".join(f"{key} {bound}" for key, bound in each.requires.items()) or "-",
-                ", ".join(each.profiles) or "any",
-                ", ".join(each.outputs) or "none" if each.outputs is not None else "all",
-            )
-            for each in contexts
-        ]
-        print_table(columns, rows)
-
-    run_with_resources(options, body)
-
-
-def _mark(name: str, context: str, chosen: str) -> str:
-    if name != context:
-        return ""
-    return "by hand" if name == chosen else "yes"
-
-
-async def _present(graph: ResourceGraph, one: SeenResource) -> dict[str, str]:
-    """The present context, and the one chosen by hand."""
-    if not one.descriptor.contexts:
-        return {"context": "", "chosen": ""}
-    (said,), values = await asyncio.gather(graph.texts([one], "context"), graph.configuration(one))
-    if one not in said:
-        raise RmpaError(f"{one} does not say its context; does it run?")
-    return {"context": said[one], "chosen": str(values.get("context", ""))}
-
-
-_CHOICE = ManualChoice("context", lambda descriptor: (each.name for each in descriptor.contexts), _present)
-get = _CHOICE.get_command("Print the present context of a RESOURCE; an empty line for none.")
-set_ = _CHOICE.set_command(
-    "Choose the CONTEXT of a RESOURCE by hand; returns when it is there.", "Let the rules decide again.", "docked"
-)

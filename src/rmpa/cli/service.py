@@ -1,7 +1,4 @@
-"""``rmpa service``: lists services, shows one, and calls it.
-
-``rmpa service call``: one call, with a request in YAML or JSON.
-"""
+"""``rmpa service``: lists services, shows one and what of it crosses the mesh, and calls it."""
 
 from __future__ import annotations
 
@@ -12,54 +9,38 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
 from rmpa.cli.messages import fill_stamps, read_values, to_text
 from rmpa.cli.options import (
     FiniteRange,
-    GraphOptions,
+    Options,
     Selection,
-    completes,
-    graph_options,
+    argument,
+    flag,
+    graph_verb,
     selection_options,
     summary,
 )
-from rmpa.cli.output import (
-    Column,
-    duration,
-    origin_json,
-    origin_text,
-    peers_of,
-    print_json,
-    print_line,
-    print_names,
-    print_table,
-    printable,
-    read_graph,
-    read_name,
-    read_namespace,
-    require_peer,
-    warn,
-)
+from rmpa.cli.output import Table, duration, print_json, printable, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Sequence
 
-    from rmpa.cli.output import Graph, GraphName, Master
+    from rmpa.cli.graph import Graph, GraphName, Master
+    from rmpa.cli.output import Text
     from rmpa.observe.snapshot import ServiceInfo
-    from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.types.messages import MessageType, Plain
+    from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
-
-# Finds the server of a service at the master, and asks it for the service's type.
-
-
-CALLER_ID: Final = "/rmpa_service"
+_CALLER_ID: Final = "/rmpa_service"
 _AT_ONCE: Final = 16
 """Servers that are asked at the same time."""
+_LOOK: Final = 0.1
+"""Seconds between two questions to the master whether the service is there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +57,18 @@ class Probed:
     description: ServiceDescription | None = None
     problem: str = ""
 
+    def told(self, name: str) -> ServiceDescription:
+        """What the server says.
 
-async def lookup(master: Master, name: str) -> str:
+        Raises:
+            RmpaError: It does not answer.
+        """
+        if self.description is None:
+            raise RmpaError(f"{name} does not say what it is: {self.problem}")
+        return self.description
+
+
+async def _lookup(master: Master, name: str) -> str:
     """The address of a service's server, ``rosrpc://host:port``.
 
     Raises:
@@ -85,7 +76,7 @@ async def lookup(master: Master, name: str) -> str:
         RmpaError: It knows no such service.
     """
     try:
-        reply = await call_api(master.uri, "lookupService", CALLER_ID, name)
+        reply = await call_api(master.uri, "lookupService", _CALLER_ID, name)
     except UnreachableError:
         raise master.unreachable() from None
     if reply.code != 1:
@@ -93,83 +84,49 @@ async def lookup(master: Master, name: str) -> str:
     return str(reply.value)
 
 
-async def probe(master: Master, name: str) -> Probed:
-    """Ask a service's server for its type; an error of the server is in the answer.
+def probe(master: Master, names: Iterable[str]) -> dict[str, Probed]:
+    """Ask the servers of services for their types, several at once; an error of a server is in its answer.
 
     Raises:
         UnreachableError: The master does not answer.
     """
     from rmpa.ros.node.endpoints import probe as ask
 
-    uri = ""
-    try:
-        uri = await lookup(master, name)
-        return Probed(uri, (await ask(uri, name, CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)).description)
-    except RmpaError as error:
-        return Probed(uri, None, str(error))
-
-
-async def probe_all(master: Master, names: Iterable[str]) -> dict[str, Probed]:
-    """Ask the servers of several services at once."""
-    turns = asyncio.Semaphore(_AT_ONCE)
-
-    async def one(name: str) -> tuple[str, Probed]:
+    async def one(name: str) -> Probed:
+        uri = ""
         async with turns:
-            return name, await probe(master, name)
+            try:
+                uri = await _lookup(master, name)
+                return Probed(uri, (await ask(uri, name, _CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)).description)
+            except RmpaError as error:
+                return Probed(uri, None, str(error))
 
-    return dict(await asyncio.gather(*map(one, names)))
+    async def each() -> dict[str, Probed]:
+        wanted = list(names)
+        return dict(zip(wanted, await asyncio.gather(*map(one, wanted)), strict=True))
 
-
-def known_type(description: ServiceDescription) -> ServiceType:
-    """The definition of the type that a server names, from this machine's packages or from rmpa's own.
-
-    Raises:
-        DefinitionError: It is not known here, or only in another version.
-    """
-    return find_service_type(description.type, description.md5sum)
-
-
-# What the agent knows of the services that cross the mesh, as ``rmpa service`` shows it.
+    turns = asyncio.Semaphore(_AT_ONCE)
+    return asyncio.run(each())
 
 
-def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
-    """What the master's agent knows of a service, at all peers or the named one; empty without an agent."""
-    snapshot = master.snapshot(topics=(), services=(wanted.name,), peers=False)
-    return tuple(
-        info
-        for info in (snapshot.services if snapshot is not None else ())
-        if info.name == wanted.name and wanted.peer in (None, info.peer)
-    )
+def _of_agent(master: Master, services: tuple[str, ...] | bool) -> Sequence[ServiceInfo]:
+    """What the master's agent knows of services that cross the mesh; empty without an agent."""
+    snapshot = master.snapshot(topics=(), services=services, peers=False)
+    return snapshot.services if snapshot is not None else ()
 
 
-def transports(master: Master) -> dict[str, ServiceInfo]:
-    """The peers' services in the master's graph, by name; empty without an agent."""
-    snapshot = master.snapshot(topics=(), services=True, peers=False)
-    return {info.name: info for info in (snapshot.services if snapshot is not None else ()) if info.transport}
-
-
-def transport_json(info: ServiceInfo | None) -> dict[str, str]:
-    """The transport of a peer's service, and the condition by which it is relayed; empty for others."""
-    if info is None:
-        return {}
-    return {"transport": info.transport} | ({"condition": info.condition} if info.condition else {})
-
-
-def transport_text(info: ServiceInfo | None) -> str:
+def _transport_text(info: ServiceInfo | None) -> str:
     """The transport of a peer's service in a few words; empty for others."""
-    if info is None:
-        return ""
-    if info.transport == "direct":
-        return "direct"
+    if info is None or info.transport == "direct":
+        return "direct" if info is not None else ""
     return f"relayed ({info.condition})" if info.condition and info.wanted != "relay" else "relayed"
 
 
-def print_crossing(infos: tuple[ServiceInfo, ...]) -> None:
-    """Print whether a service may cross, each peer that offers it, and how its calls went."""
+def _crossing(infos: Sequence[ServiceInfo]) -> Iterator[str]:
+    """Whether a service may cross, each peer that offers it, and how its calls went."""
     for info in infos:
-        print_line(f" * {_headline(info)}")
-        for label, text in _facts(info):
-            print_line(f"     {label:<10} {text}")
+        yield f" * {_headline(info)}"
+        yield from (f"     {label:<10} {text}" for label, text in _facts(info))
         if info.problem:
             warn(f"{info.peer or info.node}: {info.problem}")
 
@@ -183,102 +140,242 @@ def _headline(info: ServiceInfo) -> str:
     return f"from {info.peer}: {info.node}{over_there}, {state}"
 
 
-def _transport(info: ServiceInfo) -> list[tuple[str, str]]:
+def _facts(info: ServiceInfo) -> Iterator[tuple[str, str]]:
     if info.direct_callers:
-        return [("transport", f"direct for {', '.join(info.direct_callers)}")]
-    if info.transport == "direct":
-        return [("transport", f"direct, at {info.address}, {info.lookups} lookups answered so")]
-    if info.transport and info.wanted != "relay":
+        yield "transport", f"direct for {', '.join(info.direct_callers)}"
+    elif info.transport == "direct":
+        yield "transport", f"direct, at {info.address}, {info.lookups} lookups answered so"
+    elif info.transport and info.wanted != "relay":
         why = f" ({info.condition}): {info.relayed_because}" if info.condition else "; its module is being asked"
-        return [("transport", f"relayed{why}")]
-    return []
-
-
-def _facts(info: ServiceInfo) -> list[tuple[str, str]]:
-    facts = _transport(info)
+        yield "transport", f"relayed{why}"
     if info.calls or info.active:
         under_way = f", {info.active} under way" if info.active else ""
-        facts.append(("calls", f"{info.calls}, {info.failed} failed{under_way}"))
-    if info.latency is not None:
-        spread = info.latency
-        label = "latency" if info.direction == "in" else "server"
-        facts.append((label, f"p50 {duration(spread.p50)}, p99 {duration(spread.p99)}, max {duration(spread.max)}"))
-    return facts
+        yield "calls", f"{info.calls}, {info.failed} failed{under_way}"
+    if (spread := info.latency) is not None:
+        text = f"p50 {duration(spread.p50)}, p99 {duration(spread.p99)}, max {duration(spread.max)}"
+        yield ("latency" if info.direction == "in" else "server"), text
 
 
-_LOOK: Final = 0.1
-"""Seconds between two questions to the master whether the service is there."""
+def _json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, object]:
+    about: dict[str, object] = {"name": name, **origin_json(graph.server(name))}
+    if found is not None:
+        said = found.description
+        about |= {"uri": found.uri or None, "type": said and said.type, "md5": said and said.md5sum}
+        if found.problem:
+            about["problem"] = found.problem
+    return about
 
 
-@click.command(
+@graph_verb(
+    argument("namespace", "service", default=""),
+    flag("-v", "--verbose", help="Types and nodes too; each server is asked."),
+    selection_options,
+)
+def service_list(namespace: str, verbose: bool, selection: Selection, options: Options) -> None:
+    """List services, all or those of a NAMESPACE.
+
+    A service that a peer offers has its name behind it: /add  [base]. With -v or --json it has its transport, too.
+
+    ---
+
+    Examples:
+      rmpa service list
+      rmpa service list -v /arm
+      rmpa service list base:/
+    """
+    wanted = read_name(namespace or "/", "service")
+    master, graph = options.graph()
+    require_peer(master, graph, wanted)
+    peers = {name: peers_of(nodes) for name, nodes in sorted(graph.services.items())}
+    every = [name for name, of in peers.items() if wanted.contains(name, of) and selection.wants(name, of)]
+    shown = every
+    if not options.as_json and selection.is_long(every):
+        shown = sorted(every, key=lambda name: (bool(peers[name]), name))[: selection.lines]
+    found = probe(master, shown) if verbose else {}
+    mesh = {}
+    if verbose or options.as_json:
+        mesh = {info.name: info for info in _of_agent(master, services=True) if info.transport}
+
+    def text() -> Iterator[Text]:
+        if shown is not every:
+            yield summary(len(every), "services", ("remote" if peers[n] else "of this module" for n in every))
+            yield ""
+        if verbose:
+            titles = "SERVICE, TYPE, NODE, TRANSPORT" if mesh else "SERVICE, TYPE, NODE"
+            yield Table(titles, [row(name)[: titles.count(",") + 1] for name in shown])
+        else:
+            yield from marked(shown, graph.services)
+        yield selection.rest(every, "services", "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'")
+
+    def row(name: str) -> list[str]:
+        said, node = found[name].description, graph.server(name)
+        kind = said.type if said is not None else "does not answer"
+        return [name, kind, origin_text(node or "unknown"), _transport_text(mesh.get(name))]
+
+    def value(name: str) -> dict[str, object]:
+        about, info = _json(graph, name, found.get(name)), mesh.get(name)
+        if info is not None:
+            about["transport"] = info.transport
+            if info.condition:
+                about["condition"] = info.condition
+        return about
+
+    options.show([value(name) for name in shown] if options.as_json else None, text())
+
+
+def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
+    """The service that a user names, the master, and its graph; where another module serves it, that is told."""
+    wanted = read_name(text, "service")
+    master, graph = options.graph()
+    if wanted.name not in graph.services:
+        require_peer(master, graph, wanted)
+    return wanted, master, graph
+
+
+@graph_verb(argument("service", "service"))
+def service_info(service: str, options: Options) -> None:
+    """Show a service's node, address, type and arguments, and what of it crosses.
+
+    ---
+
+    Examples:
+      rmpa service info /add_two_ints
+      rmpa service info base:/arm/enable --json
+    """
+    wanted, master, graph = _find(service, options)
+    infos = _of_agent(master, (wanted.name,))
+    mesh = [info for info in infos if info.name == wanted.name and wanted.peer in (None, info.peer)]
+    if mesh and all(each.hidden for each in mesh):
+        # It is not in the graph because it is hidden: the lines say why.
+        options.show({"name": wanted.name, "mesh": mesh}, _crossing(mesh))
+        return
+    graph.require_service(wanted)
+    found = probe(master, (wanted.name,))[wanted.name]
+    halves: dict[str, MessageType] = {}
+    unknown = ""
+    if found.description is not None:
+        try:
+            kind = find_service_type(found.description.type, found.description.md5sum)
+            halves = {"request": kind.request, "response": kind.response}
+        except RmpaError as error:
+            unknown = str(error)
+    names = {
+        half: [field.name for field in halves[half].fields] if halves else None for half in ("request", "response")
+    }
+
+    def text() -> Iterator[Text]:
+        yield f"Node: {origin_text(graph.server(wanted.name) or 'unknown')}"
+        yield f"URI: {found.uri}"
+        if said := found.description:
+            yield f"Type: {said.type}"
+            yield f"MD5: {said.md5sum}"
+            if unknown:
+                warn(unknown)
+            else:
+                yield f"Args: {' '.join(names['request'] or ())}"
+            for title, half in halves.items():
+                yield f"{title.title()}:" + ("" if half.fields else " nothing")
+                yield from (f"  {field} {field.name}" for field in half.fields)
+        if mesh:
+            yield from ("", "Mesh:", *_crossing(mesh))
+        found.told(wanted.name)
+
+    options.show(_json(graph, wanted.name, found) | names | {"mesh": mesh}, text())
+
+
+@graph_verb(argument("service", "service"))
+def service_type(service: str, options: Options) -> None:
+    """Print a service's type.
+
+    ---
+
+    Examples:
+      rmpa service type /add_two_ints
+    """
+    wanted, master, graph = _find(service, options)
+    graph.require_service(wanted)
+    said = probe(master, (wanted.name,))[wanted.name].told(wanted.name)
+    options.show({"name": wanted.name, "type": said.type, "md5": said.md5sum}, said.type)
+
+
+@graph_verb(argument("kind", metavar="TYPE"))
+def service_find(kind: str, options: Options) -> None:
+    """Print the services of a TYPE; each server is asked, and one that does not answer is named on stderr.
+
+    ---
+
+    Examples:
+      rmpa service find std_srvs/Trigger
+    """
+    master, graph = options.graph()
+    found = []
+    for name, each in probe(master, sorted(graph.services)).items():
+        if each.description is None:
+            warn(f"{name}: {each.problem}")
+        elif each.description.type == kind:
+            found.append(name)
+    options.show(found, marked(found, graph.services))
+
+
+@graph_verb(
+    argument("service", "service"),
+    argument("values", nargs=-1),
+    flag("-w", "--wait", help="Wait until the service is there, for as long as --timeout says."),
+    click.option(
+        "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
+    ),
     context_settings={"ignore_unknown_options": True},
-    epilog="""\
-\b
-The request is one YAML value, or one for each field in order; what is not given is 0, empty or false.
-Its type is the server's; its definition comes with rmpa, or from this machine's ROS packages (PYTHONPATH,
-ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH).
-
-\b
-Examples:
-  rmpa service call /add_two_ints 20 22
-  rmpa service call /arm/enable '{data: true}'
-  rmpa service call base:/plan '{start: {header: auto}}' --timeout 120
-  rmpa service call /map_server/static_map --wait --json | jq .response.map.info
-""",
 )
-@click.argument("service", shell_complete=completes("service"))
-@click.argument("values", nargs=-1)
-@click.option("-w", "--wait", is_flag=True, help="Wait until the service is there, for as long as --timeout says.")
-@click.option(
-    "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
-)
-@graph_options
-def call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: GraphOptions) -> None:
+def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: Options) -> None:
     """Call a SERVICE with VALUES, in YAML or JSON, and print its response.
 
     An error of the server goes to stderr in its own words, and the exit code is 1.
+
+    ---
+    The request is one YAML value, or one for each field in order; what is not given is 0, empty or false.
+    Its type is the server's; its definition comes with rmpa, or from this machine's ROS packages (PYTHONPATH,
+    ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH).
+
+    Examples:
+      rmpa service call /add_two_ints 20 22
+      rmpa service call /arm/enable '{data: true}'
+      rmpa service call base:/plan '{start: {header: auto}}' --timeout 120
+      rmpa service call /map_server/static_map --wait --json | jq .response.map.info
     """
+    from rmpa.ros.node.service_client import ServiceConnection
+
     wanted = read_name(service, "service")
     plain = read_values(values)
     master = options.master()
+
+    async def ask() -> None:
+        if wait:
+            await _wait(master, wanted, timeout)
+        graph = await read_graph(master)
+        require_peer(master, graph, wanted)
+        graph.require_service(wanted)
+        uri = await _lookup(master, wanted.name)
+        connection = await ServiceConnection.open(uri, wanted.name, _CALLER_ID, timeout=timeout)
+        try:
+            kind = find_service_type(connection.description.type, connection.description.md5sum)
+            request = kind.request.serialize(kind.request.make(fill_stamps(plain, time.time_ns())))
+            ok, body = await connection.call(request, timeout)
+        finally:
+            connection.close()
+        if not ok:
+            text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
+            raise PeerRefused(f"service {wanted.name}", text)
+        response = kind.response.to_plain(kind.response.deserialize(body))
+        if options.as_json:
+            print_json({"service": wanted.name, "response": response, "took": time.monotonic() - began})
+        elif response:
+            click.echo(to_text(response))
+
     began = time.monotonic()
-    response = asyncio.run(_call(master, wanted, plain, timeout, wait=wait))
-    if options.as_json:
-        print_json({"service": wanted.name, "response": response, "took": time.monotonic() - began})
-    elif response:
-        click.echo(to_text(response))
+    asyncio.run(ask())
 
 
-async def _call(
-    master: Master,
-    wanted: GraphName,
-    plain: Plain,
-    timeout: float,  # noqa: ASYNC109 - the user's
-    *,
-    wait: bool,
-) -> dict[str, Plain]:
-    from rmpa.ros.node.service_client import ServiceConnection
-
-    if wait:
-        await _wait(master, wanted, timeout)
-    graph = await read_graph(master)
-    require_peer(master, graph, wanted)
-    graph.require_service(wanted)
-    uri = await lookup(master, wanted.name)
-    connection = await ServiceConnection.open(uri, wanted.name, CALLER_ID, timeout=timeout)
-    try:
-        kind = known_type(connection.description)
-        request = kind.request.serialize(kind.request.make(fill_stamps(plain, time.time_ns())))
-        ok, body = await connection.call(request, timeout)
-    finally:
-        connection.close()
-    if not ok:
-        text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
-        raise PeerRefused(f"service {wanted.name}", text)
-    return kind.response.to_plain(kind.response.deserialize(body))
-
-
-async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # noqa: ASYNC109 - likewise
+async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # noqa: ASYNC109 - the user's
     """Wait until a service is registered, by the peer if one is named.
 
     Raises:
@@ -298,172 +395,3 @@ async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # n
     except TimeoutError:
         remedy = str(last) if last is not None else ""
         raise UnreachableError(f"service {wanted}", f"{master.uri} within {timeout:g} s", remedy) from None
-
-
-# ``rmpa service list|info|type|find``: the services of the graph.
-
-
-def _node(graph: Graph, name: str, unknown: str = "") -> str:
-    """The node that serves a service."""
-    return next(iter(graph.services.get(name, ())), unknown)
-
-
-def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, object]:
-    about: dict[str, object] = {"name": name, **origin_json(_node(graph, name))}
-    if found is not None:
-        said = found.description
-        about |= {"uri": found.uri or None, "type": said and said.type, "md5": said and said.md5sum}
-        if found.problem:
-            about["problem"] = found.problem
-    return about
-
-
-@click.command(
-    "list", epilog="\b\nExamples:\n  rmpa service list\n  rmpa service list -v /arm\n  rmpa service list base:/\n"
-)
-@click.argument("namespace", default="", shell_complete=completes("service"))
-@click.option("-v", "--verbose", is_flag=True, help="Types and nodes too; each server is asked.")
-@selection_options
-@graph_options
-def list_(namespace: str, verbose: bool, selection: Selection, options: GraphOptions) -> None:
-    """List services, all or those of a NAMESPACE.
-
-    A service that a peer offers has its name behind it: /add  [base]. With -v or --json it has its transport, too.
-    """
-    master, graph = options.graph()
-    wanted = read_namespace(namespace, "service")
-    require_peer(master, graph, wanted)
-    names = [name for name in sorted(graph.services) if wanted.contains(name, peers_of(graph.services[name]))]
-    names = every = selection.with_peers(names, lambda name: peers_of(graph.services[name]))
-    if not options.as_json and selection.is_long(names):
-        names.sort(key=lambda name: (bool(peers_of(graph.services[name])), name))
-        owners = ("remote" if peers_of(graph.services[name]) else "of this module" for name in names)
-        click.echo(summary(len(names), "services", owners) + "\n")
-        names = [*selection.shown(names)]
-    found = asyncio.run(probe_all(master, names)) if verbose else {}
-    if options.as_json:
-        mesh = transports(master)
-        print_json([_service_json(graph, name, found.get(name)) | transport_json(mesh.get(name)) for name in names])
-    elif verbose:
-        mesh = transports(master)
-        rows = [
-            (name, _type_of(found[name]), origin_text(_node(graph, name, "unknown")), transport_text(mesh.get(name)))
-            for name in names
-        ]
-        columns = (Column("SERVICE"), Column("TYPE"), Column("NODE"), Column("TRANSPORT"))
-        shown = len(columns) if mesh else len(columns) - 1
-        print_table(columns[:shown], [row[:shown] for row in rows])
-    else:
-        print_names(names, graph.services)
-    if not options.as_json:
-        selection.print_rest(every, "services", "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'")
-
-
-def _type_of(found: Probed) -> str:
-    return found.description.type if found.description is not None else "does not answer"
-
-
-@click.command(
-    epilog="\b\nExamples:\n  rmpa service info /add_two_ints\n  rmpa service info base:/arm/enable --json\n"
-)
-@click.argument("service", shell_complete=completes("service"))
-@graph_options
-def info(service: str, options: GraphOptions) -> None:
-    """Show a service's node, address, type and arguments, and what of it crosses."""
-    wanted = read_name(service, "service")
-    master, graph = options.graph()
-    _require_peer(master, graph, wanted)
-    mesh = crossing(master, wanted)
-    if any(each.hidden for each in mesh) and all(each.hidden for each in mesh):
-        # It is not in the graph because it is hidden: the lines say why.
-        if options.as_json:
-            print_json({"name": wanted.name, "mesh": mesh})
-        else:
-            print_crossing(mesh)
-        return
-    graph.require_service(wanted)
-    found = asyncio.run(probe(master, wanted.name))
-    request, response, unknown = _halves(found)
-    if options.as_json:
-        about = _service_json(graph, wanted.name, found)
-        about |= {"request": request and _fields(request), "response": response and _fields(response)}
-        print_json(about | {"mesh": mesh})
-        return
-    print_line(f"Node: {origin_text(_node(graph, wanted.name, 'unknown'))}")
-    print_line(f"URI: {found.uri}")
-    if found.description is None:
-        _print_mesh(mesh)
-        raise RmpaError(f"{wanted.name} does not say what it is: {found.problem}")
-    print_line(f"Type: {found.description.type}")
-    print_line(f"MD5: {found.description.md5sum}")
-    if request is None or response is None:
-        warn(unknown)
-    else:
-        print_line(f"Args: {' '.join(_fields(request))}")
-        for title, half in (("Request", request), ("Response", response)):
-            print_line(f"{title}:" + ("" if half.fields else " nothing"))
-            for field in half.fields:
-                print_line(f"  {field} {field.name}")
-    _print_mesh(mesh)
-
-
-def _require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
-    """Check that the peer is known; where another module serves the name, that is told instead."""
-    if wanted.name not in graph.services:
-        require_peer(master, graph, wanted)
-
-
-def _print_mesh(mesh: tuple[ServiceInfo, ...]) -> None:
-    if mesh:
-        click.echo("\nMesh:")
-        print_crossing(mesh)
-
-
-def _halves(found: Probed) -> tuple[MessageType | None, MessageType | None, str]:
-    """The types of request and response, or the reason why they are not known here."""
-    if found.description is None:
-        return None, None, found.problem
-    try:
-        kind = known_type(found.description)
-    except RmpaError as error:
-        return None, None, str(error)
-    return kind.request, kind.response, ""
-
-
-def _fields(half: MessageType) -> list[str]:
-    return [field.name for field in half.fields]
-
-
-@click.command("type", epilog="\b\nExamples:\n  rmpa service type /add_two_ints\n")
-@click.argument("service", shell_complete=completes("service"))
-@graph_options
-def type_(service: str, options: GraphOptions) -> None:
-    """Print a service's type."""
-    wanted = read_name(service, "service")
-    master, graph = options.graph()
-    _require_peer(master, graph, wanted)
-    graph.require_service(wanted)
-    found = asyncio.run(probe(master, wanted.name))
-    if found.description is None:
-        raise RmpaError(f"{wanted.name} does not say what it is: {found.problem}")
-    if options.as_json:
-        print_json({"name": wanted.name, "type": found.description.type, "md5": found.description.md5sum})
-    else:
-        print_line(found.description.type)
-
-
-@click.command(epilog="\b\nExamples:\n  rmpa service find std_srvs/Trigger\n")
-@click.argument("kind", metavar="TYPE")
-@graph_options
-def find(kind: str, options: GraphOptions) -> None:
-    """Print the services of a TYPE; each server is asked, and one that does not answer is named on stderr."""
-    master, graph = options.graph()
-    probed = asyncio.run(probe_all(master, sorted(graph.services)))
-    found = [name for name, each in probed.items() if each.description is not None and each.description.type == kind]
-    for name, each in probed.items():
-        if each.description is None:
-            warn(f"{name}: {each.problem}")
-    if options.as_json:
-        print_json(found)
-    else:
-        print_names(found, graph.services)

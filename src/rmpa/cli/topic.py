@@ -1,74 +1,52 @@
-"""``rmpa topic``: lists topics, and shows one with what of it crosses.
-
-``rmpa topic list|info|type|find``: the topics of the graph.
-"""
+"""``rmpa topic list|info|type|find``: the topics of the graph; ``hz|bw|delay``: figures, as rostopic has them."""
 
 from __future__ import annotations
 
+import asyncio
+import math
+import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.options import GraphOptions, Selection, completes, graph_options, selection_options, summary
-from rmpa.cli.output import (
-    duration,
+from rmpa.cli.graph import (
+    Enough,
+    marked,
     origin_json,
     origin_text,
     peers_mark,
     peers_of,
-    print_json,
-    print_line,
-    print_names,
-    printable,
     read_name,
-    read_namespace,
     require_peer,
-    size,
-    warn,
+    run_stream,
+    warn_unpublished,
+    watch_topic,
 )
+from rmpa.cli.options import Options, Selection, argument, count_option, flag, graph_verb, selection_options, summary
+from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
+from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe.why.diagnosis import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-    from rmpa.cli.output import Graph, GraphName, Master
+    from rmpa.cli.graph import Graph, GraphName, Master
+    from rmpa.cli.output import Text
     from rmpa.observe.snapshot import LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
-
-
-# What the agent knows of the topics that cross the mesh, as the topic commands show it.
+    from rmpa.ros.node.node import Received
 
 
 def ask_agent(master: Master, topic: str) -> TopicInfo | None:
-    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer.
-
-    Args:
-        master: The master.
-        topic: The topic.
-    """
+    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer."""
     snapshot = master.snapshot(topics=(topic,), peers=False)
     return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 
-def arriving(master: Master, wanted: GraphName) -> tuple[RouteInfo, ...]:
-    """The routes of a topic's remote sources from which a message has come."""
-    info = ask_agent(master, wanted.name)
-    return tuple(
-        route
-        for route in (info.routes if info else ())
-        if route.direction == "in" and route.messages and wanted.peer in (None, route.peer)
-    )
-
-
-def origin(route: RouteInfo) -> str:
-    """The source that figures are about: ``joystick /joy_node``."""
-    return printable(f"{route.peer} {route.node}")
-
-
-def rate_text(route: RouteInfo) -> str:
-    """Rate, period and jitter."""
+def _rate_text(route: RouteInfo) -> str:
     if route.rate is None or route.period is None:
         return "one message, no rate yet" if route.messages == 1 else "nothing in the last minute"
     p = route.period
@@ -78,7 +56,7 @@ def rate_text(route: RouteInfo) -> str:
     )
 
 
-def latency_text(latency: LatencyInfo | None) -> str:
+def _latency_text(latency: LatencyInfo | None) -> str:
     """One-way latency, with the bound of its error."""
     if latency is None:
         return "unknown yet"
@@ -88,13 +66,12 @@ def latency_text(latency: LatencyInfo | None) -> str:
     )
 
 
-def bandwidth_text(route: RouteInfo) -> str:
-    """Bytes a second, and bytes a message."""
+def _bandwidth_text(route: RouteInfo) -> str:
     mean = route.bytes / route.messages if route.messages else None
     return f"{size(route.bandwidth)}/s, {size(mean)} a message" if route.bandwidth is not None else "unknown yet"
 
 
-def losses_text(route: RouteInfo) -> str:
+def _losses_text(route: RouteInfo) -> str:
     """Messages that did not arrive, by reason."""
     ours = f"{route.dropped} dropped here"
     if route.direction == "in":
@@ -105,13 +82,6 @@ def losses_text(route: RouteInfo) -> str:
     return f"{route.lost} lost to {route.peer}" if route.contract.get("reliability") == "reliable" else ours
 
 
-def oversized_text(route: RouteInfo) -> str:
-    """Messages that were left out because they are too long."""
-    where = f"by the agent of {route.peer}" if route.direction == "in" else "here"
-    last, most = size(route.oversized_bytes), size(limits.TCPROS_MESSAGE_MAX)
-    return f"{route.oversized} left out {where}, the last of {last}; at most {most} cross: send parts"
-
-
 def shown_state(route: RouteInfo) -> str:
     """The state of a route, where its messages pass the agents or not: ``open``, ``direct``, ``open and direct``."""
     if route.transport == "direct":
@@ -119,25 +89,10 @@ def shown_state(route: RouteInfo) -> str:
     return f"{route.state} and direct" if route.transport == "both" else route.state
 
 
-def transport_lines(route: RouteInfo) -> Iterator[tuple[str, str]]:
-    """The transport of each subscriber: label and text of each line."""
-    if not route.subscribers:
-        yield from (("transport", text) for text in route_texts(route))
-    for one in route.subscribers:
-        since = duration(one.since_ago) if one.since_ago is not None else ""
-        yield "transport", subscriber_text(one, since)
-        if one.interruptions:
-            yield "", interruption_text(one)
-        if one.transport == "direct":
-            yield "", UNMEASURED
-
-
-def interruption_text(one: SubscriberTransport) -> str:
+def _interruption_text(one: SubscriberTransport) -> str:
     """How often a subscriber was without its path, and for how long the last time."""
-    lasted = duration(one.interrupted)
-    over = (
-        f"{lasted}, until {duration(one.interrupted_ago)} ago" if one.interrupted_ago is not None else f"{lasted} now"
-    )
+    until = "now" if one.interrupted_ago is None else f"until {duration(one.interrupted_ago)} ago"
+    over = f"{duration(one.interrupted)}{' ' if until == 'now' else ', '}{until}"
     return f"interrupted {_times(one.interruptions)}, the last for {over}; what is lost of that time is not counted"
 
 
@@ -149,25 +104,33 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
     """All that the agent knows of a route: label and text of each line."""
     if route.wire:
         yield "there", route.wire
-    yield from transport_lines(route)
+    if not route.subscribers:
+        yield from (("transport", text) for text in route_texts(route))
+    for one in route.subscribers:
+        yield "transport", subscriber_text(one, duration(one.since_ago) if one.since_ago is not None else "")
+        if one.interruptions:
+            yield "", _interruption_text(one)
+        if one.transport == "direct":
+            yield "", UNMEASURED
     if route.lane:
         yield "lane", route.lane
     if route.direction == "in" and route.messages:
-        yield "rate", rate_text(route)
-        yield "latency", latency_text(route.latency)
-        yield "bandwidth", bandwidth_text(route)
+        yield "rate", _rate_text(route)
+        yield "latency", _latency_text(route.latency)
+        yield "bandwidth", _bandwidth_text(route)
     if route.messages or route.lost or route.events.get("loss_unknown"):
-        yield "missing", losses_text(route)
+        yield "missing", _losses_text(route)
     if route.kept:
         yield "waiting", f"{route.kept} messages for {route.peer}"
     if route.oversized:
-        yield "too long", oversized_text(route)
+        where = f"by the agent of {route.peer}" if route.direction == "in" else "here"
+        last, most = size(route.oversized_bytes), size(limits.TCPROS_MESSAGE_MAX)
+        yield "too long", f"{route.oversized} left out {where}, the last of {last}; at most {most} cross: send parts"
     if route.contract:
         yield "contract", ", ".join(f"{key} {_value(key, value)}" for key, value in route.contract.items())
     if route.events:
         yield "events", ", ".join(f"{kind} {count}" for kind, count in route.events.items())
-    for event in route.recent:
-        yield "", f"{duration(event.ago)} ago: {event.kind}: {event.text}"
+    yield from (("", f"{duration(event.ago)} ago: {event.kind}: {event.text}") for event in route.recent)
 
 
 def _value(key: str, value: object) -> str:
@@ -179,7 +142,7 @@ def _value(key: str, value: object) -> str:
     return f"{value:g} Hz" if key == "max_rate" else duration(value)
 
 
-def _topic_json(graph: Graph, name: str) -> dict[str, object]:
+def _json(graph: Graph, name: str) -> dict[str, object]:
     return {
         "name": name,
         "type": graph.types.get(name),
@@ -189,158 +152,380 @@ def _topic_json(graph: Graph, name: str) -> dict[str, object]:
     }
 
 
-@click.command(
-    "list", epilog="\b\nExamples:\n  rmpa topic list\n  rmpa topic list -v /camera\n  rmpa topic list joystick:/\n"
+@graph_verb(
+    argument("namespace", "topic", default=""),
+    flag("-v", "--verbose", help="Types and counts, publishers and subscribers apart."),
+    flag("-p", "--publishers", help="Only topics that have a publisher."),
+    flag("-s", "--subscribers", help="Only topics that have a subscriber."),
+    selection_options,
 )
-@click.argument("namespace", default="", shell_complete=completes("topic"))
-@click.option("-v", "--verbose", is_flag=True, help="Types and counts, publishers and subscribers apart.")
-@click.option("-p", "--publishers", is_flag=True, help="Only topics that have a publisher.")
-@click.option("-s", "--subscribers", is_flag=True, help="Only topics that have a subscriber.")
-@selection_options
-@graph_options
-def list_(
-    namespace: str,
-    verbose: bool,
-    publishers: bool,
-    subscribers: bool,
-    selection: Selection,
-    options: GraphOptions,
+def topic_list(
+    namespace: str, verbose: bool, publishers: bool, subscribers: bool, selection: Selection, options: Options
 ) -> None:
     """List topics, all or those of a NAMESPACE.
 
     A topic that peers publish has their names behind it: /cmd  [joystick]. A terminal shows the first of very many,
     this module's own before the others.
+
+    ---
+
+    Examples:
+      rmpa topic list
+      rmpa topic list -v /camera
+      rmpa topic list joystick:/
     """
+    wanted = read_name(namespace or "/")
     master, graph = options.graph()
-    wanted = read_namespace(namespace, "topic")
     require_peer(master, graph, wanted)
+    peers = {name: peers_of(graph.publishers.get(name, ())) for name in graph.topics}
     names = [
         name
-        for name in graph.topics
-        if wanted.contains(name, peers_of(graph.publishers.get(name, ())))
+        for name, owners in peers.items()
+        if wanted.contains(name, owners)
         and (not publishers or graph.publishers.get(name))
         and (not subscribers or graph.subscribers.get(name))
+        and selection.wants(name, owners)
     ]
-    names = selection.with_peers(names, lambda name: peers_of(graph.publishers.get(name, ())))
-    if options.as_json:
-        print_json([_topic_json(graph, name) for name in names])
-        return
-    every = names
-    if selection.is_long(names):
-        remote = {name for name in names if _is_remote(graph, name)}
-        owners = {peer for name in remote for peer in peers_of(graph.publishers[name])}
-        click.echo(summary(len(names), "topics", ("remote" if n in remote else "of this module" for n in names)))
-        click.echo(f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}\n")
-        names = [*selection.shown(sorted(names, key=lambda name: (name in remote, name)))]
-    if verbose:
-        if not subscribers:
-            _verbose("Published topics", "publisher", graph, [n for n in names if n in graph.publishers])
-        if not publishers:
-            _verbose("Subscribed topics", "subscriber", graph, [n for n in names if n in graph.subscribers])
-    else:
-        print_names(names, graph.publishers)
-    selection.print_rest(every, "topics", "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'")
+
+    def text() -> Iterator[Text]:
+        shown = names
+        if selection.is_long(names):
+            remote = {name for name in names if peers[name] and all(map(proxied_peer, graph.publishers[name]))}
+            owners = {peer for name in remote for peer in peers[name]}
+            yield summary(len(names), "topics", ("remote" if n in remote else "of this module" for n in names))
+            yield f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}"
+            yield ""
+            shown = sorted(names, key=lambda name: (name in remote, name))[: selection.lines]
+        if verbose:
+            if not subscribers:
+                yield from _verbose("Published topics", "publisher", graph, graph.publishers, shown)
+            if not publishers:
+                yield from _verbose("Subscribed topics", "subscriber", graph, graph.subscribers, shown)
+        else:
+            yield from marked(shown, graph.publishers)
+        yield selection.rest(names, "topics", "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'")
+
+    options.show([_json(graph, name) for name in names] if options.as_json else None, text())
 
 
-def _is_remote(graph: Graph, name: str) -> bool:
-    """Whether peers alone publish a topic."""
-    nodes = graph.publishers.get(name, ())
-    return bool(nodes) and all(proxied_peer(node) is not None for node in nodes)
-
-
-def _verbose(title: str, what: str, graph: Graph, names: list[str]) -> None:
-    ends = graph.publishers if what == "publisher" else graph.subscribers
-    click.echo(f"{title}:")
+def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], names: list[str]) -> Iterator[str]:
+    yield f"{title}:"
     for name in names:
-        count = len(ends[name])
-        kind = printable(graph.types.get(name, "unknown type"))
-        mark = peers_mark(ends[name]) if what == "publisher" else ""
-        click.echo(f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}{mark}")
+        if name in ends:
+            kind, count = printable(graph.types.get(name, "unknown type")), len(ends[name])
+            mark = peers_mark(ends[name]) if what == "publisher" else ""
+            yield Painted(f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}{mark}")
 
 
-@click.command(
-    epilog="""\
-\b
-Examples:
-  rmpa topic info /cmd
-  rmpa topic info joystick:/cmd                       what comes from joystick alone
-  rmpa topic info /cmd --json | jq '.mesh.routes[0].latency.p99'
-"""
-)
-@click.argument("topic", shell_complete=completes("topic"))
-@graph_options
-def info(topic: str, options: GraphOptions) -> None:
+def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
+    """The topic that a user names, the master, and its graph, which has the topic."""
+    wanted = read_name(text)
+    master, graph = options.graph()
+    require_peer(master, graph, wanted)
+    graph.require_topic(wanted.name)
+    return wanted, master, graph
+
+
+@graph_verb(argument("topic", "topic"))
+def topic_info(topic: str, options: Options) -> None:
     """Show a topic's type, publishers and subscribers, and what of it crosses.
 
     Of each remote source the agent measures, over the last minute: rate, period, jitter, bandwidth, losses, and the
     one-way latency from the publisher's agent to this one. The ± behind a latency bounds its error: the other
     machine's clock is known only so well. The agent measures only while a node here subscribes.
+
+    ---
+
+    Examples:
+      rmpa topic info /cmd
+      rmpa topic info joystick:/cmd                       what comes from joystick alone
+      rmpa topic info /cmd --json | jq '.mesh.routes[0].latency.p99'
     """
-    wanted = read_name(topic)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
-    graph.require_topic(wanted.name)
+    wanted, master, graph = _find(topic, options)
     crossing = ask_agent(master, wanted.name)
-    if options.as_json:
-        print_json(_topic_json(graph, wanted.name) | {"mesh": crossing})
-        return
-    print_line(f"Type: {graph.types.get(wanted.name, 'unknown')}")
+    options.show(_json(graph, wanted.name) | {"mesh": crossing}, _described(graph, wanted, crossing))
+
+
+def _described(graph: Graph, wanted: GraphName, crossing: TopicInfo | None) -> Iterator[str]:
+    yield f"Type: {graph.types.get(wanted.name, 'unknown')}"
     if crossing is not None and crossing.md5:
-        print_line(f"MD5: {crossing.md5}")
+        yield f"MD5: {crossing.md5}"
     for title, nodes in (("Publishers", graph.publishers), ("Subscribers", graph.subscribers)):
         meant = [node for node in nodes.get(wanted.name, []) if wanted.matches(node) or title == "Subscribers"]
-        click.echo(f"\n{title}:" + ("" if meant else " none"))
-        for node in meant:
-            print_line(f" * {origin_text(node)}")
-    if crossing is not None:
-        _print_crossing(crossing, wanted)
-
-
-def _print_crossing(crossing: TopicInfo, wanted: GraphName) -> None:
-    click.echo("\nMesh:" + ("" if crossing.routes else " nothing of it crosses"))
+        yield from ("", f"{title}:" + ("" if meant else " none"))
+        yield from (f" * {origin_text(node)}" for node in meant)
+    if crossing is None:
+        return
+    yield from ("", "Mesh:" + ("" if crossing.routes else " nothing of it crosses"))
     if crossing.policy:
-        print_line(f" * {'may cross' if crossing.crosses else 'stays home'}: {crossing.policy}")
+        yield f" * {'may cross' if crossing.crosses else 'stays home'}: {crossing.policy}"
     for route in crossing.routes:
         if wanted.peer not in (None, route.peer):
             continue
         way = "from" if route.direction == "in" else "to"
         last = "" if route.age is None else f", last {duration(route.age)} ago"
         relayed = f", {route.messages} messages{last}" if route.transport != "direct" or route.messages else ""
-        print_line(f" * {way} {route.peer}: {route.node} {shown_state(route)}{relayed}")
-        for label, text in facts(route):
-            print_line(f"     {label:<10} {text}")
+        yield f" * {way} {route.peer}: {route.node} {shown_state(route)}{relayed}"
+        yield from (f"     {label:<10} {text}" for label, text in facts(route))
         if route.problem:
             warn(f"{route.peer} {route.node}: {route.problem}")
     for trouble in (*crossing.mismatches, *crossing.unreachable):
         warn(trouble)
 
 
-@click.command("type", epilog="\b\nExamples:\n  rmpa topic type /cmd\n")
-@click.argument("topic", shell_complete=completes("topic"))
-@graph_options
-def type_(topic: str, options: GraphOptions) -> None:
-    """Print a topic's type."""
-    wanted = read_name(topic)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
-    graph.require_topic(wanted.name)
+@graph_verb(argument("topic", "topic"))
+def topic_type(topic: str, options: Options) -> None:
+    """Print a topic's type.
+
+    ---
+
+    Examples:
+      rmpa topic type /cmd
+    """
+    wanted, _, graph = _find(topic, options)
     kind = graph.types.get(wanted.name)
     if kind is None:
         raise RmpaError(f"the type of {wanted.name} is not known yet: its publisher tells it")
-    if options.as_json:
-        print_json({"name": wanted.name, "type": kind})
-    else:
-        print_line(kind)
+    options.show({"name": wanted.name, "type": kind}, kind)
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa topic find sensor_msgs/Joy\n")
-@click.argument("kind", metavar="TYPE")
-@graph_options
-def find(kind: str, options: GraphOptions) -> None:
-    """Print the topics of a TYPE."""
+@graph_verb(argument("kind", metavar="TYPE"))
+def topic_find(kind: str, options: Options) -> None:
+    """Print the topics of a TYPE.
+
+    ---
+
+    Examples:
+      rmpa topic find sensor_msgs/Joy
+    """
     _, graph = options.graph()
     found = [name for name in graph.topics if graph.types.get(name) == kind]
-    if options.as_json:
-        print_json(found)
-    else:
-        print_names(found, graph.publishers)
+    options.show(found, marked(found, graph.publishers))
+
+
+class _Figures:
+    """Figures over a sliding window of messages, measured by this command's own subscriber.
+
+    For each remote source the agent's figures follow, which are more exact: the agent takes the time of each message
+    when it arrives, this program only when it is scheduled.
+
+    Args:
+        master: The master.
+        wanted: The topic.
+        window: Messages in it.
+    """
+
+    of_agent = "at the agent"
+    source = "subscriber"
+
+    def __init__(self, master: Master, wanted: GraphName, window: int) -> None:
+        self.master, self.wanted = master, wanted
+        self.messages = 0
+        self._shown: int | None = None
+        self._last: float | None = None
+        self.periods: deque[float] = deque(maxlen=window)
+        self.sizes: deque[int] = deque(maxlen=window)
+        self.delays: deque[float] = deque(maxlen=window)
+
+    def add(self, received: Received, now: float) -> None:
+        """One message, at ``now`` (monotonic seconds)."""
+        if self._last is not None:
+            self.periods.append(now - self._last)
+        self._last = now
+        self.sizes.append(len(received.raw))
+        self.messages += 1
+
+    async def show(self, *, as_json: bool) -> None:
+        """Print a line of figures if a message came since the last one; the first call prints a heading."""
+        shown, self._shown = self._shown, self.messages
+        if shown == self.messages or shown is None:
+            if not as_json:
+                print_text("no new messages" if shown is not None else f"subscribed to [{self.wanted}]")
+            return
+        routes = await asyncio.to_thread(self._arriving)
+        if as_json:
+            print_json({"topic": str(self.wanted), **self.values(routes), "routes": routes})
+        else:
+            remote = (f"{self.of_agent}, from {printable(f'{r.peer} {r.node}')}: {self.remote(r)}" for r in routes)
+            click.echo("\n\t".join([self.text(), *remote]))
+
+    def _arriving(self) -> tuple[RouteInfo, ...]:
+        """The routes of the topic's remote sources from which a message has come."""
+        info = ask_agent(self.master, self.wanted.name)
+        routes = (route for route in (info.routes if info else ()) if route.direction == "in" and route.messages)
+        return tuple(route for route in routes if self.wanted.peer in (None, route.peer))
+
+    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:  # noqa: ARG002 - of delays alone
+        """For JSON, in base units; ``source`` is what measured them."""
+        return {"source": self.source, **self.own()}
+
+    def own(self) -> dict[str, float]:
+        """The figures of this command's subscriber, in base units."""
+        raise NotImplementedError
+
+    def text(self) -> str:
+        """The subscriber's figures as text."""
+        raise NotImplementedError
+
+    def remote(self, route: RouteInfo) -> str:
+        """The agent's figures of a remote source as text."""
+        raise NotImplementedError
+
+
+class _Rate(_Figures):
+    """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
+
+    def own(self) -> dict[str, float]:
+        p = SampleSummary.of(self.periods)
+        rate = 1 / p.mean if p.mean > 0 else math.nan
+        return {"rate": rate, "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
+
+    def text(self) -> str:
+        v = self.own()
+        if v["window"] < 2:
+            return "one message, no rate yet"
+        spread = f"min: {v['min']:.3f}s max: {v['max']:.3f}s std dev: {v['sd']:.5f}s window: {v['window']}"
+        return f"average rate: {v['rate']:.3f}\n\t{spread}"
+
+    def remote(self, route: RouteInfo) -> str:
+        return _rate_text(route)
+
+
+class _Bandwidth(_Figures):
+    """Bytes a second, in the format of ``rostopic bw``."""
+
+    def own(self) -> dict[str, float]:
+        s, elapsed = SampleSummary.of(self.sizes), math.fsum(self.periods)
+        first = self.sizes[0] if len(self.sizes) > len(self.periods) else 0  # came before the first period
+        rate = (sum(self.sizes) - first) / elapsed if elapsed > 0 else math.nan
+        return {"bandwidth": rate, "mean": s.mean, "min": s.minimum, "max": s.maximum, "window": s.count}
+
+    def text(self) -> str:
+        v = self.own()
+        spread = f"mean: {size(v['mean'])} min: {size(v['min'])} max: {size(v['max'])} window: {v['window']}"
+        return f"average: {size(v['bandwidth'])}/s\n\t{spread}"
+
+    def remote(self, route: RouteInfo) -> str:
+        return _bandwidth_text(route)
+
+
+class _Delay(_Figures):
+    """Age on arrival, in seconds.
+
+    By the header's stamp, exact only as far as both machines' clocks agree; and for a remote source by the agent,
+    which knows the clocks' offset. Without a header only the latter is known.
+    """
+
+    of_agent = "by the link's clock"
+
+    def add(self, received: Received, now: float) -> None:
+        """One message.
+
+        Raises:
+            RmpaError: Its type has no header, and it did not come over the mesh.
+        """
+        super().add(received, now)
+        if any(field.name == "header" and field.type == "std_msgs/Header" for field in received.kind.fields):
+            stamp = received.message.header.stamp
+            self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
+        elif self.master.agent is None or proxied_peer(received.caller_id) is None:
+            raise RmpaError(f"{received.kind.name} has no header, and so no stamp to tell its age by")
+
+    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
+        """Seconds; without headers those of the agent, if there is one remote source."""
+        latency = routes[0].latency if len(routes) == 1 and not self.delays else None
+        if latency is None:
+            return {"source": "header" if self.delays else "link", "error": None, **self.own()}
+        spread = {"delay": latency.mean, "min": latency.min, "max": latency.max, "sd": latency.sd}
+        return {"source": "link", "error": latency.error, **spread, "window": latency.count}
+
+    def own(self) -> dict[str, float]:
+        s = SampleSummary.of(self.delays)
+        return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
+
+    def text(self) -> str:
+        """As ``rostopic delay``, with a digit more."""
+        if not self.delays:
+            return "no header, and so no stamp to tell the whole age by"
+        v = self.own()
+        spread = f"min: {v['min']:.4f}s max: {v['max']:.4f}s std dev: {v['sd']:.5f}s window: {v['window']}"
+        return f"average delay: {v['delay']:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"
+
+    def remote(self, route: RouteInfo) -> str:
+        return _latency_text(route.latency)
+
+
+def _watch(make: type[_Figures], topic: str, window: int, count: int | None, options: Options) -> None:
+    wanted = read_name(topic)
+    master, graph = options.graph()
+    require_peer(master, graph, wanted)
+    warn_unpublished(master, graph, wanted)
+    figures = make(master, wanted, window)
+
+    def take(received: Received) -> None:
+        figures.add(received, time.monotonic())
+        if figures.messages == count:
+            raise Enough
+
+    run_stream(lambda: watch_topic(master, wanted, take, lambda: figures.show(as_json=options.as_json)))
+
+
+def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]:
+    """A ``graph_verb`` of a topic, with ``--window`` and ``--count``."""
+    type_ = click.IntRange(2, 1_000_000)
+    how_many = "Over how many messages."
+    messages = click.option("-w", "--window", type=type_, default=window, show_default=True, help=how_many)
+    return graph_verb(argument("topic", "topic"), messages, count_option("messages"))
+
+
+@_figures_verb(50_000)
+def topic_hz(topic: str, window: int, count: int | None, options: Options) -> None:
+    """Show how often messages come, once a second until Ctrl-C.
+
+    The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
+    the arrivals of the last minute over the mesh.
+
+    ---
+
+    Examples:
+      rmpa topic hz /cmd
+      rmpa topic hz joystick:/cmd -w 100 --json
+    """
+    _watch(_Rate, topic, window, count, options)
+
+
+@_figures_verb(100)
+def topic_bw(topic: str, window: int, count: int | None, options: Options) -> None:
+    """Show how many bytes a second messages need, once a second until Ctrl-C.
+
+    The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
+    the arrivals of the last minute over the mesh.
+
+    ---
+
+    Examples:
+      rmpa topic bw /camera/image_raw -w 30
+      rmpa topic bw base:/map --json
+    """
+    _watch(_Bandwidth, topic, window, count, options)
+
+
+@_figures_verb(50_000)
+def topic_delay(topic: str, window: int, count: int | None, options: Options) -> None:
+    """Show how old messages are when they come, once a second until Ctrl-C.
+
+    First by the header's stamp: from the publisher's stamp to here, exact across machines only as far as their clocks
+    agree. Then, for each remote source, by the link's clock: from the publisher's agent to this one. That needs
+    neither a header nor clocks that agree, and the true value lies within the ± that is shown.
+
+    ---
+
+    Examples:
+      rmpa topic delay base:/odom
+      rmpa topic delay /cmd_vel --json | jq '.routes[].latency'   no header is needed over the mesh
+    """
+    from rmpa.ros.types.messages import MessageType
+
+    # The modules that read messages take 0.3 s to import, which would count as the first message's delay.
+    MessageType("std_msgs/Header").make()
+    _watch(_Delay, topic, window, count, options)

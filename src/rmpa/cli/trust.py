@@ -1,120 +1,102 @@
-"""``rmpa trust``: a mesh's authority, this module's membership, and what others may do here.
-
-``rmpa trust``: what other modules may do here.
-"""
+"""``rmpa trust``: this module's part in a secured mesh, and what others may do here."""
 
 from __future__ import annotations
 
+import asyncio
+import functools
 import os
 import socket
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import click
 
-from rmpa.cli.agent import find_module
-from rmpa.cli.options import completes, json_option
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, warn
-from rmpa.config.module_name import GATEWAY_SUFFIX, keep_name, kept_name, note_state_dir
+from rmpa.cli.options import Options, argument, config_option, flag, json_verb
+from rmpa.cli.output import Table, duration, warn
+from rmpa.config.module_name import (
+    GATEWAY_SUFFIX,
+    NameSource,
+    choose_name,
+    keep_name,
+    kept_name,
+    note_state_dir,
+    state_dir,
+)
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.core.identity import is_global_name, peer_name_problem
-from rmpa.observe.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
 from rmpa.trust.store import TrustStore, modules_with_keys
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.cli.output import Text
     from rmpa.config.module_name import ModuleName
+    from rmpa.config.read import Loaded
     from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.membership import Membership
-    from rmpa.trust.permissions import PermissionDecision
-
-_WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
-
-
-@click.command(
-    epilog="\b\nExamples:\n  rmpa trust check joystick publish /cmd_vel\n"
-    "  rmpa trust check joystick action /arm/move --config new.toml\n"
-)
-@click.argument("peer", shell_complete=completes("peer"))
-@click.argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS))
-@click.argument("name")
-@click.option("--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
-@json_option
-@click.pass_context
-def check(ctx: click.Context, peer: str, what: str, name: str, file: str | None, as_json: bool) -> None:
-    """Say whether the [[permission]] of this module let PEER do something here, and which of them decides.
-
-    The exit code is 0 for yes and 1 for no. What [bridge], [[peer]], [services] and [params] say comes on top.
-    """
-    if problem := peer_name_problem(peer):
-        raise ConfigError("PEER", problem)
-    if not is_global_name(name):
-        raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
-    loaded = load_settings({"config": file}, dict(os.environ), host_name=socket.gethostname())
-    permissions = Permissions(loaded.settings.trust)
-    decisions = [permissions.judge(access, peer, each) for access, each in _asked(what, name)]
-    decision = next((each for each in decisions if not each.allowed), decisions[0])
-    files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})
-    _show(decision, permissions.groups_of(peer), files, as_json=as_json)
-    ctx.exit(0 if decision.allowed else 1)
-
-
-def _asked(what: str, name: str) -> list[tuple[Access, str]]:
-    """What a user asks for, as single accesses: five for an action."""
-    if what in (ACTION_CLIENT, ACTION_SERVER):
-        return list(action_topics(what, name))
-    return [(Access(what), name)]
-
-
-def _show(decision: PermissionDecision, groups: tuple[str, ...], files: list[str], *, as_json: bool) -> None:
-    if as_json:
-        told = {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number}
-        print_json({**told, "groups": list(groups), "files": files})
-        return
-    click.echo(f"{'yes' if decision.allowed else 'no'}: {printable(decision.rule)}")
-    if not files:
-        warn("no rmpa.toml was found here; --config names the file that rmpa up was started with")
-
-
-# The module that ``rmpa trust`` is about: its settings, its files, and its agent if that runs.
-
 
 _T = TypeVar("_T")
-name_option = click.option(
-    "--name",
-    metavar="NAME",
-    help="This module. [default: RMPA_AGENT, RMPA_NAME, rmpa.toml, the agent that runs; else as rmpa up has it]",
-)
-config_option = click.option(
-    "--config", "file", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
-)
+_WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
+_RESTART: Final = "the agent {} runs without trust until it is started again"
 
 
 @dataclass(frozen=True, slots=True)
-class TrustPlace:
-    """One module.
+class Module:
+    """The module of this machine that a command beside an agent is about.
 
-    Args:
+    Attributes:
         chosen: Its name, and why it was chosen.
-        store: Its files.
-        state: The state directory that they are in.
+        loaded: The settings, with that name.
+        state: Its state directory; ``None``: there is none.
         socket: The control socket of its agent; ``None``: none runs.
+        trust: What its agent says of trust; ``None``: none runs.
+        config_file: The settings of its agent; empty: it has none, or none runs.
     """
 
     chosen: ModuleName
-    store: TrustStore
-    state: Path
-    socket: Path | None
+    loaded: Loaded
+    state: Path | None
+    socket: Path | None = None
+    trust: TrustStatus | None = None
+    config_file: str = ""
 
     @property
     def name(self) -> str:
         """Its name."""
         return self.chosen.name
+
+    @property
+    def agent(self) -> str:
+        """How its agent runs: ``secured``, ``plain`` or ``off``."""
+        return "off" if self.trust is None else self.trust.agent
+
+    def with_place(self) -> Self:
+        """Check that the module has a state directory.
+
+        Raises:
+            StartError: There is none.
+        """
+        if self.state is None:
+            raise StartError("the state directory", "is not known: there is no home", "set RMPA_STATE_DIR")
+        return self
+
+    @property
+    def place(self) -> Path:
+        """The state directory of a module ``with_place``."""
+        assert self.state is not None  # noqa: S101 - it was checked
+        return self.state
+
+    @property
+    def store(self) -> TrustStore:
+        """The keys and certificates of a module ``with_place``."""
+        return TrustStore(self.place, self.name)
 
     def call(self, what: str, reply: type[_T], **args: object) -> _T:
         """Let the agent do something.
@@ -127,11 +109,6 @@ class TrustPlace:
             raise UnreachableError(f"agent {self.name!r}", "this machine", "start it: rmpa up")
         with ControlClient(self.socket) as client:
             return client.call("trust", reply, what=what, **args)
-
-    @property
-    def agent(self) -> str:
-        """How the agent runs: ``secured``, ``plain`` or ``off``."""
-        return "off" if self.socket is None else self.call("status", TrustStatus).agent
 
     def membership(self) -> Membership:
         """What the files say, without the agent.
@@ -148,12 +125,13 @@ class TrustPlace:
 
         return Membership.load(self.store, SystemClock(), time.time)
 
-    def authority(self, membership: Membership) -> MeshAuthority:
+    def authority(self) -> MeshAuthority:
         """What the files say, without the agent, of the authority.
 
         Raises:
-            StartError: This module is not it, or a file is broken.
+            StartError: Trust is off here, this module is not the authority, or a file is broken.
         """
+        membership = self.membership()
         from rmpa.trust.authority import MeshAuthority
 
         if not self.store.is_authority:
@@ -162,41 +140,93 @@ class TrustPlace:
             raise StartError(f"the module {self.name}", "is not the authority of its mesh", where)
         return MeshAuthority(membership)
 
+    def refuse_member(self, leaving: str) -> None:
+        """Check that the module has no keys yet.
 
-def find_place(name: str | None, file: str | None) -> TrustPlace:
-    """The module that a user means.
+        Args:
+            leaving: What is said of ``rmpa trust leave``.
+
+        Raises:
+            StartError: It has.
+        """
+        check_library()
+        if self.store.exists:
+            remedy = f"rmpa trust status shows it; rmpa trust leave {leaving}"
+            raise StartError(f"the module {self.name}", "is a member of a secured mesh already", remedy)
+
+
+def find_module(
+    name: str | None, options: Mapping[str, object], environ: Mapping[str, str], option: str = "--name"
+) -> Module:
+    """The module that a command beside an agent is about, as its agent knows it if that runs.
 
     Args:
-        name: As given; ``None``: as ``config.module_name`` chooses it.
-        file: The settings' file; ``None`` for the usual places.
+        name: As the command's option names it.
+        options: As for ``load_settings``.
+        environ: The environment's variables.
+        option: The command's option, for errors.
 
     Raises:
-        RmpaError: As ``find_module``; or there is no place for files.
+        ConfigError: The name cannot be one, or a setting cannot be used.
+        RmpaError: Several agents run, and none is meant; or the agent does not answer.
     """
-    module = find_module(name, {"config": file}, os.environ)
-    if module.state is None:
-        raise StartError("the state directory", "is not known: there is no home", "set RMPA_STATE_DIR")
-    return TrustPlace(module.chosen, TrustStore(module.state, module.name), module.state, module.socket)
+    for source, text in ((option, name), ("RMPA_AGENT", environ.get("RMPA_AGENT"))):
+        if text and (problem := peer_name_problem(text)):
+            raise ConfigError(source, problem)
+    loaded = load_settings(options, environ, host_name=socket.gethostname())
+    agents = find_agents(environ)
+    names = {**loaded.names, NameSource.AGENT_VARIABLE: environ.get("RMPA_AGENT", "")}
+    if name:
+        names[NameSource.OPTION] = name
+    chosen = choose_name(names, *running_agents(agents, environ))
+    loaded = replace(loaded, settings=replace(loaded.settings, name=chosen.name))
+    path = next((agent.path for agent in agents if agent.name == chosen.name), None)
+    if path is None:
+        return Module(chosen, loaded, state_dir(environ, loaded.settings.state_dir))
+    with ControlClient(path) as client:
+        trust, config_file = client.call("trust", TrustStatus, what="status"), client.agent().config_file
+    # The agent may have been started with another state directory than this shell has.
+    state = Path(trust.folder).parent.parent if trust.folder else None
+    return Module(chosen, loaded, state, path, trust, config_file)
 
 
-def keep_member_name(place: TrustPlace, file: str | None) -> str:
+def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
+    """A ``json_verb`` with ``--name`` and ``--config``, whose function gets the module that they mean."""
+    name_option = click.option(
+        "--name",
+        metavar="NAME",
+        help="This module. [default: RMPA_AGENT, RMPA_NAME, rmpa.toml, the agent that runs; else as rmpa up has it]",
+    )
+
+    def decorate(function: Callable[..., None]) -> click.Command:
+        @functools.wraps(function)
+        def command(name: str | None, config: str | None, options: Options, **given: Any) -> None:
+            module = find_module(name, {"config": config}, os.environ)
+            function(module.with_place(), options, **given)
+
+        return json_verb(*parameters, name_option, config_option)(command)
+
+    return decorate
+
+
+def keep_member_name(module: Module) -> str:
     """Keep the name of a module that has keys now as that of this machine; return the command that starts it.
 
     The name of another module that has keys itself stays. A gateway's is none of a module.
     """
-    if place.name.endswith(GATEWAY_SUFFIX):
-        return f"rmpa gateway --name {place.name}"
+    if module.name.endswith(GATEWAY_SUFFIX):
+        return f"rmpa gateway --name {module.name}"
+    usual = ""
     try:
-        kept = kept_name(place.state)
-        stays = bool(kept) and kept != place.name and TrustStore(place.state, kept).exists
-        if not stays:
-            keep_name(place.state, place.name, instead=True)
-        note_state_dir(os.environ, place.state)
-        usual = load_settings({"config": file}, os.environ, host_name=socket.gethostname()).settings.name
+        kept = kept_name(module.place)
+        if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
+            keep_name(module.place, module.name, instead=True)
+        note_state_dir(os.environ, module.place)
+        config = {"config": module.loaded.settings.config_file}
+        usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
     except RmpaError as error:
-        warn(f"the name {place.name} is not kept: {error}")
-        usual = ""
-    return "rmpa up" if usual == place.name else f"rmpa up --name {place.name}"
+        warn(f"the name {module.name} is not kept: {error}")
+    return "rmpa up" if usual == module.name else f"rmpa up --name {module.name}"
 
 
 def check_library() -> None:
@@ -204,9 +234,8 @@ def check_library() -> None:
     try:
         import cryptography  # noqa: F401
     except ModuleNotFoundError:
-        raise StartError(
-            "rmpa trust", "the library cryptography is not installed", "pip install 'rmpa[trust]'"
-        ) from None
+        problem = "the library cryptography is not installed"
+        raise StartError("rmpa trust", problem, "pip install 'rmpa[trust]'") from None
 
 
 def confirm(question: str) -> bool:
@@ -233,233 +262,237 @@ def date_of(wall: float) -> str:
 
 
 def grouped(digits: str) -> str:
-    """A code or fingerprint in groups, so that people can compare it."""
-    size = 3 if len(digits) == 6 else 4
-    return " ".join(digits[i : i + size] for i in range(0, len(digits), size))
+    """A fingerprint in groups of four digits, so that people can compare it."""
+    return " ".join(digits[i : i + 4] for i in range(0, len(digits), 4))
 
 
-# ``rmpa trust init|status|renew|revoke|leave``: the mesh, and this module's part in it.
-
-
-EXIT_CODES = "\b\nExit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.\n"
-_RESTART = "the agent {} runs without trust until it is started again"
-
-
-@click.command(
-    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust init\n  rmpa trust init --name base --label 'warehouse 3'\n"
+@json_verb(
+    argument("peer", "peer"),
+    argument("what", type=click.Choice(_WORDS), metavar="|".join(_WORDS)),
+    argument("name"),
+    config_option,
 )
-@click.option("--label", metavar="TEXT", default="", help="What you call the mesh; it stands in its certificates.")
-@name_option
-@config_option
-@json_option
-def init(label: str, name: str | None, file: str | None, as_json: bool) -> None:
+@click.pass_context
+def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
+    """Say whether the [[permission]] of this module let PEER do something here, and which of them decides.
+
+    The exit code is 0 for yes and 1 for no. What [bridge], [[peer]], [services] and [params] say comes on top.
+
+    ---
+
+    Examples:
+      rmpa trust check joystick publish /cmd_vel
+      rmpa trust check joystick action /arm/move --config new.toml
+    """
+    if problem := peer_name_problem(peer):
+        raise ConfigError("PEER", problem)
+    if not is_global_name(name):
+        raise ConfigError("NAME", f"{name!r} is not a global name", "one looks like /cmd_vel")
+    loaded = load_settings({"config": config}, dict(os.environ), host_name=socket.gethostname())
+    permissions = Permissions(loaded.settings.trust)
+    action = what in (ACTION_CLIENT, ACTION_SERVER)  # five accesses in one
+    asked = action_topics(what, name) if action else [(Access(what), name)]
+    decisions = [permissions.judge(access, peer, each) for access, each in asked]
+    decision = next((each for each in decisions if not each.allowed), decisions[0])
+    files = sorted({str(given.path) for given in loaded.given.values() if given.path is not None})
+    told = {"allowed": decision.allowed, "rule": decision.rule, "number": decision.number}
+    text = f"{'yes' if decision.allowed else 'no'}: {decision.rule}"
+    options.show({**told, "groups": permissions.groups_of(peer), "files": files}, text)
+    if not files and not options.as_json:
+        warn("no rmpa.toml was found here; --config names the file that rmpa up was started with")
+    ctx.exit(0 if decision.allowed else 1)
+
+
+@trust_verb(
+    click.option("--label", metavar="TEXT", default="", help="What you call the mesh; it stands in its certificates.")
+)
+def trust_init(module: Module, options: Options, label: str) -> None:
     """Make a secured mesh. This module becomes its authority: it invites, renews and revokes.
 
     Its key is needed for that alone: links come up without the authority, for as long as certificates are valid.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust init
+      rmpa trust init --name base --label 'warehouse 3'
     """
-    check_library()
-    place = find_place(name, file)
-    if place.store.exists:
-        remedy = "rmpa trust status shows it; rmpa trust leave removes it"
-        raise StartError(f"the module {place.name}", "is a member of a secured mesh already", remedy)
+    module.refuse_member("removes it")
     from rmpa.trust.authority import found_mesh
 
-    found_mesh(place.store, place.name, label or place.name, time.time())
-    status, start = _status(place), keep_member_name(place, file)
-    if as_json:
-        print_json(status)
-        return
-    print_line(f"{place.name} is the authority of a new mesh; its files are in {place.store.folder}")
-    print_line(f"fingerprint of the CA: {grouped(status.fingerprint)}")
-    print_line("Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed.")
-    if place.socket is not None:
-        warn(_RESTART.format(place.name))
-    again = " again" if place.socket is not None else ""
-    print_line(f"Next: {start} here{again}, and rmpa trust invite for each module.")
-    print_line("Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md")
+    found_mesh(module.store, module.name, label or module.name, time.time())
+    status, start = _status(module), keep_member_name(module)
+
+    def text() -> Iterator[str]:
+        yield f"{module.name} is the authority of a new mesh; its files are in {module.store.folder}"
+        yield f"fingerprint of the CA: {grouped(status.fingerprint)}"
+        yield "Keep a copy of that folder in a safe place: without ca.key no module can join or be renewed."
+        if module.socket is not None:
+            warn(_RESTART.format(module.name))
+        again = " again" if module.socket is not None else ""
+        yield f"Next: {start} here{again}, and rmpa trust invite for each module."
+        yield "Modules may do here only what [[permission]] in rmpa.toml allows: docs/permissions.md"
+
+    options.show(status, text())
 
 
-@click.command(epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust status\n  rmpa trust status --json | jq .expires\n")
-@name_option
-@config_option
-@json_option
-def status(name: str | None, file: str | None, as_json: bool) -> None:
+@trust_verb()
+def trust_status(module: Module, options: Options) -> None:
     """Show this module's part in its mesh: certificate, keys, deny list; at the authority also members and tokens.
 
     The exit code is 0 too if trust is off.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust status
+      rmpa trust status --json | jq .expires
     """
-    place = find_place(name, file)
-    shown = _status(place)
-    if as_json:
-        print_json(shown)
-        return
-    if not shown.on:
-        print_line(f"trust is off: {place.chosen} has joined no secured mesh")
-        if others := modules_with_keys(place.state):
-            print_line(f"with keys in {place.state}: {', '.join(others)}; rmpa trust status --name {others[0]}")
+    shown = _status(module)
+
+    def text() -> Iterator[Text]:
+        if shown.on:
+            yield _mesh(shown)
         else:
-            print_line("make one: rmpa trust init; or join one: rmpa trust join TOKEN")
-    else:
-        _show_mesh(shown)
-    for problem in shown.problems:
-        warn(problem)
+            yield f"trust is off: {module.chosen} has joined no secured mesh"
+            if others := modules_with_keys(module.place):
+                status = f"rmpa trust status --name {others[0]}"
+                yield f"with keys in {module.place}: {', '.join(others)}; {status}"
+            else:
+                yield "make one: rmpa trust init; or join one: rmpa trust join TOKEN"
+        for problem in shown.problems:
+            warn(problem)
+
+    options.show(shown, text())
 
 
-def _status(place: TrustPlace) -> TrustStatus:
+def _status(module: Module) -> TrustStatus:
     """The state by the agent, or by the files if none runs."""
-    if place.socket is not None:
-        shown = place.call("status", TrustStatus)
-        if shown.agent == "secured" or not place.store.exists:
-            return shown
-    if not place.store.exists:
-        return TrustStatus(on=False, module=place.name, folder=str(place.store.folder), agent=place.agent)
+    if module.trust is not None and (module.trust.agent == "secured" or not module.store.exists):
+        return module.trust
+    if not module.store.exists:
+        return TrustStatus(on=False, module=module.name, folder=str(module.store.folder), agent=module.agent)
+    from msgspec.structs import replace
+
     from rmpa.trust.joining import status_of
 
-    membership = place.membership()
-    authority = place.authority(membership) if place.store.is_authority else None
-    agent = place.agent
-    shown = status_of(membership, authority, agent=agent)
-    if agent == "plain":
-        from msgspec.structs import replace
-
-        return replace(shown, problems=(*shown.problems, _RESTART.format(place.name)))
-    return shown
+    authority = module.authority() if module.store.is_authority else None
+    membership = authority.membership if authority is not None else module.membership()
+    shown = status_of(membership, authority, agent=module.agent)
+    restart = (_RESTART.format(module.name),) if module.agent == "plain" else ()
+    return replace(shown, problems=(*shown.problems, *restart))
 
 
-def _show_mesh(shown: TrustStatus) -> None:
+def _mesh(shown: TrustStatus) -> Iterator[str | Table]:
     now = time.time()
-    role = ", the authority" if shown.is_authority else f"; authority: {shown.authority or 'not known yet'}"
-    print_line(f"{shown.module}{role}")
+    yield shown.module + (
+        ", the authority" if shown.is_authority else f"; authority: {shown.authority or 'not known yet'}"
+    )
     left = duration(shown.expires - now) if shown.expires > now else "ended"
-    print_line(f"certificate: until {date_of(shown.expires)} ({left}), renewed from {date_of(shown.renew_at)}")
-    print_line(f"CA: {grouped(shown.fingerprint)}")
-    revoked = ", ".join(shown.revoked) or "none"
-    print_line(f"group key {shown.key}; deny list {shown.deny_number}: {revoked}")
-    print_line(f"agent: {shown.agent}; files: {shown.folder}")
-    if shown.members:
-        rows = [
-            (
-                each.name,
-                {True: "linked", False: "not linked", None: "-"}[each.linked],
-                date_of(each.issued),
-                date_of(each.expires),
-            )
-            for each in shown.members
-        ]
-        print_line()
-        print_table([Column("MODULE"), Column("STATE"), Column("ISSUED"), Column("UNTIL")], rows)
-    if shown.tokens:
-        rows = [
-            (each.id[:8], each.state, each.used_by or each.name or "any module", date_of(each.expires))
-            for each in shown.tokens
-        ]
-        print_line()
-        print_table([Column("TOKEN"), Column("STATE"), Column("MODULE"), Column("UNTIL")], rows)
+    yield f"certificate: until {date_of(shown.expires)} ({left}), renewed from {date_of(shown.renew_at)}"
+    yield f"CA: {grouped(shown.fingerprint)}"
+    yield f"group key {shown.key}; deny list {shown.deny_number}: {', '.join(shown.revoked) or 'none'}"
+    yield f"agent: {shown.agent}; files: {shown.folder}"
+    words = {True: "linked", False: "not linked", None: "-"}
+    members = [(m.name, words[m.linked], date_of(m.issued), date_of(m.expires)) for m in shown.members]
+    tokens = [(t.id[:8], t.state, t.used_by or t.name or "any module", date_of(t.expires)) for t in shown.tokens]
+    for titles, rows in (("MODULE, STATE, ISSUED, UNTIL", members), ("TOKEN, STATE, MODULE, UNTIL", tokens)):
+        if rows:
+            yield ""
+            yield Table(titles, rows)
 
 
-@click.command(
-    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust renew               after the authority was away\n"
-    "  rmpa trust renew --group-key   at the authority: a new group key for all\n"
-)
-@click.option("--group-key", is_flag=True, help="At the authority: make a new group key; no link falls.")
-@name_option
-@config_option
-@json_option
-def renew(group_key: bool, name: str | None, file: str | None, as_json: bool) -> None:
+@trust_verb(flag("--group-key", help="At the authority: make a new group key; no link falls."))
+def trust_renew(module: Module, options: Options, group_key: bool) -> None:
     """Renew this module's certificate now. Agents do it by themselves after half of its time.
 
     A module that was off for up to a year is renewed too, with its key alone; it needs the authority for that.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust renew               after the authority was away
+      rmpa trust renew --group-key   at the authority: a new group key for all
     """
-    place = find_place(name, file)
-    if place.agent == "secured":
-        reply = place.call("rotate" if group_key else "renew", TrustReply)
-    else:
-        reply = _rotate_files(place) if group_key else _renew_files(place)
-    if as_json:
-        print_json(reply)
+    if module.agent == "secured":
+        reply = module.call("rotate" if group_key else "renew", TrustReply)
     elif group_key:
-        print_line(f"group key {reply.number} is made; all linked modules get it, and use it in 30 s")
+        reply = TrustReply(module=module.name, done=True, number=module.authority().rotate())
     else:
-        print_line(f"{reply.module} has a new certificate until {date_of(reply.expires)}")
+        reply = TrustReply(module=module.name, done=True, expires=_renew_files(module))
+    done = f"{reply.module} has a new certificate until {date_of(reply.expires)}"
+    if group_key:
+        done = f"group key {reply.number} is made; all linked modules get it, and use it in 30 s"
+    options.show(reply, done)
 
 
-def _rotate_files(place: TrustPlace) -> TrustReply:
-    membership = place.membership()
-    return TrustReply(module=place.name, done=True, number=place.authority(membership).rotate())
+def _renew_files(module: Module) -> int:
+    """Renew without an agent: the authority by its own key, others by a connection to it; return when it ends."""
+    if module.store.is_authority:
+        authority = module.authority()
+        authority.renew_own()
+        return int(authority.membership.certificate.expires)
+    from rmpa.trust.joining import renew_at_authority
+
+    membership, known = module.membership(), module.store.load_authority()
+    if known is None:
+        remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
+        raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
+    asyncio.run(renew_at_authority(membership, known.address, known.port))
+    return int(membership.certificate.expires)
 
 
-def _renew_files(place: TrustPlace) -> TrustReply:
-    """Renew without an agent: the authority by its own key, others by a connection to it."""
-    membership = place.membership()
-    if place.store.is_authority:
-        place.authority(membership).renew_own()
-    else:
-        import asyncio
-
-        from rmpa.trust.joining import renew_at_authority
-
-        known = place.store.load_authority()
-        if known is None:
-            remedy = "start the agent (rmpa up), or join again: rmpa trust invite at the authority"
-            raise StartError("the authority", "was never linked with this module: its address is not known", remedy)
-        asyncio.run(renew_at_authority(membership, known.address, known.port))
-    return TrustReply(module=place.name, done=True, expires=int(membership.certificate.expires))
-
-
-@click.command(
-    epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust revoke arm2          its links end everywhere at once\n"
-    "  rmpa trust revoke arm2 --force  also if no certificate of it is known here\n"
+@trust_verb(
+    argument("target", metavar="MODULE"), flag("--force", help="Also if no certificate of that name is known here.")
 )
-@click.argument("module")
-@click.option("--force", is_flag=True, help="Also if no certificate of that name is known here.")
-@name_option
-@config_option
-@json_option
-def revoke(module: str, force: bool, name: str | None, file: str | None, as_json: bool) -> None:
+def trust_revoke(module: Module, options: Options, target: str, force: bool) -> None:
     """Throw MODULE out of the mesh, at the authority: its certificates are refused everywhere from now on.
 
     All linked modules get the deny list and a new group key within a second; others when they are linked again.
     It may come back with a new token.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust revoke arm2          its links end everywhere at once
+      rmpa trust revoke arm2 --force  also if no certificate of it is known here
     """
-    place = find_place(name, file)
-    if place.agent == "secured":
-        reply = place.call("revoke", TrustReply, name=module, force=force)
+    if module.agent == "secured":
+        reply = module.call("revoke", TrustReply, name=target, force=force)
     else:
-        membership = place.membership()
-        deny = place.authority(membership).revoke_known(module, force=force)
-        reply = TrustReply(module=module, done=True, number=deny.number)
-    if as_json:
-        print_json(reply)
-    else:
-        print_line(f"{module} is revoked (deny list {reply.number}); there is a new group key")
-        if place.socket is None:
-            warn("no agent runs here: the other modules learn it when it is started (rmpa up)")
+        deny = module.authority().revoke_known(target, force=force)
+        reply = TrustReply(module=target, done=True, number=deny.number)
+    options.show(reply, f"{target} is revoked (deny list {reply.number}); there is a new group key")
+    if module.socket is None and not options.as_json:
+        warn("no agent runs here: the other modules learn it when it is started (rmpa up)")
 
 
-@click.command(epilog=f"{EXIT_CODES}\n\b\nExamples:\n  rmpa trust leave\n  rmpa trust leave --yes   in a script\n")
-@click.option("--yes", is_flag=True, help="Do not ask.")
-@name_option
-@config_option
-@json_option
-def leave(yes: bool, name: str | None, file: str | None, as_json: bool) -> None:
+@trust_verb(flag("--yes", help="Do not ask."))
+def trust_leave(module: Module, options: Options, yes: bool) -> None:
     """Remove this module's keys and certificate: its agent starts without trust then.
 
     At the authority that ends the whole mesh: nothing can be renewed after a week.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust leave
+      rmpa trust leave --yes   in a script
     """
-    place = find_place(name, file)
-    if not place.store.exists:
-        raise StartError(f"the module {place.name}", "has joined no secured mesh", "there is nothing to remove")
-    if not yes:
-        what = (
-            "the AUTHORITY's keys: the mesh ends when its certificates do" if place.store.is_authority else "its keys"
-        )
-        if not confirm(f"Remove {place.name} from its mesh, with {what}?"):
-            raise ConfigError("rmpa trust leave", "nothing was removed")
-    removed = place.store.remove()
-    secured = place.socket is not None
-    if as_json:
-        print_json(TrustReply(module=place.name, done=True, text=", ".join(removed)))
-        return
-    print_line(f"{place.name} has left its mesh: {len(removed)} files are removed")
-    if secured:
-        warn(f"the agent {place.name} keeps its membership until it is started again")
+    if not module.store.exists:
+        raise StartError(f"the module {module.name}", "has joined no secured mesh", "there is nothing to remove")
+    what = "its keys"
+    if module.store.is_authority:
+        what = "the AUTHORITY's keys: the mesh ends when its certificates do"
+    if not yes and not confirm(f"Remove {module.name} from its mesh, with {what}?"):
+        raise ConfigError("rmpa trust leave", "nothing was removed")
+    removed = module.store.remove()
+    done = f"{module.name} has left its mesh: {len(removed)} files are removed"
+    options.show(TrustReply(module=module.name, done=True, text=", ".join(removed)), done)
+    if module.socket is not None and not options.as_json:
+        warn(f"the agent {module.name} keeps its membership until it is started again")

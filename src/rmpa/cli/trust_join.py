@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import os
 import re
+import socket
 import sys
+import time
 from base64 import b64encode
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
+import msgspec
 
-from rmpa.cli.options import json_option
-from rmpa.cli.output import print_json, print_line, warn
-from rmpa.cli.trust import (
-    EXIT_CODES,
-    check_library,
-    config_option,
-    confirm,
-    date_of,
-    find_place,
-    grouped,
-    keep_member_name,
-    name_option,
-)
+from rmpa.cli.options import Options, argument, flag
+from rmpa.cli.output import print_json, warn
+from rmpa.cli.trust import check_library, confirm, date_of, grouped, keep_member_name, trust_verb
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import peer_name_problem
 from rmpa.trust import limits
 from rmpa.trust.permissions import InviteReply, JoinStep, TrustError, TrustReply
 
 if TYPE_CHECKING:
-    from rmpa.cli.trust import TrustPlace
+    from rmpa.cli.trust import Module
     from rmpa.trust.store import MemberFiles
 
 _LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")
@@ -38,105 +33,91 @@ _UNITS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400}
 _FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
 
 
-# --- the authority --------------------------------------------------------------------------------------------------
-
-
-@click.command(
-    epilog=f"{EXIT_CODES}\n"
-    "\b\nExamples:\n"
-    "  rmpa trust invite                          print the line for the new module, and wait\n"
-    "  rmpa trust invite --module arm2 --for 2d   for one module, valid for two days\n"
-    "  rmpa trust invite --no-wait | ssh arm2 rmpa trust join -\n"
-    "                                             by a script\n"
-    "  rmpa trust invite --sign arm2.csr          answer a join by files\n"
+@trust_verb(
+    click.option(
+        "--for", "lifetime", metavar="TIME", default="15min", help="Validity: 90s, 15min, 2h, 3d. [default: 15min]"
+    ),
+    click.option(
+        "--module",
+        "invitee",
+        metavar="MODULE",
+        help="The only module that may use it, which may be one that joins again. [default: any]",
+    ),
+    click.option(
+        "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
+    ),
+    flag("--yes", help="With --sign: do not ask."),
+    flag("--no-wait", help="Print the token and end."),
+    click.option("--sign", metavar="FILE", help="Answer the request of rmpa trust join --request; no token is made."),
+    click.option("--out", metavar="FILE", help="Where --sign writes the answer, a secret. [default: FILE.answer]"),
 )
-@click.option(
-    "--for", "lifetime", metavar="TIME", default="15min", help="Validity: 90s, 15min, 2h, 3d. [default: 15min]"
-)
-@click.option(
-    "--module",
-    metavar="MODULE",
-    help="The only module that may use it, which may be one that joins again. [default: any]",
-)
-@click.option(
-    "--address", metavar="HOST[:PORT]", help="Where the module reaches this one. [default: as other agents do]"
-)
-@click.option("--yes", is_flag=True, help="With --sign: do not ask.")
-@click.option("--no-wait", is_flag=True, help="Print the token and end.")
-@click.option("--sign", metavar="FILE", help="Answer the request of rmpa trust join --request; no token is made.")
-@click.option("--out", metavar="FILE", help="Where --sign writes the answer, a secret. [default: FILE.answer]")
-@name_option
-@config_option
-@json_option
-def invite(
+def trust_invite(
+    module: Module,
+    options: Options,
     lifetime: str,
-    module: str | None,
+    invitee: str | None,
     address: str | None,
     yes: bool,
     no_wait: bool,
     sign: str | None,
     out: str | None,
-    name: str | None,
-    file: str | None,
-    as_json: bool,
 ) -> None:
     """Invite a module, at the authority: print a token that is valid once, and wait until it has joined.
 
     On a terminal the token stands in the line to be run on the new module; else it goes to standard output alone. It
     lets its holder join: pass it on as a secret.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust invite                          print the line for the new module, and wait
+      rmpa trust invite --module arm2 --for 2d   for one module, valid for two days
+      rmpa trust invite --no-wait | ssh arm2 rmpa trust join -
+                                                 by a script
+      rmpa trust invite --sign arm2.csr          answer a join by files
     """
-    if module and (problem := peer_name_problem(module)):
+    if invitee and (problem := peer_name_problem(invitee)):
         raise ConfigError("--module", problem)
     seconds = _seconds(lifetime)
     host, port = _address(address)
-    place = find_place(name, file)
     if sign is not None:
-        answer = Path(out) if out else Path(f"{sign}.answer")
-        _sign(place, Path(sign), answer, module or "", yes=yes, as_json=as_json)
+        _sign(module, Path(sign), Path(out or f"{sign}.answer"), invitee or "", options, yes=yes)
         return
-    if place.agent != "secured":
-        membership = place.membership()
-        place.authority(membership)  # the better error, if this module is none
-        problem = "runs without trust" if place.socket is not None else "does not run"
-        remedy = "start it again" if place.socket is not None else "start it: rmpa up"
-        raise StartError(f"the agent {place.name}", f"{problem}, so no module can join", remedy)
-    invited = place.call("invite", InviteReply, name=module or "", lifetime=seconds, address=host, port=port)
+    if module.agent != "secured":
+        module.authority()  # the better error, if this module is none
+        problem, remedy = "does not run", "start it: rmpa up"
+        if module.socket is not None:
+            problem, remedy = "runs without trust", "start it again"
+        raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy)
+    invited = module.call("invite", InviteReply, name=invitee or "", lifetime=seconds, address=host, port=port)
     try:
-        _print_token(invited, module, as_json=as_json)
+        if not options.as_json:
+            until = date_of(invited.expires)
+            click.echo(f"for {invitee or 'one module'}, valid once, until {until}; run there:", err=True)
+        named = f" --name {invitee}" if invitee else ""
+        options.show(invited, f"rmpa trust join{named} {invited.token}" if sys.stdout.isatty() else invited.token)
+        sys.stdout.flush()
         if not no_wait:
-            _await_join(place, invited, as_json=as_json)
+            _await_join(module, invited, as_json=options.as_json)
     except (KeyboardInterrupt, click.Abort):
         with contextlib.suppress(RmpaError):
-            if place.call("withdraw", TrustReply, id=invited.id).done:
+            if module.call("withdraw", TrustReply, id=invited.id).done:
                 click.echo("\nthe token is withdrawn", err=True)
         raise
 
 
-def _print_token(invited: InviteReply, module: str | None, *, as_json: bool) -> None:
-    if as_json:
-        print_json(invited)
-    else:
-        invitee = module or "one module"
-        click.echo(f"for {invitee}, valid once, until {date_of(invited.expires)}; run there:", err=True)
-        named = f" --name {module}" if module else ""
-        click.echo(f"rmpa trust join{named} {invited.token}" if sys.stdout.isatty() else invited.token)
-    sys.stdout.flush()
-
-
-def _await_join(place: TrustPlace, invited: InviteReply, *, as_json: bool) -> None:
+def _await_join(module: Module, invited: InviteReply, *, as_json: bool) -> None:
     """Wait until a module has joined with the token; one that was refused may try again."""
-    import time
-
     step = JoinStep(step=0, state="waiting")
     if not as_json:
         click.echo("waiting for the module; Ctrl-C withdraws the token", err=True)
     while step.state != "joined":
-        following = place.call("step", JoinStep, id=invited.id, after=step.step)
+        following = module.call("step", JoinStep, id=invited.id, after=step.step)
         if following.step == step.step:
             if time.time() > invited.expires:
-                raise PeerRefused(
-                    "the authority", "the token has ended, and no module came", "rmpa trust invite again"
-                )
+                problem = "the token has ended, and no module came"
+                raise PeerRefused("the authority", problem, "rmpa trust invite again")
             continue
         step = following
         if as_json:
@@ -147,11 +128,12 @@ def _await_join(place: TrustPlace, invited: InviteReply, *, as_json: bool) -> No
             click.echo(f"{step.module} has joined", err=True)
 
 
-def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool, as_json: bool) -> None:
+def _sign(module: Module, request: Path, out: Path, invitee: str, options: Options, *, yes: bool) -> None:
     """Answer a join by files."""
     check_library()
     from rmpa.trust import certificates
     from rmpa.trust.authority import request_der
+    from rmpa.trust.tokens import fingerprint_of
 
     try:
         with request.open("rb") as stream:
@@ -162,41 +144,30 @@ def _sign(place: TrustPlace, request: Path, out: Path, module: str, *, yes: bool
     except (ValueError, TrustError) as error:
         remedy = "make it by rmpa trust join --request FILE"
         raise ConfigError(str(request), f"is no request: {error}", remedy) from None
-    if module and module != wanted.name:
-        raise ConfigError("--module", f"is {module}, and the request is of {wanted.name}")
+    if invitee and invitee != wanted.name:
+        raise ConfigError("--module", f"is {invitee}, and the request is of {wanted.name}")
     if out.exists():  # before a certificate takes the name
         raise ConfigError(str(out), "exists already", "choose another --out, or remove it")
     key = wanted.key_hash[: limits.FINGERPRINT_BYTES].hex()
     click.echo(f"{wanted.name} asks with the key {grouped(key)}", err=True)
     if not yes and not confirm(f"Does {wanted.name} show this key?"):
         raise ConfigError("rmpa trust invite --sign", "nothing was signed")
-    if place.agent == "secured":
-        reply = place.call("sign", dict[str, str], request=b64encode(data).decode(), module=module)
+    if module.agent == "secured":
+        reply = module.call("sign", dict[str, str], request=b64encode(data).decode(), module=invitee)
         answer = reply["answer"].encode()
     else:
-        import msgspec
-
-        _, made = place.authority(place.membership()).join_file(data, module)
-        answer = msgspec.json.encode(made)
+        answer = msgspec.json.encode(module.authority().join_file(data, invitee)[1])
     _write_secret(out, answer)
-    if as_json:
-        print_json({"module": wanted.name, "key": key, "file": str(out)})
-    else:
-        print_line(f"{out} is the answer, a secret: bring it to {wanted.name}, and delete it then")
-        print_line(f"there: rmpa trust join --accept {out.name} --ca {_ca_of(place)} --name {wanted.name}")
-
-
-def _ca_of(place: TrustPlace) -> str:
-    """The fingerprint of this mesh's CA."""
-    from rmpa.trust.tokens import fingerprint_of
-
-    return fingerprint_of(place.membership().files.ca).hex()
+    ca = fingerprint_of(module.membership().files.ca).hex()
+    options.show(
+        {"module": wanted.name, "key": key, "file": str(out)},
+        f"{out} is the answer, a secret: bring it to {wanted.name}, and delete it then",
+        f"there: rmpa trust join --accept {out.name} --ca {ca} --name {wanted.name}",
+    )
 
 
 def _write_secret(path: Path, data: bytes) -> None:
     """Write a new file that only this user can read."""
-    import os
-
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as stream:
@@ -220,8 +191,6 @@ def _address(text: str | None) -> tuple[str, int | None]:
     """The host as an IPv4 address, and the port, of ``--address``; empty and ``None`` where it is not given."""
     if text is None:
         return "", None
-    import socket
-
     host, _, port = text.partition(":")
     if port and not (port.isascii() and port.isdigit() and 0 < int(port) < 65_536):
         raise ConfigError("--address", f"{port!r} is no port", "write HOST or HOST:PORT")
@@ -231,66 +200,53 @@ def _address(text: str | None) -> tuple[str, int | None]:
         raise ConfigError("--address", f"{host!r} has no IPv4 address: {error}") from None
 
 
-# --- the module that joins ------------------------------------------------------------------------------------------
-
-
-@click.command(
-    epilog=f"{EXIT_CODES}\n"
-    "\b\nExamples:\n"
-    "  rmpa trust join rmpa1-...                 with a token of rmpa trust invite\n"
-    "  rmpa trust join -                         the token from standard input, not in the process list\n"
-    "  rmpa trust join --request arm2.csr        offline: bring this file to the authority ...\n"
-    "  rmpa trust join --accept arm2.csr.answer --ca 4f2a...   ... and its answer back\n"
+@trust_verb(
+    argument("token", required=False),
+    click.option("--request", metavar="FILE", help="Join by files: write the request."),
+    click.option("--accept", metavar="FILE", help="Join by files: read the answer."),
+    click.option(
+        "--ca", metavar="FINGERPRINT", help="With --accept: of the CA, as rmpa trust invite --sign shows it."
+    ),
 )
-@click.argument("token", required=False)
-@click.option("--request", metavar="FILE", help="Join by files: write the request.")
-@click.option("--accept", metavar="FILE", help="Join by files: read the answer.")
-@click.option("--ca", metavar="FINGERPRINT", help="With --accept: of the CA, as rmpa trust invite --sign shows it.")
-@name_option
-@config_option
-@json_option
-def join(
-    token: str | None,
-    request: str | None,
-    accept: str | None,
-    ca: str | None,
-    name: str | None,
-    file: str | None,
-    as_json: bool,
+def trust_join(
+    module: Module, options: Options, token: str | None, request: str | None, accept: str | None, ca: str | None
 ) -> None:
     """Join a secured mesh with a TOKEN of rmpa trust invite; - reads it from standard input.
 
     The token proves both sides to each other: nothing between the machines can take part without it.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust join rmpa1-...                 with a token of rmpa trust invite
+      rmpa trust join -                         the token from standard input, not in the process list
+      rmpa trust join --request arm2.csr        offline: bring this file to the authority ...
+      rmpa trust join --accept arm2.csr.answer --ca 4f2a...   ... and its answer back
     """
     if sum(each is not None for each in (token, request, accept)) != 1:
         raise ConfigError("rmpa trust join", "needs a TOKEN, --request or --accept", "see rmpa trust join --help")
-    check_library()
-    place = find_place(name, file)
-    if place.store.exists:
-        remedy = "rmpa trust status shows it; rmpa trust leave first, to join anew"
-        raise StartError(f"the module {place.name}", "is a member of a secured mesh already", remedy)
+    module.refuse_member("first, to join anew")
     if request is not None:
-        _write_request(place, Path(request), as_json=as_json)
+        _write_request(module, Path(request), options)
         return
-    files = _accepted(place, Path(accept), ca) if accept is not None else _join_by_token(place, token or "")
-    place.store.save(files)
-    place.store.forget("request.key")
-    start = keep_member_name(place, file)
-    import time
-
+    files = _accepted(module, Path(accept), ca) if accept is not None else _join_by_token(module, token or "")
+    module.store.save(files)
+    module.store.forget("request.key")
+    start = keep_member_name(module)
     from rmpa.trust import certificates
 
     found = certificates.verify(files.certificate, files.ca, None)
-    if as_json:
-        print_json(TrustReply(module=found.name, done=True, expires=int(found.expires)))
+    done = f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before"
+    options.show(TrustReply(module=found.name, done=True, expires=int(found.expires)), done)
+    if options.as_json:
         return
-    print_line(f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before")
     if text := _clock_problem(time.time(), found.issued, by_files=accept is not None):
         warn(text)
-    if place.socket is not None:
-        warn(f"the agent {place.name} runs without trust until it is started again")
+    if module.socket is not None:
+        warn(f"the agent {module.name} runs without trust until it is started again")
     else:
-        print_line(f"Next: {start}; rmpa trust check says what other modules may do here.")
+        click.echo(f"Next: {start}; rmpa trust check says what other modules may do here.")
 
 
 def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
@@ -304,9 +260,7 @@ def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
     return f"{here}: links are refused while they differ by more than {limits.CLOCK_TOLERANCE:.0f} s; set it"
 
 
-def _join_by_token(place: TrustPlace, text: str) -> MemberFiles:
-    import asyncio
-
+def _join_by_token(module: Module, text: str) -> MemberFiles:
     from rmpa.trust.joining import join_mesh
     from rmpa.trust.store import AuthorityPlace
     from rmpa.trust.tokens import Token, TokenError
@@ -315,58 +269,55 @@ def _join_by_token(place: TrustPlace, text: str) -> MemberFiles:
         token = Token.parse(sys.stdin.readline() if text == "-" else text)
     except TokenError as error:
         raise ConfigError("TOKEN", str(error)) from None
-    place.store.check_writable()  # before the token is used up
-    files = asyncio.run(join_mesh(token, place.name))
-    place.store.save_authority(AuthorityPlace("", str(token.address), token.port))
+    module.store.check_writable()  # before the token is used up
+    files = asyncio.run(join_mesh(token, module.name))
+    module.store.save_authority(AuthorityPlace("", str(token.address), token.port))
     return files
 
 
-def _write_request(place: TrustPlace, out: Path, *, as_json: bool) -> None:
+def _write_request(module: Module, out: Path, options: Options) -> None:
     from rmpa.trust import certificates
     from rmpa.trust import store as files_of
     from rmpa.trust.authority import request_pem
     from rmpa.trust.membership import new_key, private_key
 
     pem = new_key()
-    request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
+    request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), module.name)
     key = certificates.read_request(request).key_hash[: limits.FINGERPRINT_BYTES].hex()
-    place.store.write(files_of.REQUEST_KEY, pem)
+    module.store.write(files_of.REQUEST_KEY, pem)
     try:
         out.write_bytes(request_pem(request))
     except OSError as error:
         raise StartError(str(out), f"cannot be written: {error.strerror}") from None
-    if as_json:
-        print_json({"module": place.name, "key": key, "file": str(out)})
-    else:
-        print_line(f"{out} is the request of {place.name}, with the key {grouped(key)}; it is no secret")
-        print_line(f"at the authority: rmpa trust invite --sign {out.name}")
+    options.show(
+        {"module": module.name, "key": key, "file": str(out)},
+        f"{out} is the request of {module.name}, with the key {grouped(key)}; it is no secret",
+        f"at the authority: rmpa trust invite --sign {out.name}",
+    )
 
 
-def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
+def _accepted(module: Module, path: Path, ca: str | None) -> MemberFiles:
     """The files of the answer in a join by files.
 
     Raises:
         ConfigError: It is no answer, or of another authority, another module or another key.
     """
-    import msgspec
-
     from rmpa.trust import certificates
     from rmpa.trust import store as files_of
     from rmpa.trust.joining import check_grant
     from rmpa.trust.membership import private_key
-    from rmpa.trust.store import MemberFiles
     from rmpa.trust.tokens import CertificateGrant
 
     digits = re.sub(r"[\s:]", "", ca or "").lower()
     if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):
         raise ConfigError("--ca", f"is not {_FINGERPRINT} hexadecimal digits", "rmpa trust invite --sign shows them")
-    pem = place.store.load_request_key()
-    own = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), place.name)
+    pem = module.store.load_request_key()
+    own = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), module.name)
     try:
         with path.open("rb") as stream:
             answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=CertificateGrant)
         certificates.check_ca(answer.ca, bytes.fromhex(digits))
-        check_grant(answer, place.name, own)
+        check_grant(answer, module.name, own)
     except OSError as error:
         raise ConfigError(str(path), f"cannot be read: {error.strerror}") from None
     except (msgspec.MsgspecError, UnicodeError) as error:
@@ -374,4 +325,4 @@ def _accepted(place: TrustPlace, path: Path, ca: str | None) -> MemberFiles:
     except TrustError as error:
         text = str(error).replace("of the token", "of --ca")
         raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
-    return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)
+    return files_of.MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)
