@@ -42,18 +42,15 @@ assert isinstance(cli, LazyGroup)
 ALL = commands(cli)
 
 
-@pytest.mark.parametrize(("path", "command"), [(path, command) for path, _, command in ALL])
-def test_each_command_has_help(path: str, command: click.Command) -> None:
-    result = CliRunner().invoke(cli, [*path.split()[1:], "--help"])
-    assert result.exit_code == 0
-    if not isinstance(command, LazyGroup) and path != "rmpa core":
-        assert "Examples:" in result.output, path
-
-
-@pytest.mark.parametrize(("path", "command"), [(path, command) for path, _, command in ALL])
-def test_each_command_but_those_without_an_answer_has_json(path: str, command: click.Command) -> None:
-    if path.split()[1] in ("peer", "topic") and not isinstance(command, LazyGroup):
-        assert any("--json" in parameter.opts for parameter in command.params), path
+def test_each_command_has_help_and_each_of_a_graph_has_json() -> None:
+    for path, _, command in ALL:
+        result = CliRunner().invoke(cli, [*path.split()[1:], "--help"])
+        assert result.exit_code == 0, path
+        if isinstance(command, LazyGroup):
+            continue
+        assert "Examples:" in result.output or path == "rmpa core" or path.startswith("rmpa config "), path
+        if path.split()[1] in ("peer", "topic"):
+            assert any("--json" in parameter.opts for parameter in command.params), path
 
 
 @pytest.mark.parametrize("command", ["up", "core"])
@@ -73,20 +70,8 @@ QUIET = {
 """These need neither an agent nor a master."""
 
 
-@pytest.mark.parametrize(
-    ("path", "command"),
-    [
-        (path, command)
-        for path, _, command in ALL
-        if path not in QUIET and any("--json" in parameter.opts for parameter in command.params)
-    ],
-)
 def test_an_error_is_json_too(
-    path: str,
-    command: click.Command,
-    place: Place,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where neither an agent nor a master answers, and whatever is named is not there."""
     for name in [name for name in os.environ if name.startswith(("ROS_", "RMPA_"))]:
@@ -94,17 +79,24 @@ def test_an_error_is_json_too(
     monkeypatch.setenv("RMPA_RUNTIME_DIR", str(place.path))
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9/")
     monkeypatch.chdir(place.path)
-    arguments = [
-        WORDS.get(parameter.name or "", "nothere")
-        for parameter in command.params
-        if isinstance(parameter, click.Argument) and (parameter.required or parameter.name == "names")
+    with_json = [
+        (path, command)
+        for path, _, command in ALL
+        if path not in QUIET and any("--json" in parameter.opts for parameter in command.params)
     ]
-    code = main([*path.split()[1:], *arguments, "--json"])
-    out, err = capsys.readouterr()
-    said = json.loads(out)
-    assert code in {1, 2}, out
-    assert list(said) == ["error"]
-    assert said["error"] in " ".join(err.split()) or said["error"] in err
+    assert len(with_json) > 40
+    for path, command in with_json:
+        arguments = [
+            WORDS.get(parameter.name or "", "nothere")
+            for parameter in command.params
+            if isinstance(parameter, click.Argument) and (parameter.required or parameter.name == "names")
+        ]
+        code = main([*path.split()[1:], *arguments, "--json"])
+        out, err = capsys.readouterr()
+        said = json.loads(out)
+        assert code in {1, 2}, out
+        assert list(said) == ["error"]
+        assert said["error"] in " ".join(err.split()) or said["error"] in err, path
 
 
 def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
