@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hypothesis import given
-from hypothesis import strategies as st
-
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import EntityKind, Ros2Endpoint, Ros2Node, Ros2Qos
 from rmpa.gateway.ros2.graph import Ros2Graph, valid_name
@@ -74,11 +71,3 @@ def test_names_that_ros2_does_not_allow_are_told_apart() -> None:
     assert valid_name("/a/b_1")
     for name in ("/1a", "/a/2", "a", "/", "/a/", "/a b", "/" + "x" * 300):
         assert not valid_name(name), name
-
-
-@given(st.lists(st.tuples(st.text(max_size=80), st.booleans())))
-def test_any_text_is_a_token_or_ignored(changes: list[tuple[str, bool]]) -> None:
-    graph = Ros2Graph(0, "cd")
-    for key, alive in changes:
-        graph.change(key, alive=alive)
-        graph.change(f"@ros2_lv/0/{key}", alive=alive)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
@@ -54,12 +50,6 @@ def test_a_loop_is_bounded() -> None:
     path = tuple(f"s{number}" for number in range(limits.PATH_MAX + 1))
     with pytest.raises(RemoteProtocolError, match="sites"):
         AttachmentReader().read(MessageSource("0" * 32, "/n", path).writer()(1, 0))
-
-
-@given(st.binary(max_size=120) | st.binary(max_size=60).map(GOLDEN[:34].__add__))
-def test_any_bytes_are_an_attachment_or_refused(data: bytes) -> None:
-    with contextlib.suppress(RemoteProtocolError):
-        AttachmentReader().read(data)
 
 
 def test_the_run_is_read_back_and_a_reader_knows_each_source_again() -> None:

@@ -38,7 +38,7 @@ class Ros2Publisher:
 
     def __init__(self, bed: Ros2TopicBed, endpoint: Ros2Endpoint) -> None:
         self.endpoint = endpoint
-        self._types = bed.types
+        self._bed = bed
         self._publisher = bed.ros2.publisher(endpoint.key(), zenoh_qos(endpoint.qos), self._matching)
         self._token = bed.ros2.token(endpoint.token())
         self.wanted = False
@@ -53,8 +53,7 @@ class Ros2Publisher:
         self._publisher.put(payload, Ros2Attachment(self.sequence, 1, self.gid).serialize())
 
     def say(self, text: str, *, skip: int = 0) -> None:
-        name = "std_msgs/msg/String"
-        self.put(bytes(self._types.store.serialize_cdr(self._types.store.types[name](text), name)), skip=skip)
+        self.put(self._bed.cdr("std_msgs/msg/String", data=text), skip=skip)
 
     def close(self) -> None:
         self._token.close()
@@ -111,8 +110,11 @@ class Ros2TopicBed:
         declared = self.ros2.subscribe(endpoint.key(), heard.append, history=history)
         return [declared, self.ros2.token(endpoint.token())]
 
-    def read(self, sample: ZenohSample, name: str = "std_msgs/msg/String") -> Any:
-        return self.types.store.deserialize_cdr(sample.payload, name)
+    def cdr(self, name: str, **values: Any) -> bytes:
+        return bytes(self.types.store.serialize_cdr(self.types.store.types[name](**values), name))
+
+    def read(self, raw: bytes, name: str = "std_msgs/msg/String") -> Any:
+        return self.types.store.deserialize_cdr(raw, name)
 
     def own(self, kind: EntityKind) -> list[Ros2Endpoint]:
         """What the gateway shows in ROS 2's graph."""

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings
+from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos
 from rmpa.gateway.ros2.graph import gid_of
-from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
-from tests.gateway.memory_graph import MemoryGraph
-from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, MemoryZenoh, eventually
+from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, eventually
+from tests.gateway.ros2.io.ros2_bed import Ros2TopicBed, topic_bed
 from tests.gateway.ros2.type_descriptions import response
 
 if TYPE_CHECKING:
@@ -28,41 +27,12 @@ ADD = ServiceType("rospy_tutorials/AddTwoInts")
 ADD_2 = "example_interfaces/srv/AddTwoInts"
 
 
-class Bed:
-    """A gateway's neighbour ROS 2, and one program of ROS 2."""
-
-    def __init__(self, rules: tuple[CrossingRule, ...] = ()) -> None:
-        self.network = MemoryZenoh()
-        self.graph = MemoryGraph()
-        self.ros2 = self.network.session()
-        settings = GatewaySettings(rules=rules)
-        self.neighbour = Ros2Neighbour(cast("Any", self.graph), cast("Any", self.network.session()), settings)
-        self.types = Ros2Types("jazzy")
-        self.types.service_hash(ADD, ADD_2)
-        self.types.service_hash(SET_BOOL)
-
-    def endpoint(self, kind: EntityKind, name: str, type_name: str, node: str = "/bot") -> Ros2Endpoint:
-        return Ros2Endpoint(
-            Ros2Node(0, self.ros2.zid, 0, node), 1, kind, name, type_name, self.types.type_hash(type_name), Ros2Qos()
-        )
-
-    def cdr(self, name: str, **values: Any) -> bytes:
-        return bytes(self.types.store.serialize_cdr(self.types.store.types[name](**values), name))
-
-    def read(self, name: str, raw: bytes) -> Any:
-        return self.types.store.deserialize_cdr(raw, name)
-
-    def tokens(self, kind: EntityKind) -> list[Ros2Endpoint]:
-        parsed = [parse_token(key) for key in self.network.token_keys]
-        return [each for each in parsed if isinstance(each, Ros2Endpoint) and each.kind is kind]
-
-
 @pytest.fixture
-async def bed() -> AsyncIterator[Bed]:
-    made = Bed()
-    made.neighbour.start()
-    yield made
-    await made.neighbour.close()
+async def bed() -> AsyncIterator[Ros2TopicBed]:
+    async with topic_bed() as made:
+        for kind, name in ((ADD, ADD_2), (SET_BOOL, "")):
+            made.types.service_hash(kind, name)
+        yield made
 
 
 def add(request: bytes) -> bytes:
@@ -78,23 +48,37 @@ def serve_ros2(session: MemorySession, endpoint: Ros2Endpoint, answer: Callable[
     return session.token(endpoint.token())
 
 
-async def test_a_service_of_a_module_is_called_by_ros2(bed: Bed) -> None:
+def describes(bed: Ros2TopicBed, node: Ros2Node, types: Ros2Types, name: str) -> list[bytes]:
+    """A node of ROS 2 describes a type; returns what it was asked."""
+    asked: list[bytes] = []
+    names = f"{node.name}/get_type_description", SERVICE_TYPE, "RIHS01_" + "1" * 64
+
+    def describe(query: MemoryQuery) -> None:
+        asked.append(query.payload)
+        query.reply(query.key, response(types, name), query.attachment)
+        query.finish()
+
+    serve_ros2(bed.ros2, Ros2Endpoint(node, 2, EntityKind.SERVICE, *names, Ros2Qos()), describe)
+    return asked
+
+
+async def test_a_service_of_a_module_is_called_by_ros2(bed: Ros2TopicBed) -> None:
     bed.graph.server("/add", ADD, add, node="/adder")
-    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
-    (token,) = bed.tokens(EntityKind.SERVICE)
+    await eventually(lambda: bed.own(EntityKind.SERVICE))
+    (token,) = bed.own(EntityKind.SERVICE)
     assert (token.name, token.type, token.node.name) == ("/add", ADD_2, "/rmpa/arm/adder")
     client = bed.endpoint(EntityKind.CLIENT, "/add", ADD_2)
     asked = Ros2Attachment(7, 1000, gid_of(client.token()))
     (reply,) = await bed.ros2.get(client.key(), bed.cdr(f"{ADD_2}_Request", a=4, b=5), asked.serialize())
     assert reply.ok
-    assert bed.read(f"{ADD_2}_Response", reply.payload).sum == 9
+    assert bed.read(reply.payload, f"{ADD_2}_Response").sum == 9
     answered = Ros2Attachment.parse(reply.attachment)
     assert (answered.sequence, answered.gid) == (7, asked.gid), "rmw_zenoh finds its request by these"
 
 
-async def test_a_call_that_fails_is_no_response_of_ros2(bed: Bed) -> None:
+async def test_a_call_that_fails_is_no_response_of_ros2(bed: Ros2TopicBed) -> None:
     bed.graph.server("/add", ADD, add)
-    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    await eventually(lambda: bed.own(EntityKind.SERVICE))
     client = bed.endpoint(EntityKind.CLIENT, "/add", ADD_2)
     attachment = Ros2Attachment(1, 0, bytes(16)).serialize()
     for request, why in ((bed.cdr(f"{ADD_2}_Request", a=-1, b=5), b"below 0"), (b"\0\1\0\0", b"cannot convert")):
@@ -105,29 +89,29 @@ async def test_a_call_that_fails_is_no_response_of_ros2(bed: Bed) -> None:
     assert not reply.ok
 
 
-async def test_a_service_that_is_gone_is_gone_in_ros2(bed: Bed) -> None:
+async def test_a_service_that_is_gone_is_gone_in_ros2(bed: Ros2TopicBed) -> None:
     source = bed.graph.server("/add", ADD, add)
-    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
+    await eventually(lambda: bed.own(EntityKind.SERVICE))
     bed.graph.remove(source)
     assert bed.network.token_keys == []
     assert bed.network.queryables == []
 
 
-async def test_of_two_servers_of_one_name_one_is_called(bed: Bed) -> None:
+async def test_of_two_servers_of_one_name_one_is_called(bed: Ros2TopicBed) -> None:
     first = bed.graph.server("/add", ADD, add, node="/one")
     bed.graph.server("/add", ADD, add, node="/two")
-    await eventually(lambda: bed.tokens(EntityKind.SERVICE))
-    assert [each.node.name for each in bed.tokens(EntityKind.SERVICE)] == ["/rmpa/arm/one"]
+    await eventually(lambda: bed.own(EntityKind.SERVICE))
+    assert [each.node.name for each in bed.own(EntityKind.SERVICE)] == ["/rmpa/arm/one"]
     bed.graph.remove(first)
-    await eventually(lambda: [each.node.name for each in bed.tokens(EntityKind.SERVICE)] == ["/rmpa/arm/two"])
+    await eventually(lambda: [each.node.name for each in bed.own(EntityKind.SERVICE)] == ["/rmpa/arm/two"])
 
 
-async def test_a_service_of_ros2_is_called_by_a_node(bed: Bed) -> None:
+async def test_a_service_of_ros2_is_called_by_a_node(bed: Ros2TopicBed) -> None:
     server = bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/calculator")
     seen: list[Ros2Attachment] = []
 
     def answer(query: MemoryQuery) -> None:
-        request = bed.read(f"{ADD_2}_Request", query.payload)
+        request = bed.read(query.payload, f"{ADD_2}_Request")
         seen.append(Ros2Attachment.parse(query.attachment))
         query.reply(query.key, bed.cdr(f"{ADD_2}_Response", sum=request.a + request.b), query.attachment)
         query.finish()
@@ -142,11 +126,11 @@ async def test_a_service_of_ros2_is_called_by_a_node(bed: Bed) -> None:
     for number in (1, 2):
         response = await service.serve(ADD.request.serialize(ADD.request.make({"a": number, "b": 2})))
         assert ADD.response.deserialize(response).sum == number + 2
-    (client,) = bed.tokens(EntityKind.CLIENT)
+    (client,) = bed.own(EntityKind.CLIENT)
     assert [(each.sequence, each.gid) for each in seen] == [(1, gid_of(client.token())), (2, gid_of(client.token()))]
 
 
-async def test_an_error_of_ros2_and_a_server_that_is_gone_are_the_clients_error(bed: Bed) -> None:
+async def test_an_error_of_ros2_and_a_server_that_is_gone_are_the_clients_error(bed: Ros2TopicBed) -> None:
     server = bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2)
     queries: list[MemoryQuery] = []
     serve_ros2(bed.ros2, server, queries.append)
@@ -164,7 +148,7 @@ async def test_an_error_of_ros2_and_a_server_that_is_gone_are_the_clients_error(
         await call
 
 
-async def test_the_next_server_of_a_name_takes_over(bed: Bed) -> None:
+async def test_the_next_server_of_a_name_takes_over(bed: Ros2TopicBed) -> None:
     one = serve_ros2(bed.ros2, bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/one"), lambda _: None)
     await eventually(lambda: "/sum" in bed.graph.services)
     two = serve_ros2(bed.ros2, bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2, node="/two"), lambda _: None)
@@ -174,7 +158,7 @@ async def test_the_next_server_of_a_name_takes_over(bed: Bed) -> None:
     await eventually(lambda: not bed.graph.services)
 
 
-async def test_a_service_whose_definition_differs_is_reported_and_not_shown(bed: Bed) -> None:
+async def test_a_service_whose_definition_differs_is_reported_and_not_shown(bed: Ros2TopicBed) -> None:
     node = Ros2Node(0, bed.ros2.zid, 0, "/other")
     other = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/sum", ADD_2, "RIHS01_" + "0" * 64, Ros2Qos())
     unknown = Ros2Endpoint(node, 2, EntityKind.SERVICE, "/odd", "odd_msgs/srv/Odd", "RIHS01_" + "0" * 64, Ros2Qos())
@@ -196,19 +180,12 @@ GRIP = ServiceType(
 GRIP_2 = "arm_msgs/srv/Grip"
 
 
-async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_called(bed: Bed) -> None:
+async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_called(bed: Ros2TopicBed) -> None:
     theirs = Ros2Types("jazzy")
     type_hash = theirs.service_hash(GRIP)
     node = Ros2Node(0, bed.ros2.zid, 0, "/gripper")
     server = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/grip", GRIP_2, type_hash, Ros2Qos())
-    names = "/gripper/get_type_description", SERVICE_TYPE, "RIHS01_" + "1" * 64
-    describer = Ros2Endpoint(node, 2, EntityKind.SERVICE, *names, Ros2Qos())
-    asked: list[bytes] = []
-
-    def describe(query: MemoryQuery) -> None:
-        asked.append(query.payload)
-        query.reply(query.key, response(theirs, GRIP_2), query.attachment)
-        query.finish()
+    asked = describes(bed, node, theirs, GRIP_2)
 
     def answer(query: MemoryQuery) -> None:
         request: Any = theirs.store.deserialize_cdr(query.payload, f"{GRIP_2}_Request")
@@ -219,7 +196,6 @@ async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_c
         query.finish()
 
     serve_ros2(bed.ros2, server, answer)
-    serve_ros2(bed.ros2, describer, describe)
     await eventually(lambda: "/grip" in bed.graph.services)
     service = bed.graph.services["/grip"]
     description = await service.describe()
@@ -231,7 +207,9 @@ async def test_a_service_of_a_type_that_ros1_lacks_is_learnt_from_its_node_and_c
     assert len(asked) == 1
 
 
-async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_its_node_describes(bed: Bed) -> None:
+async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_its_node_describes(
+    bed: Ros2TopicBed,
+) -> None:
     theirs = Ros2Types("jazzy").variant({})
     wider = ServiceType("std_srvs/SetBool", "bool data\nstring why\n---\nbool success\nstring message\n")
     name = "std_srvs/srv/SetBool"
@@ -240,13 +218,7 @@ async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_it
         theirs.store.types.pop(name + part, None)
     node = Ros2Node(0, bed.ros2.zid, 0, "/motor")
     server = Ros2Endpoint(node, 1, EntityKind.SERVICE, "/on", name, theirs.service_hash(wider), Ros2Qos())
-    names = "/motor/get_type_description", SERVICE_TYPE, "RIHS01_" + "1" * 64
-    describer = Ros2Endpoint(node, 2, EntityKind.SERVICE, *names, Ros2Qos())
-
-    def describe(query: MemoryQuery) -> None:
-        query.reply(query.key, response(theirs, name), query.attachment)
-        query.finish()
-
+    describes(bed, node, theirs, name)
     asked: list[bytes] = []
 
     def answer(query: MemoryQuery) -> None:
@@ -256,7 +228,6 @@ async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_it
         query.finish()
 
     serve_ros2(bed.ros2, server, answer)
-    serve_ros2(bed.ros2, describer, describe)
     await eventually(lambda: "/on" in bed.graph.services)
     service = bed.graph.services["/on"]
     assert (await service.describe()).md5sum == SET_BOOL.md5sum
@@ -268,18 +239,13 @@ async def test_a_service_that_differs_from_ros1s_is_called_by_the_fields_that_it
 
 async def test_rules_and_use_decide_what_crosses() -> None:
     private = CrossingRule(names=("/private/**",), crossing=Crossing.NONE)
-    bed = Bed((private, CrossingRule(name="/{site}{name}")))
-    bed.neighbour.start()
-    try:
+    async with topic_bed(rules=(private, CrossingRule(name="/{site}{name}"))) as bed:
+        bed.types.service_hash(ADD, ADD_2)
         bed.graph.server("/private/add", ADD, add)
         bed.graph.server("/talker/set_logger_level", ServiceType("roscpp/SetLoggerLevel"), add)
         bed.graph.server("/add", ADD, add)
         bed.ros2.token(bed.endpoint(EntityKind.SERVICE, "/private/sum", ADD_2).token())
         bed.ros2.token(bed.endpoint(EntityKind.SERVICE, "/sum", ADD_2).token())
-        await eventually(lambda: bed.tokens(EntityKind.SERVICE) and bed.graph.services)
-        own = [each.name for each in bed.tokens(EntityKind.SERVICE) if each.node.zid != bed.ros2.zid]
-        assert own == ["/add"]
+        await eventually(lambda: bed.own(EntityKind.SERVICE) and bed.graph.services)
+        assert [each.name for each in bed.own(EntityKind.SERVICE)] == ["/add"]
         assert list(bed.graph.services) == ["/ros2/sum"]
-    finally:
-        await bed.neighbour.close()
-    assert all(f"/{bed.ros2.zid}/" in key for key in bed.network.token_keys)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
-from rmpa.core.contract import ContractRule, Contracts, History, Reliability
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ZenohQos
 from rmpa.gateway.ros2.conversion import Conversion
@@ -14,9 +13,7 @@ from rmpa.gateway.ros2.format import (
     EntityKind,
     Ros2Attachment,
     Ros2Durability,
-    Ros2History,
     Ros2Qos,
-    Ros2Reliability,
 )
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
@@ -56,7 +53,7 @@ async def test_a_topic_of_a_module_is_a_publisher_of_ros2() -> None:
         for text in ("one", "zwei"):
             bed.graph.send(source, string(text))
         await eventually(lambda: len(heard) == 2)
-        assert [bed.read(each).data for each in heard] == ["one", "zwei"]
+        assert [bed.read(each.payload).data for each in heard] == ["one", "zwei"]
         attached = [Ros2Attachment.parse(each.attachment) for each in heard]
         assert [each.sequence for each in attached] == [1, 2]
         assert {each.gid for each in attached} == {gid_of(endpoint.token())}
@@ -81,7 +78,7 @@ async def test_a_late_node_of_ros2_gets_the_latched_message() -> None:
         late: list[ZenohSample] = []
         bed.subscribe("/map", late, qos=LATCHED)
         await eventually(lambda: late)
-        assert [bed.read(each).data for each in late] == ["new"]
+        assert [bed.read(each.payload).data for each in late] == ["new"]
         assert bed.graph.taps, "the last message is followed, for later ones"
 
 
@@ -168,20 +165,6 @@ async def test_a_subscription_with_another_hash_or_type_is_told() -> None:
         assert "/humble" in heard.text
         for each in ends:
             each.close()
-
-
-async def test_contracts_are_the_qos_of_ros2() -> None:
-    rules = (
-        ContractRule(("/scan",), (), {"reliability": Reliability.BEST_EFFORT, "deadline": 0.5}),
-        ContractRule(("/log",), (), {"history": History.KEEP_ALL}),
-    )
-    async with topic_bed(contracts=Contracts(rules)) as bed:
-        for name in ("/scan", "/log", "/plain"):
-            bed.graph.publisher(name, STRING)
-        qos = {each.name: each.qos for each in bed.own(EntityKind.PUBLISHER)}
-        assert qos["/plain"] == Ros2Qos()
-        assert (qos["/scan"].reliability, qos["/scan"].deadline) == (Ros2Reliability.BEST_EFFORT, 500_000_000)
-        assert qos["/log"].history is Ros2History.KEEP_ALL
 
 
 async def test_humble_has_no_hash_and_longer_gids() -> None:
