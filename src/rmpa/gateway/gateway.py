@@ -7,7 +7,7 @@ import contextlib
 import logging
 import random
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.neighbour import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
+
+# Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it.
+_AGENTS_LOOK_PERIOD: Final = 5.0
+# The longest time in seconds between two attempts to open a session.
+_OPEN_RETRY_MAX: Final = 5.0
 
 _log = logging.getLogger(__name__)
 
@@ -135,7 +140,7 @@ class Gateway:
 
     async def _run(self) -> None:
         """Open the session until it is open; make neighbours and session anew where other rules hold."""
-        backoff = Backoff(limits.OPEN_RETRY_FIRST, limits.OPEN_RETRY_MAX, random.random)
+        backoff = Backoff(limits.OPEN_RETRY_FIRST, _OPEN_RETRY_MAX, random.random)
         while True:
             if self.session is None:
                 await asyncio.sleep(backoff.delay())
@@ -262,7 +267,7 @@ async def _keep_checking(check: Callable[[], None]) -> None:
         StartError: It may not.
     """
     while True:
-        await asyncio.sleep(limits.AGENTS_LOOK_PERIOD)
+        await asyncio.sleep(_AGENTS_LOOK_PERIOD)
         try:
             await asyncio.to_thread(check)
         except StartError:

@@ -6,39 +6,19 @@ from typing import Final
 
 from rmpa.core.limits import MIB
 
-AGENTS_LOOK_PERIOD: Final = 5.0
-"""Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it."""
 KEY_MAX: Final = 2048
 """Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
 read; the longest that ROS names and types make is some 900."""
-GID_MAX: Final = 255
-"""Bytes of the source's GID in an attachment of ROS 2: its length is one byte."""
 QOS_NUMBER_MAX: Final = 2**63 - 1
 """The largest number in a QoS of ROS 2: they are 64-bit there."""
-ENTITY_ID_MAX: Final = 2**64 - 1
-"""The largest number of a node or an endpoint in a liveliness token."""
-DOMAIN_MAX: Final = 2**32 - 1
-"""The largest ROS domain id in a key; ROS 2 uses 0 to 232."""
 PATH_MAX: Final = 8
 """Sites that a message passes at most; more mean a loop."""
-SERVICE_DESCRIPTION_MAX: Final = 8192
-"""Bytes of the description of another site's service: four names."""
 SITE_CALLS_AT_ONCE: Final = 32
 """Calls of other sites that one service gets at once, as many as an agent opens connections to a server for."""
 SITE_CALLS_WAITING: Final = 1024
 """Calls of other sites that may wait for one service; further ones are refused at once."""
-SITE_CALL_BYTES: Final = 256 * MIB
-"""Bytes of the requests of other sites that are under way here: four of the largest."""
-SITE_CALL_GRACE: Final = 1.0
-"""Seconds that the calling site waits longer than the serving one, whose error text tells more."""
-DESCRIBE_TIMEOUT: Final = 10.0
-"""Seconds for the description of another site's service; its server may be probed for it over two meshes."""
 LATCH_LOOK_AFTER: Final = 5.0
 """Seconds that a topic is there before the gateway asks its publisher whether it is latched."""
-LATCH_LOOK_TIMEOUT: Final = 10.0
-"""Seconds for the publisher's answer to that."""
-LATCH_LOOKS_AT_ONCE: Final = 2
-"""Publishers that are asked that at once: each opens a route in the mesh for a moment."""
 SITE_WHY_MAX: Final = MIB // 16
 """Bytes of what another site's gateway tells of a topic for ``rmpa why``."""
 SITES_REMEMBERED_MAX: Final = 256
@@ -47,18 +27,12 @@ SITE_REPORT_SOURCES_MAX: Final = 5000
 """Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
 SITE_ACTIONS_MAX: Final = 1024
 """Connections under the names of other sites' action servers: two for each pair of a client and a server."""
-SITE_ASK_TIMEOUT: Final = 5.0
-"""Seconds for a question to another site's gateway."""
-SITE_PARAMS_AT_ONCE: Final = 256
-"""Questions of other sites about parameters that are answered at once."""
 SITE_PARAM_BYTES_MAX: Final = 64 * MIB
 """Bytes of one question or answer about parameters between gateways: some of the largest values."""
 SITE_PARAM_TIMEOUT: Final = 20.0
 """Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
 SITE_NAME_MAX: Final = 63
 """Characters of a site's name, as for a module's name and for a label of DNS."""
-NODE_NAME_MAX: Final = 255
-"""Bytes of a node's name in an attachment."""
 ROS2_NAME_MAX: Final = 255
 """Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
 ROS2_NODES_MAX: Final = 2000
@@ -98,9 +72,6 @@ SITES_SOURCES_MAX: Final = 65_536
 can announce more; they are counted as ``site.limit`` and left out."""
 SITE_NAMES_WAITING_MAX: Final = 64
 """Sources that wait for one name here which another one holds; each is judged again whenever it is free."""
-SITE_SETTLE: Final = 0.05
-"""Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
-one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn."""
 SITE_GRACE: Final = 0.5
 """Seconds for which the sources of a site stay when its leading gateway, or the way to it, is lost: longer than
 another gateway of that site needs to take over. A site that is frozen is noticed within 1 s by Zenoh's lease, and
@@ -110,26 +81,8 @@ LEADER_PATIENCE: Final = 0.3
 other sites keep the sources."""
 HEADER_MAX: Final = 512 * 1024
 """Bytes of a publisher's header from another site, with the definition; the longest of ROS 1 has some 30 KB."""
-HEADER_TIMEOUT: Final = 5.0
-"""Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first."""
-HEADER_RETRY: Final = 2.0
-"""Seconds at most until a header is asked for again, when there was no answer and nodes wait for it; at first a
-sixteenth."""
-HEADER_QUERIES_MAX: Final = 64
-"""Queries that wait for the header of one publisher; further ones are refused at once."""
-TAP_LINGER: Final = 2.0
-"""Seconds for which a publisher stays connected after its header was asked for: its subscriber comes right after."""
 HELD_MESSAGES_MAX: Final = 1000
 """Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
-HELD_BYTES: Final = 64 * 1024 * 1024
-"""Bytes that wait likewise; one message always fits."""
-LATCHED_NODES_MAX: Final = 64
-"""Nodes that publish one latched topic of another site, and of which no node here wants one, whose last message is
-kept."""
-DEMAND_LINGER: Final = 1.0
-"""Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh."""
-LIMIT_BURST: Final = 0.5
-"""Seconds of a topic's limit of rate or size that may cross at once after a rest: jitter must not cost messages."""
 BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
 """Bytes of one best-effort topic that wait for a slow link: what is older than that is of no use. One message always
 fits, and a burst of 1,000 small ones."""
@@ -138,13 +91,6 @@ RELIABLE_BYTES: Final = 64 * 1024 * 1024
 LARGE_MESSAGE: Final = 8 * 1024
 """Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
 1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
-COLLECTED_MESSAGES: Final = 256
-"""Messages of one read that are collected before they are queued for other sites; the read may go on for longer."""
-IDLE_CHECK: Final = 1.0
-"""Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
-leave no gap."""
-IDLE_CHECK_MAX: Final = 60.0
-"""Seconds between two such questions at most: the pause doubles while no message comes."""
 RESUMED_WITHIN: Final = 10.0
 """Seconds after a topic of another site is back within which a subscriber counts as the one from before: what was
 lost meanwhile is counted. roscpp's and rospy's nodes are back within two."""
@@ -155,15 +101,6 @@ ROS2_CALL_TIMEOUT: Final = 600.0
 server that dies ends its calls at once."""
 ROS2_CALLS_MAX: Final = 64
 """Calls of one service that are under way at one time, each way; the next one gets an error."""
-ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
-"""Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles."""
-ROS2_LINGER: Final = 5.0
-"""Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
-publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s."""
-ROS2_EARLY_MESSAGES: Final = 1000
-"""Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard."""
-ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
-"""Bytes of these."""
 ROS2_PUBLISHERS_MAX: Final = 1000
 """Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
 ROS2_ASKS_MAX: Final = 200
@@ -176,27 +113,16 @@ CERTIFICATE_LOOK_PERIOD: Final = 5.0
 is each 3.5 days, or a module has joined that the table of access must name. Some 2 ms each."""
 OPEN_RETRY_FIRST: Final = 0.5
 """Seconds until a session is opened again, at first, whose router did not answer."""
-OPEN_RETRY_MAX: Final = 5.0
-"""The longest time in seconds between two attempts to open a session."""
 ROS2_GOALS_MAX: Final = 1000
 """Goals of one action that are known at one time, each way; the next one is rejected."""
 ROS2_GOAL_KEPT: Final = 5.0
 """Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``."""
 ROS2_RESULT_KEPT: Final = 60.0
 """Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10."""
-ROS2_STATUS_PERIOD: Final = 0.2
-"""Seconds between two messages of an action's status in ROS 1; actionlib's ``status_frequency`` is 5 Hz, and its
-clients count a server as lost after 5 s without one."""
 ROS2_ACCEPT_TIMEOUT: Final = 10.0
 """Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted."""
 ROS2_ACTIONS_MAX: Final = 500
 """Actions that are joined, each way; the others are reported."""
-ROS2_GOAL_TIMEOUT: Final = 86_400.0
-"""Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once."""
-ROS2_LAST_RESULTS: Final = 1.0
-"""Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave."""
-ROS2_ACTION_READY: Final = 5.0
-"""Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused."""
 
 
 # Every bound of the gateway's Zenoh session, with unit and reason.
@@ -216,33 +142,6 @@ what is large on every slow link. A dead transport ends by its lease. A put that
 Zenoh closes a transport behind which one message, with all its fragments, waits for longer than ``BLOCK_MAX``."""
 DROP_WAIT_MAX: Final = 300.0
 """Seconds that all fragments of a message may wait together: 32 MB at 1 Mbit/s."""
-SEND_BUFFER: Final = 0.125
-"""Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
-there are no priorities: on 1 Mbit/s with images a command waited 2.7 s with Linux's own size, 0.3 s with this one,
-and as many images came."""
-SEND_BUFFER_MIN: Final = 4096
-"""Bytes of that buffer at least: the kernel allows no less than about two packets."""
-BATCH: Final = 0.0625
-"""Seconds of the line's rate in one batch of Zenoh, which a message of a higher priority does not overtake."""
-BATCH_MIN: Final = 2048
-"""Bytes of a batch at least."""
-BATCH_MAX: Final = 65_535
-"""Bytes of a batch at most: Zenoh's own."""
-UNSENT_BYTES: Final = 16_384
-"""Bytes of one connection that the kernel may hold unsent (TCP_NOTSENT_LOWAT): a command does not overtake them.
-On 1 Mbit/s with images a command waited 1.0 s with it and 3.4 s without it, both without ``uplink``."""
-LOOK_AT_LINKS: Final = 2.0
-"""Seconds between two looks at which connections Zenoh has, to bound what the kernel holds of new ones."""
-RECONNECT_FIRST: Final = 0.2
-"""Seconds before the first attempt to reach a router again."""
-RECONNECT_MAX: Final = 2.0
-"""Seconds between two later attempts at most; a router that was restarted is reached again within that time."""
-RECONNECT_GROWTH: Final = 1.5
-"""Factor between the waits of two attempts."""
-TURN_MESSAGES: Final = 64
-"""Messages of one publisher that are sent in one turn, while others of its priority wait."""
-TURN_BYTES: Final = 65_536
-"""Bytes of one publisher in one turn: one batch of Zenoh. One message always fits."""
 ARRIVED_MESSAGES: Final = 10_000
 """Messages of one subscriber that wait for the event loop; above it the oldest is dropped, and counted. It is several
 bursts of 1,000, and 30 ms of what the loop can take."""
@@ -273,17 +172,7 @@ ANSWER_BYTES_MAX: Final = 256 * 1024 * 1024
 counted as ``zenoh.answer.limit``: a client that asks and does not read must not fill the memory."""
 ANSWERS_WAITING_MAX: Final = 20_000
 """Answers that wait for Zenoh in all, likewise."""
-DRAIN_MESSAGES: Final = 256
-"""Messages that the event loop takes before it looks at its other work: at most a millisecond or so."""
-DRAIN_BYTES: Final = 8 * 1024 * 1024
-"""Bytes that the event loop takes before it looks at its other work."""
 BUSY_PERIOD: Final = 0.001
 """Seconds between two looks at what arrived while much arrives; the delay that a message may have then."""
-BUSY_MESSAGES: Final = 8
-"""Messages in ``BUSY_PERIOD`` from which on the loop is not woken for each: 8,000 a second."""
 FLUSH_MAX: Final = 1.0
 """Seconds that a publisher which is closed may still send what waits."""
-CLOSE_MAX: Final = 3.0
-"""Seconds that closing a session may take before it is given up; its threads do not keep the process from ending."""
-GET_GRACE: Final = 1.0
-"""Seconds beyond a query's own time-out after which its answers are no longer waited for."""

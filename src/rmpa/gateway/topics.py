@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core.counters import TokenBucket
 from rmpa.core.errors import RmpaError
@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import TopicDescription
+
+# Queries that wait for the header of one publisher; further ones are refused at once.
+_HEADER_QUERIES_MAX: Final = 64
+# Seconds of a topic's limit of rate or size that may cross at once after a rest: jitter must not cost messages.
+_LIMIT_BURST: Final = 0.5
+# Messages of one read that are collected before they are queued for other sites; the read may go on for longer.
+_COLLECTED_MESSAGES: Final = 256
 
 _BOUNDARY = 0.001
 """Seconds by which a timer may be early."""
@@ -66,13 +73,13 @@ class TopicLimits:
 
     Args:
         rate: Messages a second; ``None``: no limit.
-        size: Bytes a second; ``None``: no limit. A message that is larger than ``limits.LIMIT_BURST`` seconds of it
+        size: Bytes a second; ``None``: no limit. A message that is larger than ``_LIMIT_BURST`` seconds of it
             passes after a rest, and later ones wait until it is paid off.
     """
 
     def __init__(self, rate: float | None, size: int | None) -> None:
         self._rate, self._size = (
-            None if each is None else TokenBucket(each, max(1.0, each * limits.LIMIT_BURST)) for each in (rate, size)
+            None if each is None else TokenBucket(each, max(1.0, each * _LIMIT_BURST)) for each in (rate, size)
         )
 
     def admit(self, now: float, size: int) -> bool:
@@ -183,7 +190,7 @@ class Export:
             RmpaError: It does not answer in that time, or cannot cross.
         """
         if self._tap is None or self._tap.description is None:
-            if self._closed or len(self._asking) >= limits.HEADER_QUERIES_MAX:
+            if self._closed or len(self._asking) >= _HEADER_QUERIES_MAX:
                 raise RmpaError("too many questions for this publisher's header wait already, or it has gone")
             answer: asyncio.Future[TopicDescription] = asyncio.get_running_loop().create_future()
             self._asking.append(answer)
@@ -341,7 +348,7 @@ class Export:
         collected.append(payload)
         if len(collected) == 1:
             after_read(self._flush)
-        elif len(collected) >= limits.COLLECTED_MESSAGES:
+        elif len(collected) >= _COLLECTED_MESSAGES:
             self._flush()
 
     def _flush(self) -> None:

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.loop import SystemClock
 
+# Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused.
+_ROS2_ACTION_READY: Final = 5.0
+
 _NODE: Final = "/action_clients"
 """The node that publishes goals and cancellations for all clients of ROS 2, below ``/rmpa/ros2``."""
 _LATCHED: Final = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
@@ -322,7 +325,7 @@ class OfferedAction(JoinedAction):
 
     async def _send_when_ready(self, query: ArrivedQuery) -> None:
         try:
-            async with asyncio.timeout(limits.ROS2_ACTION_READY):
+            async with asyncio.timeout(_ROS2_ACTION_READY):
                 await self._ready.wait()
         except TimeoutError:
             query.reply_error("the action server of ROS 1 does not listen to goals")

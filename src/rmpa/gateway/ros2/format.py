@@ -32,6 +32,13 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contract, Contracts
     from rmpa.ros.wire.tcpros import Buffer
 
+# Bytes of the source's GID in an attachment of ROS 2: its length is one byte.
+_GID_MAX: Final = 255
+# The largest number of a node or an endpoint in a liveliness token.
+_ENTITY_ID_MAX: Final = 2**64 - 1
+# The largest ROS domain id in a key; ROS 2 uses 0 to 232.
+_DOMAIN_MAX: Final = 2**32 - 1
+
 GID_BYTES: Final = 16
 """Bytes of a GID since ROS 2 Jazzy."""
 _HEAD: Final = struct.Struct("<qqB")
@@ -71,7 +78,7 @@ class Ros2Attachment:
             raise RemoteProtocolError(f"an attachment of ROS 2 has {len(raw)} bytes; the least are {_HEAD.size}")
         sequence, stamp, length = _HEAD.unpack_from(raw)
         gid = bytes(raw[_HEAD.size : _HEAD.size + length])
-        if len(gid) < length or length > limits.GID_MAX:
+        if len(gid) < length or length > _GID_MAX:
             raise RemoteProtocolError(f"an attachment of ROS 2 has {len(gid)} bytes of a GID of {length}")
         return cls(sequence, stamp, gid)
 
@@ -428,17 +435,17 @@ def parse_token(key: str) -> Ros2Node | Ros2Endpoint:
         kind = EntityKind(parts[5])
     except ValueError:
         raise RemoteProtocolError(f"{_short(key)}: {parts[5][:20]!r} is no kind of entity") from None
-    domain = _token_number(parts[1], limits.DOMAIN_MAX, key)
+    domain = _token_number(parts[1], _DOMAIN_MAX, key)
     enclave, namespace, name = (_demangle(part) for part in parts[6:9])
     if not name or "/" in name:
         raise RemoteProtocolError(f"{_short(key)} has no name of a node")
     full = f"{_absolute(namespace)}/{name}" if namespace else f"/{name}"
-    node = Ros2Node(domain, parts[2], _token_number(parts[3], limits.ENTITY_ID_MAX, key), full, enclave)
+    node = Ros2Node(domain, parts[2], _token_number(parts[3], _ENTITY_ID_MAX, key), full, enclave)
     if kind is EntityKind.NODE:
         return node
     if len(parts) < _ENDPOINT_PARTS:
         raise RemoteProtocolError(f"{_short(key)} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
-    number = _token_number(parts[4], limits.ENTITY_ID_MAX, key)
+    number = _token_number(parts[4], _ENTITY_ID_MAX, key)
     name = _absolute(_demangle(parts[9]))
     return Ros2Endpoint(node, number, kind, name, ros_type(parts[10]), parts[11], Ros2Qos.parse(parts[12]))
 

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
+# Seconds until a service that could not be asked for its type is asked again: at first, and at most; it doubles.
+_ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
+
 _log = logging.getLogger(__name__)
 _GID_BYTES_BEFORE: Final = 24
 """RMW_GID_STORAGE_SIZE up to ROS 2 Humble."""
@@ -250,7 +253,7 @@ class OfferedService:
 
     async def _describe(self) -> ServiceDescription:
         """Ask the server for its type until it answers."""
-        again, longest = limits.ROS2_DESCRIBE_AGAIN
+        again, longest = _ROS2_DESCRIBE_AGAIN
         while True:
             try:
                 return await self._context.graph.describe(self.source)

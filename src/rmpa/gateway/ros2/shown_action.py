@@ -35,6 +35,14 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 
+# Seconds between two messages of an action's status in ROS 1; actionlib's ``status_frequency`` is 5 Hz, and its
+# clients count a server as lost after 5 s without one.
+_ROS2_STATUS_PERIOD: Final = 0.2
+# Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once.
+_ROS2_GOAL_TIMEOUT: Final = 86_400.0
+# Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave.
+_ROS2_LAST_RESULTS: Final = 1.0
+
 KINDS: Final = ("Goal", "Result", "Feedback")
 """What the definition of an action is made of."""
 
@@ -296,7 +304,7 @@ class GoalsToRos2(Goals):
         for uuid in [u for u, goal in self._goals.items() if goal.ended is not None and goal.ended + kept <= now]:
             del self._goals[uuid]
         if self._next_status is not None and self._next_status <= now:
-            self._next_status = now + limits.ROS2_STATUS_PERIOD
+            self._next_status = now + _ROS2_STATUS_PERIOD
             self._tell_states()
 
     # --- inside ---------------------------------------------------------------------------------------------------
@@ -373,7 +381,7 @@ class ShownAction(JoinedAction):
         """The server is gone: goals under way end as aborted, then the topics go."""
         super().close()
         # The last results have to leave before their publishers.
-        self._leaving = asyncio.get_running_loop().call_later(limits.ROS2_LAST_RESULTS, self.finish)
+        self._leaving = asyncio.get_running_loop().call_later(_ROS2_LAST_RESULTS, self.finish)
 
     def finish(self) -> None:
         """Take its topics out of the graph, once it is closed."""
@@ -468,7 +476,7 @@ class ShownAction(JoinedAction):
                 caller.endpoint.key(),
                 request,
                 self._attachment(caller.gid),
-                timeout=limits.ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
+                timeout=_ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
                 all_complete=True,
             )
             answer = next((answer for answer in answers if answer.ok), None)

@@ -41,6 +41,18 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 
+# Seconds for the publisher's answer to that.
+_LATCH_LOOK_TIMEOUT: Final = 10.0
+# Publishers that are asked that at once: each opens a route in the mesh for a moment.
+_LATCH_LOOKS_AT_ONCE: Final = 2
+# Seconds for which a topic of ROS 2 that is wanted stays subscribed after a publisher came or went: messages of a
+# publisher that restarts are held until nodes have subscribed to it anew, which takes a module some 0.1 s.
+_ROS2_LINGER: Final = 5.0
+# Messages of one topic of ROS 2 that are held so; the oldest are dropped, and counted as unheard.
+_ROS2_EARLY_MESSAGES: Final = 1000
+# Bytes of these.
+_ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
+
 _STATIC_TF: Final = "/tf_static"
 """Its publishers latch, in ROS 1 and ROS 2 (tf2_ros)."""
 _STREAMS: Final = frozenset(
@@ -288,7 +300,7 @@ class Ros2Import:
             return
         if self._lingering is not None:
             self._lingering.cancel()
-        self._lingering = asyncio.get_running_loop().call_later(limits.ROS2_LINGER, self._end_lingering)
+        self._lingering = asyncio.get_running_loop().call_later(_ROS2_LINGER, self._end_lingering)
 
     def _end_lingering(self) -> None:
         self._lingering = None
@@ -300,7 +312,7 @@ class Ros2Import:
     def _hold(self, gid: bytes, sequence: int, payload: bytes) -> None:
         self._early.append((gid, sequence, payload))
         self._early_bytes += len(payload)
-        while len(self._early) > limits.ROS2_EARLY_MESSAGES or self._early_bytes > limits.ROS2_EARLY_BYTES:
+        while len(self._early) > _ROS2_EARLY_MESSAGES or self._early_bytes > _ROS2_EARLY_BYTES:
             self._early_bytes -= len(self._early.popleft()[2])
             self.unheard += 1
 
@@ -405,7 +417,7 @@ class Ros2Topics:
         """By name here, then by proxy."""
         self.imports: dict[str, Ros2Import] = {}
         """ROS 2's topics in the gateway's graph, by key."""
-        self._looks = asyncio.Semaphore(limits.LATCH_LOOKS_AT_ONCE)
+        self._looks = asyncio.Semaphore(_LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
@@ -456,7 +468,7 @@ class Ros2Topics:
         async with self._looks:
             if export.about is None:
                 with contextlib.suppress(RmpaError):
-                    await export.header(limits.LATCH_LOOK_TIMEOUT)
+                    await export.header(_LATCH_LOOK_TIMEOUT)
 
     def declared(self, dialect: Ros2Dialect) -> None:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""

@@ -1,7 +1,7 @@
 """What other sites have, which gateway of a site leads, and since when a site is away. Without I/O.
 
 Tokens come and go one by one, in any order. A source is there while its own token and that of its module are. What a
-gateway withdraws goes at once (after ``limits.SITE_SETTLE``); what is lost together with the leading gateway of its
+gateway withdraws goes at once (after ``_SITE_SETTLE``); what is lost together with the leading gateway of its
 site, or with the way to it, stays for ``limits.SITE_GRACE``, so that neither a short break of a link nor a change of
 the leading gateway takes everything down and up::
 
@@ -23,6 +23,10 @@ from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_t
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+
+# Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
+# one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
+_SITE_SETTLE: Final = 0.05
 
 _ENDING: Final = 2.0
 """Seconds within which a gateway that ends withdraws what it announced: that too is what its site had."""
@@ -223,7 +227,7 @@ class SiteCatalogue:
         there = item in site.modules if isinstance(item, SiteModule) else item in site.modules.get(item.module, ())
         if there and key not in self._by_token:
             self._by_token[key] = item
-            self._ending.set(key, max(now + limits.SITE_SETTLE, site.interrupted_until))
+            self._ending.set(key, max(now + _SITE_SETTLE, site.interrupted_until))
 
     def _end_module(self, site: _Site, module: SiteModule) -> None:
         for source in sorted(site.modules.pop(module), key=SiteSource.token):

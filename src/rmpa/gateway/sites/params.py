@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+# Questions of other sites about parameters that are answered at once.
+_SITE_PARAMS_AT_ONCE: Final = 256
+
 _NEEDS: Final = Needs(
     (Access.PARAM,),
     "each parameter, of the site and of the modules that ask; also by the module that has it",
@@ -281,9 +284,7 @@ class SiteParams:
         self._context = context
         self._ask = ask
         self._queryable: Declaration | None = None
-        self._answering = Answering(
-            "parameters", f"the gateway of site {context.name} ends", limits.SITE_PARAMS_AT_ONCE
-        )
+        self._answering = Answering("parameters", f"the gateway of site {context.name} ends", _SITE_PARAMS_AT_ONCE)
 
     def lead(self, *, leads: bool) -> None:
         """Answer while this gateway leads its site."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.neighbour import MeshSource, SourceKey
     from rmpa.gateway.rules import CrossingRules
+
+# Bytes of a node's name in an attachment.
+_NODE_NAME_MAX: Final = 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +197,8 @@ def _problem(announced: SiteSource) -> str:
     unasked = announced.kind is SourceKind.SERVICE and announced.type == UNKNOWN_TYPE
     if not unasked and not is_type_name(announced.type):
         return f"its type is not known ({announced.type!r})"
-    if len(announced.node.encode()) > limits.NODE_NAME_MAX:
-        return f"its node's name has more than {limits.NODE_NAME_MAX} bytes"
+    if len(announced.node.encode()) > _NODE_NAME_MAX:
+        return f"its node's name has more than {_NODE_NAME_MAX} bytes"
     if len(announced.token()) > limits.KEY_MAX:
         return f"its names and type have more than {limits.KEY_MAX} characters"
     return ""

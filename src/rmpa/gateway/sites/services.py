@@ -42,6 +42,15 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
+# Bytes of the description of another site's service: four names.
+_SERVICE_DESCRIPTION_MAX: Final = 8192
+# Bytes of the requests of other sites that are under way here: four of the largest.
+_SITE_CALL_BYTES: Final = 256 * 1024 * 1024
+# Seconds that the calling site waits longer than the serving one, whose error text tells more.
+_SITE_CALL_GRACE: Final = 1.0
+# Seconds for the description of another site's service; its server may be probed for it over two meshes.
+_DESCRIBE_TIMEOUT: Final = 10.0
+
 _NEEDS: Final = Needs((Access.CALL,), "the service, of the site", key="rmpa/1/<site>/<module>/s/**")
 _STATUS: Final = "actionlib_msgs/GoalStatusArray"
 DESCRIPTION: Final = "description"
@@ -70,7 +79,7 @@ def read_description(data: Buffer) -> ServiceDescription:
     Raises:
         RemoteProtocolError: It is none, or names no type.
     """
-    if len(data) > limits.SERVICE_DESCRIPTION_MAX:
+    if len(data) > _SERVICE_DESCRIPTION_MAX:
         raise RemoteProtocolError(f"a description of a service has {len(data)} bytes")
     try:
         told = msgspec.json.decode(data, type=_Described)
@@ -181,10 +190,10 @@ class ExportedService:
 
     async def _describe(self) -> ServiceDescription:
         try:
-            async with asyncio.timeout(limits.DESCRIBE_TIMEOUT):
+            async with asyncio.timeout(_DESCRIBE_TIMEOUT):
                 self._description = await self._part.context.graph.describe(self._source)
         except TimeoutError:
-            text = f"service {self._source.name} does not tell its type within {limits.DESCRIBE_TIMEOUT:g} s"
+            text = f"service {self._source.name} does not tell its type within {_DESCRIBE_TIMEOUT:g} s"
             raise PeerRefused(self._source.module, text) from None
         return self._description
 
@@ -244,7 +253,7 @@ class ImportedService:
 
     async def _describe(self) -> ServiceDescription:
         """Ask for the type; raises as ``_serve``, and ``RemoteProtocolError`` for a reply that is none."""
-        reply = await self._ask(f"?{DESCRIPTION}", b"", NO_MD5, limits.DESCRIBE_TIMEOUT)
+        reply = await self._ask(f"?{DESCRIPTION}", b"", NO_MD5, _DESCRIBE_TIMEOUT)
         self._description = read_description(reply)
         return self._description
 
@@ -257,7 +266,7 @@ class ImportedService:
                 source.key() + parameters,
                 request,
                 attachment(next(self._numbers), time.time_ns()),
-                timeout=within + limits.SITE_CALL_GRACE,
+                timeout=within + _SITE_CALL_GRACE,
                 priority=ZenohPriority.INTERACTIVE_HIGH,
             )
         )
@@ -297,7 +306,7 @@ class SiteServices:
 
     def is_full(self, size: int) -> bool:
         """Whether a request of this size finds no room."""
-        return size > ros_limits.SERVICE_MESSAGE_MAX or self.waiting + size > limits.SITE_CALL_BYTES
+        return size > ros_limits.SERVICE_MESSAGE_MAX or self.waiting + size > _SITE_CALL_BYTES
 
     def export(self, entry: SiteExport) -> None:
         """Let other sites call a service."""

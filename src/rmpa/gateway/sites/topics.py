@@ -36,6 +36,26 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.wire.tcpros import TopicDescription
 
+# Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first.
+_HEADER_TIMEOUT: Final = 5.0
+# Seconds at most until a header is asked for again, when there was no answer and nodes wait for it; at first a
+# sixteenth.
+_HEADER_RETRY: Final = 2.0
+# Seconds for which a publisher stays connected after its header was asked for: its subscriber comes right after.
+_TAP_LINGER: Final = 2.0
+# Bytes that wait likewise; one message always fits.
+_HELD_BYTES: Final = 64 * 1024 * 1024
+# Nodes that publish one latched topic of another site, and of which no node here wants one, whose last message is
+# kept.
+_LATCHED_NODES_MAX: Final = 64
+# Seconds for which a topic of another site stays subscribed after its last subscriber left, as in the mesh.
+_DEMAND_LINGER: Final = 1.0
+# Seconds without a message after which a receiver asks for the last sequence number: losses at the end of a burst
+# leave no gap.
+_IDLE_CHECK: Final = 1.0
+# Seconds between two such questions at most: the pause doubles while no message comes.
+_IDLE_CHECK_MAX: Final = 60.0
+
 REFUSED: Final = "refused: "
 """What an error begins with that a rule causes: asking again is of no use."""
 _HEADER_NEEDS: Final = Needs((Access.SUBSCRIBE,), "the topic, of the site", key="rmpa/1/<site>/<module>/d/t/**")
@@ -132,7 +152,7 @@ class SiteDialect:
         """
         del keeps
         reliable = self._contract.reliability is Reliability.RELIABLE
-        return max(limits.TAP_LINGER, self._contract.outage if reliable else 0.0)
+        return max(_TAP_LINGER, self._contract.outage if reliable else 0.0)
 
     def told(self, problem: str) -> None:
         """``rmpa why`` tells it, and no log."""
@@ -147,7 +167,7 @@ class ImportedTopic:
     On demand its key is subscribed to, and its gateway is asked for the publisher's header. Messages that come before
     the header wait for it, since no subscriber is accepted before. If no message comes for a while its gateway is
     asked for the last number too, for a loss at the end leaves no gap; again after twice the time, at most
-    ``limits.IDLE_CHECK_MAX``.
+    ``_IDLE_CHECK_MAX``.
 
     Args:
         entry: The source.
@@ -245,14 +265,14 @@ class ImportedTopic:
         self._stop_lingering()
         if not wanted:
             if self.wanted:
-                self._linger = asyncio.get_running_loop().call_later(limits.DEMAND_LINGER, self._detach)
+                self._linger = asyncio.get_running_loop().call_later(_DEMAND_LINGER, self._detach)
         elif not self.wanted:
             self.wanted = True
             if time.monotonic() > self._resumes_until:
                 self._sequence.restart()
             self._resumes_until = 0.0
             self._part.subscribe(self)
-            self._check_in(limits.IDLE_CHECK)
+            self._check_in(_IDLE_CHECK)
             self._ask()
 
     def _stop_lingering(self) -> None:
@@ -282,10 +302,10 @@ class ImportedTopic:
     def _check(self, pause: float) -> None:
         if self._fresh:
             self._fresh = False
-            self._check_in(limits.IDLE_CHECK)
+            self._check_in(_IDLE_CHECK)
         else:
             self._ask()
-            self._check_in(min(pause * 2, limits.IDLE_CHECK_MAX))
+            self._check_in(min(pause * 2, _IDLE_CHECK_MAX))
 
     # --- the header -----------------------------------------------------------------------------------------------
 
@@ -297,10 +317,10 @@ class ImportedTopic:
             )
 
     async def _ask_until_known(self) -> None:
-        pause = limits.HEADER_RETRY / 16
+        pause = _HEADER_RETRY / 16
         while self.wanted and not await self._ask_once():
             await asyncio.sleep(pause)
-            pause = min(limits.HEADER_RETRY, pause * 2)
+            pause = min(_HEADER_RETRY, pause * 2)
 
     async def _ask_once(self) -> bool:
         """Ask for the header; return whether it need not be asked again."""
@@ -308,7 +328,7 @@ class ImportedTopic:
         replies = await context.session.get(
             f"{ROOT}/{announced.site}/{announced.module.name}/d/t{announced.name}"
             f"?node={announced.node};site={context.name}",
-            timeout=limits.HEADER_TIMEOUT,
+            timeout=_HEADER_TIMEOUT,
             priority=ZenohPriority.INTERACTIVE_HIGH,
         )
         reply = next((each for each in replies if each.ok), replies[0] if replies else None)
@@ -332,7 +352,7 @@ class ImportedTopic:
         self._problem = ""
         self._sequence.announced(header.run, header.sequence - header.waiting)
         if header.waiting and self.wanted:
-            self._check_in(limits.IDLE_CHECK)
+            self._check_in(_IDLE_CHECK)
         described, self._description = self._description, header.description
         if self._description != described:
             self._topic.describe(self._description)
@@ -347,7 +367,7 @@ class ImportedTopic:
         """Keep a message until the header is known, or known anew: its publisher has another definition."""
         self._held.append((payload, md5))
         size = sum(len(each) for each, _ in self._held) if len(payload) > limits.LARGE_MESSAGE else 0
-        while len(self._held) > limits.HELD_MESSAGES_MAX or (size > limits.HELD_BYTES and len(self._held) > 1):
+        while len(self._held) > limits.HELD_MESSAGES_MAX or (size > _HELD_BYTES and len(self._held) > 1):
             size -= len(self._held.popleft()[0])
             self.dropped += 1
         if self._description is not None:
@@ -487,9 +507,9 @@ class SiteTopics:
         elif subscription is not None:
             counters.add("site.message.unwanted_node")
             known = subscription.latched
-            if source.latched and (source.node in known or len(known) < limits.LATCHED_NODES_MAX):
+            if source.latched and (source.node in known or len(known) < _LATCHED_NODES_MAX):
                 others = sum(len(each[0]) for node, each in known.items() if node != source.node)
-                if others + len(sample.payload) > limits.HELD_BYTES:
+                if others + len(sample.payload) > _HELD_BYTES:
                     counters.add("site.message.unkept")
                 else:
                     known[source.node] = sample.payload, sequence, source
@@ -513,7 +533,7 @@ class SiteTopics:
 
     @staticmethod
     async def _header(export: Export, dialect: SiteDialect, _query: ArrivedQuery) -> tuple[bytes, bytes]:
-        about = await export.header(limits.HEADER_TIMEOUT * 0.8)
+        about = await export.header(_HEADER_TIMEOUT * 0.8)
         definition = about.definition.encode(errors="replace").decode()  # JSON has no bytes that are not UTF-8
         fields = about.type, about.md5sum, definition, about.latching
         told = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)

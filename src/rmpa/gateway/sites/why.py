@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
+# Seconds for a question to another site's gateway.
+_SITE_ASK_TIMEOUT: Final = 5.0
+
 _T = TypeVar("_T")
 _NEEDS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, of the site", key="rmpa/1/<site>/-gateway/why"
@@ -362,7 +365,7 @@ class SiteWhy:
             return (), "it is not there"
         question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module, service=service))
         replies = await self._sites.context.session.get(
-            _why_key(site), question, timeout=limits.SITE_ASK_TIMEOUT, all_complete=True
+            _why_key(site), question, timeout=_SITE_ASK_TIMEOUT, all_complete=True
         )
         problem = "it does not answer; is it of an earlier release?"
         for reply in replies:

@@ -27,6 +27,28 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.ros.wire.tcpros import Buffer
 
+# Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
+# there are no priorities: on 1 Mbit/s with images a command waited 2.7 s with Linux's own size, 0.3 s with this one,
+# and as many images came.
+_SEND_BUFFER: Final = 0.125
+# Bytes of that buffer at least: the kernel allows no less than about two packets.
+_SEND_BUFFER_MIN: Final = 4096
+# Seconds of the line's rate in one batch of Zenoh, which a message of a higher priority does not overtake.
+_BATCH: Final = 0.0625
+# Bytes of a batch at least.
+_BATCH_MIN: Final = 2048
+# Bytes of a batch at most: Zenoh's own.
+_BATCH_MAX: Final = 65_535
+# Bytes of one connection that the kernel may hold unsent (TCP_NOTSENT_LOWAT): a command does not overtake them. On 1
+# Mbit/s with images a command waited 1.0 s with it and 3.4 s without it, both without ``uplink``.
+_UNSENT_BYTES: Final = 16_384
+# Seconds before the first attempt to reach a router again.
+_RECONNECT_FIRST: Final = 0.2
+# Seconds between two later attempts at most; a router that was restarted is reached again within that time.
+_RECONNECT_MAX: Final = 2.0
+# Factor between the waits of two attempts.
+_RECONNECT_GROWTH: Final = 1.5
+
 _ENCRYPTED: Final = ("tls", "quic")
 """Protocols of endpoints that are encrypted, and that certificates are checked at."""
 _INSECURE: Final = "or say --insecure, and every program that reaches it may read and write everything"
@@ -102,9 +124,9 @@ class ZenohConfig:
             "connect/endpoints": list(self.connect),
             "listen/endpoints": list(self.listen),
             "connect/retry": {
-                "period_init_ms": round(limits.RECONNECT_FIRST * 1000),
-                "period_max_ms": round(limits.RECONNECT_MAX * 1000),
-                "period_increase_factor": limits.RECONNECT_GROWTH,
+                "period_init_ms": round(_RECONNECT_FIRST * 1000),
+                "period_max_ms": round(_RECONNECT_MAX * 1000),
+                "period_increase_factor": _RECONNECT_GROWTH,
             },
             "scouting/delay": 0,
             "scouting/multicast/enabled": False,
@@ -121,8 +143,8 @@ class ZenohConfig:
         if self.certificates is not None:
             entries["transport/link/tls"] = self.certificates.entries()
         if self.uplink is not None:
-            buffer = max(limits.SEND_BUFFER_MIN, round(self.uplink * limits.SEND_BUFFER))
-            batch = min(limits.BATCH_MAX, max(limits.BATCH_MIN, round(self.uplink * limits.BATCH)))
+            buffer = max(_SEND_BUFFER_MIN, round(self.uplink * _SEND_BUFFER))
+            batch = min(_BATCH_MAX, max(_BATCH_MIN, round(self.uplink * _BATCH)))
             entries |= {f"transport/link/{kind}/so_sndbuf": buffer for kind in ("tcp", "tls")}
             entries["transport/link/tx/batch_size"] = batch
         if self.access_control is not None:
@@ -212,7 +234,7 @@ class SocketTuning:
         unsent: Bytes that the kernel may hold unsent of one connection.
     """
 
-    def __init__(self, unsent: int = limits.UNSENT_BYTES) -> None:
+    def __init__(self, unsent: int = _UNSENT_BYTES) -> None:
         self._unsent = unsent
         self._tuned: frozenset[str] = frozenset()
 

@@ -29,6 +29,13 @@ if TYPE_CHECKING:
     from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.ros.wire.tcpros import Buffer
 
+# Seconds between two looks at which connections Zenoh has, to bound what the kernel holds of new ones.
+_LOOK_AT_LINKS: Final = 2.0
+# Seconds that closing a session may take before it is given up; its threads do not keep the process from ending.
+_CLOSE_MAX: Final = 3.0
+# Seconds beyond a query's own time-out after which its answers are no longer waited for.
+_GET_GRACE: Final = 1.0
+
 _log = logging.getLogger(__name__)
 _WILD: Final = frozenset("*$")
 
@@ -130,7 +137,7 @@ class OpenSession:
 
     def _look_at_links(self) -> None:
         self._tuning.look(self.endpoints)
-        self._looking = self._loop.call_later(limits.LOOK_AT_LINKS, self._look_at_links)
+        self._looking = self._loop.call_later(_LOOK_AT_LINKS, self._look_at_links)
 
     @property
     def stale(self) -> bool:
@@ -300,7 +307,7 @@ class OpenSession:
 
         self._queries.submit(ask)
         try:
-            async with asyncio.timeout(timeout + limits.GET_GRACE):
+            async with asyncio.timeout(timeout + _GET_GRACE):
                 return await done
         except TimeoutError:
             return pending.collected()
@@ -341,8 +348,8 @@ class OpenSession:
             *self._lanes.values(),
         )
         for thread in threads:
-            if not thread.join(limits.CLOSE_MAX):
-                _log.warning("zenoh: a thread of the session did not end within %g s", limits.CLOSE_MAX)
+            if not thread.join(_CLOSE_MAX):
+                _log.warning("zenoh: a thread of the session did not end within %g s", _CLOSE_MAX)
 
     def _direct(self, callback: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
         """A callback that Zenoh calls in its own thread.

@@ -6,7 +6,7 @@ Zenoh calls back in threads of its own. Each subscriber has a queue there, and o
 all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.
 
 The loop and Zenoh's threads share the interpreter's lock. A loop that each message wakes would hand it over for each
-one, which costs 20 µs. So above ``limits.BUSY_MESSAGES`` in a period the loop is not woken: it looks once a period.
+one, which costs 20 µs. So above ``_BUSY_MESSAGES`` in a period the loop is not woken: it looks once a period.
 """
 
 from __future__ import annotations
@@ -27,6 +27,17 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.neighbour import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
+
+# Messages of one publisher that are sent in one turn, while others of its priority wait.
+_TURN_MESSAGES: Final = 64
+# Bytes of one publisher in one turn: one batch of Zenoh. One message always fits.
+_TURN_BYTES: Final = 65_536
+# Messages that the event loop takes before it looks at its other work: at most a millisecond or so.
+_DRAIN_MESSAGES: Final = 256
+# Bytes that the event loop takes before it looks at its other work.
+_DRAIN_BYTES: Final = 8 * 1024 * 1024
+# Messages in ``BUSY_PERIOD`` from which on the loop is not woken for each: 8,000 a second.
+_BUSY_MESSAGES: Final = 8
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -186,9 +197,9 @@ class Arrivals:
         with self.lock:
             if self._closed:
                 return
-            if self._ready and taken >= limits.DRAIN_MESSAGES:
+            if self._ready and taken >= _DRAIN_MESSAGES:
                 self._loop.call_soon(self._drain)
-            elif self._in_window >= limits.BUSY_MESSAGES:
+            elif self._in_window >= _BUSY_MESSAGES:
                 self._loop.call_later(limits.BUSY_PERIOD, self._drain)
             elif self._ready or self.discarded:
                 self._loop.call_soon(self._drain)
@@ -197,7 +208,7 @@ class Arrivals:
 
     def _deliver(self) -> int:
         """Deliver what waits, but not more than the loop can do without a delay; return the number of messages."""
-        messages, size = limits.DRAIN_MESSAGES, limits.DRAIN_BYTES
+        messages, size = _DRAIN_MESSAGES, _DRAIN_BYTES
         with self.lock:
             discarded = tuple(self.discarded)
             self.discarded.clear()
@@ -208,20 +219,20 @@ class Arrivals:
                 if not self._ready:
                     break
                 queue = self._ready.popleft()
-                taken, taken_bytes = self._take_turn(queue, min(messages, limits.TURN_MESSAGES))
+                taken, taken_bytes = self._take_turn(queue, min(messages, _TURN_MESSAGES))
                 queue.reschedule()
             with CollectedSends():  # one system call for what goes to one peer
                 for item in taken:
                     queue.deliver(item)
             messages -= len(taken)
             size -= taken_bytes
-        return limits.DRAIN_MESSAGES - messages
+        return _DRAIN_MESSAGES - messages
 
     @staticmethod
     def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
         taken: list[object] = []
         taken_bytes = 0
-        while len(taken) < messages and taken_bytes < limits.TURN_BYTES:
+        while len(taken) < messages and taken_bytes < _TURN_BYTES:
             entry = queue.take()
             if entry is None:
                 break
@@ -320,7 +331,7 @@ class QueuedPublisher:
         """Take the messages of one turn. The caller has the lane's lock."""
         turn: list[tuple[bytes, bytes]] = []
         size = 0
-        while self._queue and len(turn) < limits.TURN_MESSAGES and size < limits.TURN_BYTES:
+        while self._queue and len(turn) < _TURN_MESSAGES and size < _TURN_BYTES:
             message = self._queue.popleft()
             turn.append(message)
             size += len(message[0])
@@ -432,7 +443,7 @@ class SendingLane:
     def _run(self) -> None:
         window_end, in_window = 0.0, 0
         while True:
-            if in_window >= limits.BUSY_MESSAGES and not self._ready:
+            if in_window >= _BUSY_MESSAGES and not self._ready:
                 # The loop need not wake this thread, nor wait for the interpreter's lock, for each message.
                 time.sleep(limits.BUSY_PERIOD / 2)
             with self.changed:
