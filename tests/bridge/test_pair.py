@@ -39,7 +39,7 @@ from tests.bridge.recorder import (
 )
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]
-ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
+TOPIC_ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
 
 
 class World:
@@ -135,7 +135,7 @@ class World:
             while self.deliver() or self.exports.pending:
                 self.act(self.exports.advertise())
             for source in list(self.connected):
-                self.act(self.exports.described(source, ABOUT))
+                self.act(self.exports.described(source, TOPIC_ABOUT))
             timer = self.imports.next_timer()
             if not self.to_importer and not self.to_exporter:
                 if timer is None:
@@ -182,7 +182,7 @@ def _step(world: World, what: str, index: int) -> None:
     elif what == "tell":
         world.act(world.exports.advertise())
     elif what == "describe" and source in world.connected:
-        world.act(world.exports.described(source, ABOUT))
+        world.act(world.exports.described(source, TOPIC_ABOUT))
     elif what == "lose" and source in world.connected:
         world.connected.discard(source)
         world.act(world.exports.lost(source, "lost"))

@@ -40,6 +40,19 @@ class Registrations(ast.NodeVisitor):
             self.scope[ast.unparse(node.targets[0])] = self._value(node.value)
         self.generic_visit(node)
 
+    def visit_For(self, node: ast.For) -> None:
+        """Handlers that are registered from a table have a turn each."""
+        table, _, method = ast.unparse(node.iter).partition(".")
+        if method != "items()" or not isinstance(self.scope.get(table), dict):
+            self.generic_visit(node)
+            return
+        outer = self.scope
+        for key, value in self._value(node.iter):
+            names = [ast.unparse(name) for name in getattr(node.target, "elts", [])]
+            self.scope = outer | dict(zip(names, (key, value), strict=True))
+            self.generic_visit(node)
+        self.scope = outer
+
     def visit_Call(self, node: ast.Call) -> None:
         *_, owner, kind = ("", *ast.unparse(node.func).split("."))
         if kind in KINDS and owner in REGISTRARS:

@@ -15,7 +15,7 @@ from rmpa.bridge.rpc import LinkRequests, PeerRpc
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RmpaError
 from rmpa.ros.master.parameters import leaves
-from tests.bridge.services.io.test_calls import Wire
+from tests.bridge.services.test_calls import Wire
 
 _UNTIL = bytes(8)
 SEEDS: list[bytes] = [

@@ -1,5 +1,3 @@
-"""Who listens is told to the peer that publishes; whom a peer tells of is connected to our publisher."""
-
 from __future__ import annotations
 
 import asyncio
@@ -15,6 +13,7 @@ from rmpa.bridge.messages import (
     Audience,
     CloseRoute,
     Description,
+    Mismatch,
     OpenRoute,
     Origin,
     RouteClosed,
@@ -25,23 +24,42 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
 from rmpa.bridge.topics import subscribers as module
-from rmpa.bridge.topics.exports import LocalSource
-from rmpa.bridge.topics.subscribers import RemoteSubscribers
+from rmpa.bridge.topics.exports import ExportRoute, LocalSource
+from rmpa.bridge.topics.local import LocalSubscriptions
+from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers, audience, compares_names, is_watched
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
+from rmpa.core.contract import Contract
+from rmpa.ros.node.publication import Publication
 from rmpa.trust.permissions import Permissions
-from tests.bridge.recorder import Exports, Imports
+from tests.bridge.io.doubles import Link
+from tests.bridge.recorder import Exports, Imports, Send
+from tests.ros.node.peers import STRING, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.sessions import PeerSession
 
+
+# Who listens is told to the peer that publishes; whom a peer tells of is connected to our publisher.
+
+
 GOAL = Source("/count/goal", "/client")
+
+
 CHATTER = Source("/chatter", "/client")
+
+
 TYPE = "actionlib/TestActionGoal"
+
+
 GOAL_OFFER = TopicOffer("/count/goal", "/client", TYPE)
+
+
 MD5 = "5a9ea5f83505693b71e785041e67a8bb"
+
+
 URI = "http://client:1/"
 
 
@@ -230,3 +248,177 @@ def test_listeners_behind_a_relay_are_named_only_if_both_may(world: World) -> No
         secured.imports.advertised(1, Advertise(added=(goal_of_arm,)))
         secured.publish(GOAL, TYPE, 7)
         assert secured.told(7, "/own", "/rmpa/arm/server", "/rmpa/leg/server") == expected
+
+
+# Subscriptions to local publishers, whose routes end with them.
+
+
+SOURCE = Source("/chatter", "/talker")
+
+
+SUBSCRIBER = "http://talker:1/"
+
+
+async def test_a_route_that_is_opened_while_the_end_of_the_last_one_is_told_has_data() -> None:
+    """The peer that waited for this one may open it while the end of the last one is told."""
+    publications = [Publication("/chatter", "/talker", STRING)]
+    core = SimpleNamespace(call=lambda *_: None, suspend=None, suspect=lambda _: None)
+    node = SimpleNamespace(uri="http://agent:1/", next_number=lambda: 1)
+    described: list[Description] = []
+    link = Link()
+
+    def lost(source: Source, _reason: str, _lasts: object) -> None:
+        publications.append(Publication("/chatter", "/talker", STRING))
+        subscriptions.connect(SOURCE, SUBSCRIBER)
+        subscriptions.add_route(source, 1, ExportRoute(7, Contract(), Contract(), "", ""), cast("Any", link))
+
+    exports = SimpleNamespace(described=lambda _, description: described.append(description), lost=lost)
+    shared: Any = SimpleNamespace(core=core, node=node)
+    unused = cast("Any", None)
+    subscriptions = LocalSubscriptions(shared, cast("Any", exports), unused, unused, lambda *_: publications[-1])
+    subscriptions.connect(SOURCE, SUBSCRIBER)
+    await until(lambda: described)
+    publications[0].withdraw()
+    await until(lambda: len(described) == 2)
+    assert subscriptions.flows[SOURCE].by_peer[1].route == 7
+    assert subscriptions.senders[1, 7] is subscriptions.flows[SOURCE].by_peer[1]
+    subscriptions.close()
+
+
+@pytest.mark.parametrize(
+    ("type_name", "watched"),
+    [
+        ("move_base_msgs/MoveBaseActionGoal", True),
+        ("actionlib_msgs/GoalID", True),
+        ("actionlib_msgs/GoalStatusArray", False),
+        ("move_base_msgs/MoveBaseActionResult", False),
+        ("move_base_msgs/MoveBaseGoal", False),
+        ("other_msgs/GoalID", False),
+        ("*", False),
+    ],
+)
+def test_publishers_of_goals_and_cancellations_look_at_who_listens(type_name: str, watched: bool) -> None:
+    assert is_watched(type_name) is watched
+
+
+def test_nodes_are_named_once_in_order_and_nobody_else() -> None:
+    caller_ids = ("/b", "/a", "/b", "/rmpa", "/rmpa/peer/node", "no name", "", "/line\nfeed", "/" + "x" * 2000)
+    # What stands for other modules is named where we relay: nothing else of theirs listens to a proxy.
+    assert audience(caller_ids) == ("/a", "/b", "/rmpa/peer/node")
+
+
+def test_no_more_are_named_than_a_message_may_hold() -> None:
+    assert len(audience(f"/n{number}" for number in range(1000))) == limits.AUDIENCE_MAX
+
+
+def test_all_topics_of_an_action_compare_names() -> None:
+    of_actions = {
+        "actionlib/TestActionGoal",
+        "actionlib_msgs/GoalID",
+        "actionlib_msgs/GoalStatusArray",
+        "actionlib/TestActionFeedback",
+        "actionlib/TestActionResult",
+    }
+    assert all(compares_names(name) for name in of_actions)
+    assert not compares_names("std_msgs/String")
+
+
+# What a mismatch of definitions says here, and what the agent at the other end hears of it.
+
+
+CMD = Source("/cmd", "/joy")
+
+
+BASE = 1
+
+
+class Reports(Mismatches):
+    """Reports of a module that offers ``/cmd`` to the peer *base*, or has it of that peer."""
+
+    def __init__(self) -> None:
+        self.done: list[Any] = []
+        self.warnings: list[str] = []
+        self.offered = {CMD}
+        exports = SimpleNamespace(
+            offered=self.offered, local=lambda _peer, source: source if source in self.offered else None
+        )
+        imports = SimpleNamespace(at=lambda topic: [(BASE, CMD)] if topic == CMD.topic else [], knows=lambda _: False)
+        out = SimpleNamespace(
+            send=lambda peer, message: self.done.append(Send(peer, message)),
+            warn=lambda *args: self.warnings.append(args[2]),
+        )
+        super().__init__(cast("Any", out), cast("Any", exports), cast("Any", imports))
+
+    def hear(self, text: str, subscriber: str = "/viewer") -> None:
+        self.reported(BASE, "base", Mismatch(CMD.topic, CMD.node, subscriber, text))
+
+
+@pytest.fixture
+def reports() -> Reports:
+    return Reports()
+
+
+def test_a_refused_subscriber_is_shown_here_and_told_to_the_peer(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    assert reports.texts(CMD) == ("other md5",)
+    assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", "other md5"))]
+    assert reports.warnings == ["other md5"]
+
+
+def test_a_subscriber_that_registers_again_is_mended_at_the_peer_too_and_once(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    reports.done.clear()
+    for _ in range(2):
+        reports.registration_changed("/cmd", "/viewer")
+    assert reports.texts(CMD) == ()
+    assert reports.done == [Send(BASE, Mismatch("/cmd", "/joy", "/viewer", ""))]
+
+
+def test_another_subscriber_of_the_topic_mends_nothing(reports: Reports) -> None:
+    reports.refused(BASE, CMD, "/viewer", "other md5")
+    reports.done.clear()
+    reports.registration_changed("/cmd", "/recorder")
+    assert (reports.texts(CMD), reports.done) == (("other md5",), [])
+
+
+def test_a_peers_report_is_a_warning_that_names_the_peer(reports: Reports) -> None:
+    reports.hear("other md5")
+    assert reports.texts(CMD) == ("other md5",)
+    assert reports.warnings == [f"base: {CMD}: other md5"]
+
+
+def test_a_peers_report_ends_with_an_empty_text_or_with_the_peer(reports: Reports) -> None:
+    reports.hear("other md5")
+    reports.hear("")
+    assert reports.texts(CMD) == ()
+    reports.hear("other md5")
+    reports.peer_gone("base")
+    assert reports.texts(CMD) == ()
+    assert len(reports.warnings) == 2, "an end is no warning"
+
+
+def test_only_nodes_of_a_peer_that_is_gone_are_forgotten(reports: Reports) -> None:
+    reports.hear("of base")
+    reports.reported(2, "base2", Mismatch(CMD.topic, CMD.node, "/viewer", "of base2"))
+    reports.refused(BASE, CMD, "/viewer", "ours")
+    reports.peer_gone("base")
+    assert reports.texts(CMD) == ("of base2", "ours")
+
+
+def test_a_source_has_only_so_many_and_each_of_them_can_still_change(reports: Reports) -> None:
+    for number in range(limits.MISMATCHES_MAX + 5):
+        reports.hear("other md5", f"/n{number}")
+    assert len(reports.texts(CMD)) == limits.MISMATCHES_MAX
+    reports.hear("changed", "/n0")
+    assert reports.texts(CMD)[0] == "changed"
+
+
+def test_a_source_that_is_gone_has_no_mismatches(reports: Reports) -> None:
+    reports.hear("other md5")
+    reports.forget_gone()
+    assert reports.texts(CMD) == ("other md5",)
+    reports.offered.clear()
+    reports.forget_gone()
+    assert reports.texts(CMD) == ()
+    reports.hear("late")
+    assert reports.texts(CMD) == (), "the report crossed the withdrawal"

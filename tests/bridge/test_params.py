@@ -1,9 +1,8 @@
-"""Two modules' parameters, joined by their questions: real parameter servers, real parts; the links are doubles."""
-
 from __future__ import annotations
 
 import asyncio
 from collections import deque
+from contextlib import asynccontextmanager
 from datetime import datetime
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -17,21 +16,110 @@ from rmpa.bridge.messages import decode
 from rmpa.bridge.params import rules as transfer
 from rmpa.bridge.params.follower import Params
 from rmpa.bridge.params.owner import read_text, write_text
+from rmpa.bridge.params.rules import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
 from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
+from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import FollowRule
-from rmpa.config.settings import ParamSettings, Settings, TimeSettings
+from rmpa.config.settings import ParamSettings, Settings, TimeSettings, TrustSettings
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.api import MasterApi
-from tests.bridge.services.io.test_calls import Wire
+from rmpa.ros.master.parameters import leaves
+from rmpa.trust.permissions import Permissions
+from tests.bridge.services.test_calls import Wire
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+
+
+# What peers may do with parameters, by name.
+
+
+SETTINGS = Settings(
+    params=ParamSettings(
+        ("/open/**", "/followed/**"),
+        ("/open/**", "/roslaunch/**", "/followed/**"),
+        (FollowRule("/x", "arm", "/followed"),),
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("key", "get", "put", "follow"),
+    [
+        ("/open/a", "", "", ""),
+        ("/open", "", "", ""),
+        ("/opened", "remote_get", "remote_set", "remote_get"),
+        ("/", "remote_get", "the root", "the root"),
+        ("/roslaunch/uris", "remote_get", "roslaunch's own", "remote_get"),
+        ("/run_id", "remote_get", "names the run", "remote_get"),
+        ("/use_sim_time", "remote_get", "[time] alone", "does not share"),
+        ("/followed", "", "followed from arm:/x", "followed from arm:/x"),
+        ("/followed/deep", "", "followed from arm:/x", "followed from arm:/x"),
+    ],
+)
+def test_policy(key: str, get: str, put: str, follow: str) -> None:
+    for why, expected in (
+        (why_not_get(SETTINGS, key), get),
+        (why_not_set(SETTINGS, key), put),
+        (why_not_follow(SETTINGS, key), follow),
+    ):
+        assert (expected in why) if expected else why == ""
+
+
+def test_time_is_followed_where_it_is_shared() -> None:
+    shared = Settings(params=ParamSettings(remote_get=()), time=TimeSettings(share=True))
+    assert why_not_follow(shared, "/use_sim_time") == ""
+    chained = Settings(time=TimeSettings("sim", share=True))
+    assert "time comes from sim here" in why_not_follow(chained, "/use_sim_time")
+    rules = follow_rules(chained)
+    assert rules == (FollowRule("/use_sim_time", "sim", "/use_sim_time"),)
+
+
+@pytest.mark.parametrize("key", ["/a", "/joint-1/x.y", "/", "/a/b/"])
+def test_names_that_masters_take(key: str) -> None:
+    assert key_problem(key) == ""
+
+
+@pytest.mark.parametrize("key", ["", "a", "~a", 1, None, "/a//b", "/a b", "/a\n", "/" + "a" * 2000, "/a" * 100])
+def test_names_that_are_none(key: object) -> None:
+    assert key_problem(key)
+
+
+def test_leaves() -> None:
+    value: XmlRpcValue = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
+    root: XmlRpcValue = {"a": 1}
+    assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
+    assert list(leaves("/", root)) == [("/a", 1)]
+    assert list(leaves("/x", 5)) == [("/x", 5)]
+
+
+@pytest.mark.parametrize(
+    ("names", "at", "present", "lost"),
+    [
+        (["/a/b"], "/a", {"b": 1}, []),
+        (["/a/b"], "/a", {"b": {"x": 1, "y": {"z": 2}}}, ["/a/b/x", "/a/b/y/z"]),
+        (["/a/b/c"], "/a", {"b": 7, "d": 8}, ["/a/b"]),
+        (["/a/b"], "/a", 7, ["/a"]),
+        (["/a"], "/a", {"b": 1}, ["/a/b"]),
+        (["/a/new/x"], "/a", {"b": 1}, []),
+        (["/x/y", "/b"], "/", {"x": 1, "b": {"c": 2}}, ["/x", "/b/c"]),
+        (["/a"], "/a", None, []),
+    ],
+)
+def test_what_is_lost_when_a_value_takes_the_place_of_a_namespace_or_the_other_way_round(
+    names: list[str], at: str, present: XmlRpcValue, lost: list[str]
+) -> None:
+    assert list(replaced(names, at, present)) == lost
+
+
+# Two modules' parameters, joined by their questions: real parameter servers, real parts; the links are doubles.
+
 
 OURS = "http://127.0.0.1:1/"
 
@@ -157,6 +245,8 @@ def follows(*rules: FollowRule) -> ParamSettings:
 
 
 DESCRIPTION = FollowRule("/robot_description", "base", "/base/robot_description")
+
+
 ARM = FollowRule("/arm", "base", "/arm")
 
 
@@ -176,6 +266,8 @@ async def sides(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 DATE = datetime(2020, 1, 2, 3, 4, 5)  # noqa: DTZ001 - XML-RPC's have no zone
+
+
 VALUES: list[XmlRpcValue] = [
     True, 3, -1.5, "", "<x>&\n  é☃ ", b"\x00\xff", DATE, [], [1, [2.0, "x"]], {},
     {"a": {"b": [True, {"c": b"x"}]}, "d": 0.1},
@@ -584,3 +676,88 @@ async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytes
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
     assert "/arm is not as over there" in caplog.text
+
+
+# What the permissions of a secured mesh keep from a peer that asks for a module's parameters.
+
+
+def denying(*names: str) -> PermissionGate:
+    """Permissions by which a peer may have all parameters but these."""
+    allow = PermissionRule(("*",), names={"param": ("/**",)})
+    deny = PermissionRule(("*",), names={"param": names}, effect=Effect.DENY)
+    return PermissionGate(Permissions(TrustSettings(rules=(allow, deny))))
+
+
+@asynccontextmanager
+async def linked(params: ParamSettings, gate: PermissionGate = OPEN_GATE) -> AsyncIterator[tuple[Side, Side]]:
+    """An owner with these rules, and a peer of it."""
+    owner, peer = Side("base", params, gate=gate), Side("pad")
+    try:
+        join(owner, peer)
+        yield owner, peer
+    finally:
+        await owner.close()
+        await peer.close()
+
+
+ALL = ParamSettings(remote_get=("/**",), remote_set=("/**",))
+
+
+@pytest.mark.parametrize("denied", ["/motors/limit", "/motors/*", "/**/limit"])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("/motors/limit", {"": 5}),
+        ("/motors/limit/", {"": 5}),
+        ("/motors", {"limit/": 5}),
+        ("/", {"motors/limit": 5}),
+        ("/", {"motors/limit/": 5}),
+    ],
+)
+async def test_a_slash_at_the_end_does_not_pass_a_deny(denied: str, key: str, value: XmlRpcValue) -> None:
+    async with linked(ALL, denying(denied)) as (owner, peer):
+        owner.core.set("/motors/limit", 1)
+        with pytest.raises(PeerRefused, match="do not let pad read or set"):
+            await peer.ask(transfer.SET, {"key": key, "text": await write_text("", value)})
+        assert owner.core.get("/motors/limit") == 1
+        await peer.ask(transfer.SET, {"key": "/speed", "text": await write_text("", {"max": 2})})
+        assert owner.core.get("/speed/max") == 2
+
+
+async def test_without_trust_a_member_with_a_slash_at_its_end_is_set_as_before() -> None:
+    async with linked(ALL) as (owner, peer):
+        await peer.ask(transfer.SET, {"key": "/motors", "text": await write_text("", {"limit/": 5})})
+        assert owner.core.get("/motors") == {"limit": 5}
+
+
+async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() -> None:
+    """The globs of [params] refuse it as well, and their error names the first parameter that none fits."""
+    async with linked(ParamSettings(remote_get=("/open/**", "/run_id")), denying("/secret/**")) as (owner, peer):
+        owner.core.set("/open", {"a": 1})
+        owner.core.set("/secret/door", 1234)
+        with pytest.raises(PeerRefused) as caught:
+            await peer.ask(transfer.GET, {"key": "/"})
+        assert "secret" not in str(caught.value)
+        text = (await peer.ask(transfer.GET, {"key": "/open"}))["text"]
+        assert await read_text(text) == {"a": 1}
+
+
+async def test_a_peer_that_names_other_sites_is_refused_and_logged_by_its_own_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """What a member says of the sites that ask is not proved: it must not fill the log, nor put others in it."""
+    async with linked(ALL, denying("/door")) as (owner, peer):
+        for number in range(20):
+            with pytest.raises(PeerRefused, match="permissions there do not let"):
+                await peer.ask(transfer.GET, {"key": "/door", "site": f"site{number}", "askers": ["base"]})
+        assert owner.params.owner._gate._counters["permission.param"] == 20
+    lines = [record.getMessage() for record in caplog.records if "may not" in record.getMessage()]
+    assert [line[: len("! pad may not")] for line in lines] == ["! pad may not"]
+
+
+@pytest.mark.parametrize("site", [0, False, [], {}, 0.0])
+async def test_what_is_no_name_of_a_site_is_refused(site: object) -> None:
+    async with linked(ALL, denying("/door")) as (owner, peer):
+        with pytest.raises(PeerRefused, match="is not the name of a site or a module"):
+            await peer.ask(transfer.GET, {"key": "/run_id", "site": site})
+        assert owner.counters["ask.failed"] == 0

@@ -1,5 +1,3 @@
-"""Calls over a route: every byte arrives, in whichever size; whoever will get no answer is told so at once."""
-
 from __future__ import annotations
 
 import asyncio
@@ -7,31 +5,50 @@ import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import LinkTime
-from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
+from rmpa.bridge.direct.conditions import Condition, DirectAsk
+from rmpa.bridge.direct.grants import ServiceGrants
+from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget, LocalService, ServicePool
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Server
+from rmpa.config.settings import TrustSettings
 from rmpa.core import limits as core_limits
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.contract import Transport
+from rmpa.core.counters import Counters
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros import limits as ros_limits
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription
+from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
-    from rmpa.bridge.services.bodies import ServicePool
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.tls import Buffer
 
+
+# Calls over a route: every byte arrives, in whichever size; whoever will get no answer is told so at once.
+
+
 DESCRIPTION = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
+
+
 SMALL = b"x" * 100
+
+
 MIDDLE = bytes(range(256)) * 64
+
+
 LARGE = bytes(range(251)) * 4000
 
 
@@ -396,3 +413,231 @@ def test_parts_beyond_the_budget_pass_unkept() -> None:
     taker.part(1, 0, LAST, memoryview(b"cd"))
     assert [sequence for sequence, _ in taker.failures] == [1]
     assert (taker.bodies, budget.used) == ([], 8)
+
+
+# The connections to one server: calls at once, each over its own, and no call lost with one that was closed.
+
+
+MD5 = "6a2e34150c00229791cc89ff309fff21"
+
+
+class Desk:
+    """A server whose calls wait to be answered, and a pool for it."""
+
+    def __init__(self, node: SlaveNode) -> None:
+        self.node = node
+        self.calls: list[ServiceCall] = []
+        self.lost = 0
+        self.endpoint = ServiceEndpoint(
+            "/add", "/adder", self.calls.append, description=ServiceDescription("a/Add", MD5), timeout=30.0
+        )
+        node.add_service(self.endpoint)
+        self.pool = ServicePool("/add", LocalService("/adder", node.service_uri), self._lost)
+        self.answers: dict[bytes, tuple[bool, bytes]] = {}
+
+    def _lost(self) -> None:
+        self.lost += 1
+
+    def call(self, body: bytes, timeout: float = 20.0) -> None:
+        def done(ok: bool, answer: Buffer) -> None:
+            assert body not in self.answers
+            self.answers[body] = ok, bytes(answer)
+
+        self.pool.call(body, timeout, done)
+
+    async def until(self, *, calls: int = 0, answers: int = 0, lost: int = 0) -> None:
+        async with asyncio.timeout(20):
+            while len(self.calls) < calls or len(self.answers) < answers or self.lost < lost:
+                await asyncio.sleep(0.001)
+
+
+@pytest.fixture
+async def desk() -> AsyncIterator[Desk]:
+    node = SlaveNode("/adder", "127.0.0.1", "http://127.0.0.1:1/")
+    await node.start()
+    made = Desk(node)
+    yield made
+    made.pool.close("the test ends")
+    await made.pool.closed()
+    await node.close()
+
+
+async def test_the_server_says_what_it_is_and_its_connection_stays_for_a_call(desk: Desk) -> None:
+    told = await desk.pool.describe()
+    assert (told.type, told.md5sum) == ("a/Add", MD5)
+    desk.call(b"1")
+    await desk.until(calls=1)
+    assert desk.pool.size == len(desk.endpoint._clients) == 1
+    desk.calls[0].reply(True, b"one")
+    await desk.until(answers=1)
+    desk.call(b"2")
+    await desk.until(calls=2)
+    assert len(desk.endpoint._clients) == 1, "an idle connection is used again"
+    desk.calls[1].fail("it sticks")
+    await desk.until(answers=2)
+    assert desk.answers == {b"1": (True, b"one"), b"2": (False, b"it sticks")}
+
+
+async def test_calls_are_made_at_once_as_far_as_may_be_and_the_rest_waits(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SERVICE_POOL", 3)
+    monkeypatch.setattr(limits, "SERVICE_QUEUE", 4)
+    for number in range(6):
+        desk.call(b"%d" % number)
+        if number == 2:
+            await desk.until(calls=3)
+    assert len(desk.calls) == desk.pool.size == 3
+    for number in (6, 7):
+        desk.call(b"%d" % number)
+    assert b"calls wait for its server already" in desk.answers[b"7"][1]
+    for number in range(7):
+        await desk.until(calls=number + 1)
+        desk.calls[number].reply(True, desk.calls[number].request)
+    await desk.until(answers=8)
+    assert sum(ok for ok, _ in desk.answers.values()) == 7
+
+
+async def test_a_connection_that_the_server_closed_meanwhile_is_replaced(desk: Desk) -> None:
+    await desk.pool.describe()
+    desk.endpoint.withdraw()
+    desk.node.remove_service("/add")
+    desk.node.add_service(
+        ServiceEndpoint("/add", "/adder", desk.calls.append, description=ServiceDescription("a/Add", MD5))
+    )
+    desk.call(b"1")
+    await desk.until(calls=1)
+    desk.calls[0].reply(True, b"one")
+    await desk.until(answers=1)
+    assert desk.answers[b"1"] == (True, b"one")
+    desk.node.remove_service("/add")
+
+
+async def test_a_server_that_dies_in_the_middle_of_a_call(desk: Desk) -> None:
+    desk.call(b"1")
+    await desk.until(calls=1)
+    for session in tuple(desk.endpoint._clients):
+        session.close()
+    await desk.until(answers=1, lost=1)
+    ok, text = desk.answers[b"1"]
+    assert not ok
+    assert b"in the middle of the call" in text
+
+
+async def test_a_server_that_is_not_there(desk: Desk) -> None:
+    port = desk.node.service_uri.rpartition(":")[2]
+    await desk.node.close()
+    for body in (b"1", b"2"):
+        desk.call(body)
+    await desk.until(answers=2, lost=1)
+    assert all(not ok and port.encode() in text for ok, text in desk.answers.values())
+    with pytest.raises(RmpaError):
+        await desk.pool.describe()
+
+
+async def test_a_call_whose_time_is_over_costs_its_connection(desk: Desk) -> None:
+    desk.call(b"1", timeout=0.05)
+    await desk.until(calls=1, answers=1)
+    assert b"no answer within" in desk.answers[b"1"][1]
+    assert desk.pool.size == 0
+
+
+async def test_what_nobody_uses_is_closed(desk: Desk) -> None:
+    await desk.pool.describe()
+    now = asyncio.get_running_loop().time()
+    desk.pool.close_idle(now - 10)
+    assert not desk.pool.unused
+    desk.pool.close_idle(now + 10)
+    assert desk.pool.unused
+
+
+async def test_the_end_answers_everybody(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SERVICE_POOL", 1)
+    for body in (b"1", b"2"):
+        desk.call(body)
+    await desk.until(calls=1)
+    desk.pool.close("its server has gone")
+    await desk.until(answers=2)
+    assert b"its server has gone" in desk.answers[b"2"][1]
+    assert not desk.answers[b"1"][0]
+
+
+# The server's side of direct calls, with doubles for the peers and the offered services: what a peer is told.
+
+
+AGAIN = "direct.service_again"
+
+
+URI, RESTARTED = "rosrpc://10.0.0.1:45000", "rosrpc://10.0.0.1:45001"
+
+
+class Module:
+    """The module of /adder, which provides /add, and what its agent told peer 1."""
+
+    def __init__(self, *, secured: bool) -> None:
+        self.permitted = False
+        self.told: list[str] = []
+        self.handlers: dict[str, Any] = {}
+        self.offered = {"/add": SimpleNamespace(node="/adder", uri=URI, origin=None)}
+        link = SimpleNamespace(name="pad")
+        self.session: Any = SimpleNamespace(peer=1, link=link, linked=True, same_machine=False, address="10.0.0.2")
+        trust = Permissions(TrustSettings()) if secured else None
+        local = lambda _, service: service if self.permitted else None  # noqa: E731 - a double
+        rpc = SimpleNamespace(
+            on_request=self._on,
+            on_notification=self._on,
+            notify=lambda _, what, __: self.told.append(what),
+        )
+        self.sut = ServiceGrants(
+            cast(
+                "Any",
+                SimpleNamespace(
+                    sessions=SimpleNamespace(get={1: self.session}.get),
+                    rpc=rpc,
+                    counters=Counters(),
+                    context=SimpleNamespace(
+                        gate=PermissionGate(trust), services=SimpleNamespace(transport=lambda _: Transport.AUTO)
+                    ),
+                ),
+            ),
+            cast("Any", SimpleNamespace(offered=self.offered, local=local)),
+            lambda *_: None,
+        )
+
+    def _on(self, what: str, handler: object, _needs: object) -> None:
+        self.handlers[what] = handler
+
+    async def ask(self) -> str:
+        """Peer 1 asks for a direct call; returns the condition that is not met."""
+        reply = await self.handlers["direct.service"](self.session, msgspec.to_builtins(DirectAsk("/add", "/adder")))
+        return str(reply["why"])
+
+    def restart(self) -> None:
+        """The server is registered again, at another port."""
+        self.sut.server_gone("/add")
+
+
+@pytest.mark.parametrize("secured", [True, False])
+async def test_a_secured_peer_does_not_learn_of_a_service_that_it_may_not_have(*, secured: bool) -> None:
+    module = Module(secured=secured)
+    assert await module.ask() == Condition.OFFERED
+    module.restart()
+    assert module.told == ([] if secured else [AGAIN])
+
+
+async def test_a_secured_peer_is_told_when_to_ask_again_for_a_service_that_it_may_have() -> None:
+    module = Module(secured=True)
+    module.permitted = True
+    assert await module.ask() == Condition.TRUST
+    module.restart()
+    assert module.told == [AGAIN]
+
+
+async def test_what_a_reload_forbids_is_forgotten() -> None:
+    module = Module(secured=True)
+    module.permitted = True
+    assert await module.ask() == Condition.TRUST
+    module.permitted = False
+    module.sut.judge_again()
+    module.restart()
+    assert module.told == []

@@ -1,0 +1,535 @@
+from __future__ import annotations
+
+import asyncio
+import errno
+import re
+import socket
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import psutil
+import pytest
+
+from rmpa.bridge import limits
+from rmpa.bridge.graph_part import GraphPart
+from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode, op_of
+from rmpa.bridge.policy import PermissionGate
+from rmpa.bridge.proxies import PeerProxies, ProxyNodes
+from rmpa.bridge.sessions import Part, PeerSession, PeerSessions, PeerState
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports
+from rmpa.config.settings import TrustSettings
+from rmpa.core.counters import Counters
+from rmpa.core.errors import LimitExceeded
+from rmpa.core.identity import Guid, Identity
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros.http.rpc import call_api
+from rmpa.ros.node import listeners as shared_listener
+from rmpa.trust.permissions import Permissions
+from tests.bridge.io.virtual import VirtualLoop, run
+from tests.bridge.recorder import context
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable, Sequence
+
+    from rmpa.bridge.sessions import PeerSession
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.ros.core.external import Core
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+
+# When a session begins, waits for its peer, goes on and ends.
+
+
+GRACE = mesh_limits.SILENT_GRACE
+
+
+class Keeper(Part):
+    """Notes what it is told, and keeps something for each of these seconds."""
+
+    def __init__(self, *outages: float) -> None:
+        self.outages = outages
+        self.told: list[str] = []
+
+    def link_up(self, session: PeerSession) -> None:
+        self.told.append(f"up {session.peer}")
+
+    def link_down(self, session: PeerSession) -> None:
+        self.told.append("down")
+
+    def grace_over(self, session: PeerSession) -> bool:
+        self.told.append("grace over")
+        return bool(self.outages)
+
+    def outlasted(self, session: PeerSession, seconds: float) -> float | None:
+        return min((outage for outage in self.outages if outage > seconds), default=None)
+
+    def gone(self, session: PeerSession) -> None:
+        self.told.append("gone")
+
+
+class Link:
+    """What a session needs of a link to a run of the peer."""
+
+    name = "far"
+    resumed_at = 0.0
+    abandoned = False
+
+    def __init__(self, run_number: int, *, silent: bool, host: str = "10.0.0.1") -> None:
+        self.identity = Identity(Guid.of(host, 1000), bytes([run_number]) * 16, self.name)
+        self.guid = self.identity.guid
+        self.routes: dict[int, object] = {}
+        self.silent = silent
+        self.crashed = False
+
+
+class Scene:
+    """The sessions of one bridge with one part."""
+
+    def __init__(self, *outages: float, before: Sequence[Part] = ()) -> None:
+        self.part = Keeper(*outages)
+        nodes = cast("Any", SimpleNamespace())
+        self.gate = PermissionGate()
+        self.sessions = PeerSessions([*before, self.part], nodes, self._killed, self.gate)
+
+    async def _killed(self, *_: object) -> RosReply:
+        raise NotImplementedError
+
+    def link(self, run_number: int = 1, *, silent: bool = True, host: str = "10.0.0.1") -> PeerLink:
+        link = cast("PeerLink", Link(run_number, silent=silent, host=host))
+        self.sessions.link_up(link)
+        return link
+
+    def states(self) -> list[PeerState]:
+        return [session.state for session in self.sessions]
+
+
+def play(scene: Callable[[Scene], Coroutine[object, object, None]], *outages: float) -> list[str]:
+    """Play a scene; return what the part was told."""
+    loop, told = VirtualLoop(), []
+
+    async def main() -> None:
+        made = Scene(*outages)
+        await scene(made)
+        told.extend(made.part.told)
+        await made.sessions.close()
+        assert made.states() == []
+
+    run(main(), loop)
+    return told
+
+
+def test_a_short_silence_goes_unnoticed() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        assert made.states() == [PeerState.SILENT]
+        await asyncio.sleep(GRACE / 2)
+        made.link()
+        await asyncio.sleep(GRACE)
+        assert made.states() == [PeerState.LINKED]
+
+    assert play(scene) == ["up 1", "down", "up 1"]
+
+
+class Broken(Part):
+    """A part that fails whatever it is told."""
+
+    def link_up(self, session: PeerSession) -> None:
+        raise ZeroDivisionError
+
+    link_down = gone = lane_lost = link_up
+
+    def grace_over(self, session: PeerSession) -> bool:
+        raise ZeroDivisionError
+
+
+def test_a_part_that_fails_does_not_keep_the_next_ones_from_being_told(caplog: pytest.LogCaptureFixture) -> None:
+    made: list[Scene] = []
+
+    async def main() -> None:
+        made.append(Scene(before=[Broken()]))
+        made[0].sessions.link_down(made[0].link())
+        await asyncio.sleep(GRACE * 2)
+        await made[0].sessions.close()
+
+    run(main(), VirtualLoop())
+    assert made[0].part.told == ["up 1", "down", "grace over", "gone"]
+    assert "Broken failed" in caplog.text
+
+
+def test_another_module_that_claims_a_run_does_not_get_its_session() -> None:
+    """Instances are no secret: each member hears them in beacons. In a secured mesh the name alone is proved."""
+
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        thief = Link(1, silent=True)
+        thief.name = "thief"
+        thief.identity = Identity(thief.guid, thief.identity.instance, "thief")
+        made.sessions.link_up(cast("PeerLink", thief))
+        assert [(session.peer, session.link.name) for session in made.sessions] == [(2, "thief")]
+
+    assert play(scene) == ["up 1", "down", "gone", "up 2"]
+
+
+@pytest.mark.parametrize("secured", [True, False])
+def test_a_module_at_the_address_of_another_ends_its_session_in_a_plain_mesh_alone(*, secured: bool) -> None:
+    """In a secured mesh the address is a claim, and the name is proved. In a plain one the module was renamed."""
+
+    async def scene(made: Scene) -> None:
+        made.gate.permissions = Permissions(TrustSettings()) if secured else None
+        made.sessions.link_down(made.link())
+        other = Link(2, silent=True)
+        other.name = "other"
+        other.identity = Identity(other.guid, other.identity.instance, "other")
+        made.sessions.link_up(cast("PeerLink", other))
+        assert [session.link.name for session in made.sessions] == (["far"] if secured else []) + ["other"]
+
+    assert play(scene) == ["up 1", "down", *([] if secured else ["gone"]), "up 2"]
+
+
+def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        await asyncio.sleep(GRACE + 0.1)
+        assert made.states() == []
+        made.link()
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone", "up 2"]
+
+
+def test_a_peer_whose_agent_died_has_a_short_grace() -> None:
+    async def scene(made: Scene) -> None:
+        link = made.link()
+        link.crashed = True
+        made.sessions.link_down(link)
+        await asyncio.sleep(mesh_limits.AWAY_GRACE / 2)
+        assert made.states() == [PeerState.SILENT]
+        await asyncio.sleep(mesh_limits.AWAY_GRACE)
+        assert made.states() == []
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone"]
+
+
+def test_a_link_that_was_closed_in_order_has_no_grace() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link(silent=False))
+        assert made.states() == []
+
+    assert play(scene) == ["up 1", "down", "grace over", "gone"]
+
+
+def test_a_session_waits_for_as_long_as_something_is_kept() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link())
+        await asyncio.sleep(8.9)
+        assert made.states() == [PeerState.AWAY]
+        await asyncio.sleep(0.2)
+        assert made.states() == []
+
+    assert play(scene, 3.0, 9.0) == ["up 1", "down", "grace over", "gone"]
+
+
+def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
+    async def scene(made: Scene) -> None:
+        made.sessions.link_down(made.link(1))
+        await asyncio.sleep(GRACE + 1.0)
+        link = made.link(2)
+        assert made.states() == [PeerState.LINKED]
+        [session] = made.sessions.linked()
+        assert made.sessions.of(link) is session
+        assert made.sessions.get(1) is None
+
+    assert play(scene, 9.0) == ["up 1", "down", "grace over", "gone", "up 2"]
+
+
+# Proxies are there while something holds them.
+
+
+class Nodes:
+    """Makes nodes without sockets, or fails."""
+
+    def __init__(self) -> None:
+        self.problem: Exception | None = None
+        self.open: list[str] = []
+
+    def make(self, name: str, _on_kill: object) -> SlaveNode:
+        async def start() -> None:
+            await asyncio.sleep(0)
+            if self.problem is not None:
+                raise self.problem
+            self.open.append(name)
+
+        async def close() -> None:
+            self.open.remove(name)
+
+        return cast("SlaveNode", SimpleNamespace(name=name, start=start, close=close))
+
+
+class World:
+    """The proxies of one peer, and what happened at them."""
+
+    def __init__(self) -> None:
+        self.nodes = Nodes()
+        self.proxies = PeerProxies("/rmpa/far", cast("Any", self.nodes))
+        self.happened: list[str] = []
+
+    def hold(self, node: str, key: str) -> None:
+        self.proxies.hold(
+            node,
+            key,
+            lambda proxy: self.happened.append(f"{key} at {proxy.name}"),
+            lambda proxy: self.happened.append(f"{key} left"),
+        )
+
+    async def settled(self) -> list[str]:
+        for _ in range(10):
+            await asyncio.sleep(0)
+        happened, self.happened = self.happened, []
+        return happened
+
+
+async def test_a_proxy_is_there_while_something_holds_it() -> None:
+    world = World()
+    world.hold("/n", "topic /a")
+    world.hold("/n", "service /b")
+    assert await world.settled() == ["topic /a at /rmpa/far/n", "service /b at /rmpa/far/n"]
+    assert (len(world.proxies), world.nodes.open) == (1, ["/rmpa/far/n"])
+    world.proxies.release("/n", "topic /a")
+    assert await world.settled() == ["topic /a left"]
+    assert world.proxies.get("/n") is not None
+    world.proxies.release("/n", "service /b")
+    assert await world.settled() == ["service /b left"]
+    assert (world.proxies.get("/n"), world.nodes.open) == (None, [])
+    await world.proxies.close()
+
+
+async def test_what_is_released_at_once_never_appears() -> None:
+    world = World()
+    world.hold("/n", "topic /a")
+    world.proxies.release("/n", "topic /a")
+    assert await world.settled() == []
+    world.hold("/n", "topic /a")
+    await asyncio.sleep(0)  # the proxy is being made
+    world.proxies.release("/n", "topic /a")
+    assert await world.settled() == []
+    assert world.nodes.open == []
+    await world.proxies.close()
+
+
+async def test_a_proxy_that_cannot_be_made_is_tried_again() -> None:
+    world = World()
+    world.nodes.problem = OSError("no address is left")
+    world.hold("/n", "topic /a")
+    assert await world.settled() == []
+    assert world.proxies.problems == {"/n": "no address is left"}
+    world.nodes.problem = None
+    world.proxies.reconcile()
+    assert await world.settled() == ["topic /a at /rmpa/far/n"]
+    assert world.proxies.problems == {}
+    world.proxies.reconcile()
+    assert await world.settled() == []
+    await world.proxies.close()
+    assert world.happened == ["topic /a left"]
+    assert world.nodes.open == []
+
+
+async def test_a_relayed_node_has_the_name_of_its_own_module() -> None:
+    world = World()
+    world.proxies.names["/rmpa/other/n"] = "/rmpa/other/n"
+    world.hold("/rmpa/other/n", "topic /a")
+    assert await world.settled() == ["topic /a at /rmpa/other/n"]
+    await world.proxies.close()
+
+
+# How proxies listen: together where nodes of this machine alone reach them, and apart where that cannot be.
+
+
+def core(host: str = "127.0.0.1", address: str = "127.0.0.1") -> Core:
+    """As much of a core as proxies ask for."""
+    return cast("Core", SimpleNamespace(uri="http://127.0.0.1:11311/", node_host=host, node_address=address))
+
+
+def listening() -> int:
+    """How many sockets of this process listen."""
+    return sum(found.status == psutil.CONN_LISTEN for found in psutil.Process().net_connections("tcp"))
+
+
+async def proxies(nodes: ProxyNodes, count: int = 3) -> list[str]:
+    """Make some proxies, see that each answers, and close them; their hosts."""
+    made = [nodes.make(f"/rmpa/base/n{number}") for number in range(count)]
+    for proxy in made:
+        await proxy.start()
+        uri = f"http://127.0.0.1:{proxy.uri.rsplit(':')[-1]}" if "robot" in proxy.uri else proxy.uri
+        assert (await call_api(uri, "getName", "/c")).value == proxy.name
+    hosts = [proxy.uri.split("/")[2].split(":")[0] for proxy in made]
+    for proxy in made:
+        await proxy.close()
+    return hosts
+
+
+async def test_on_loopback_they_share_two_sockets() -> None:
+    before = listening()
+    nodes = ProxyNodes(core())
+    await nodes.start()
+    assert nodes.sockets(1000) == 2
+    assert re.fullmatch(r"two for all, ports \d+ and \d+, and an address 127.a.b.c for each", nodes.listening)
+    hosts = await proxies(nodes)
+    assert len(set(hosts)) == 3
+    assert "127.0.0.1" not in hosts
+    assert listening() == before + 2
+    await nodes.close()
+    assert listening() == before
+
+
+async def test_where_other_machines_reach_them_each_listens_by_itself() -> None:
+    nodes = ProxyNodes(core("0.0.0.0", "robot"))  # as an external core over several machines has it
+    await nodes.start()
+    assert nodes.sockets(1000) == 2000
+    assert nodes.listening == "two for each: nodes of other machines reach them, at robot"
+    assert await proxies(nodes) == ["robot"] * 3
+    await nodes.close()
+
+
+async def test_without_the_device_each_listens_by_itself_and_the_log_says_why(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Forbidden(socket.socket):
+        def setsockopt(self, level: int, option: int, value: int | bytes) -> None:  # type: ignore[override]
+            if option == socket.SO_BINDTODEVICE:
+                raise PermissionError(errno.EPERM, "Operation not permitted")
+            super().setsockopt(level, option, value)
+
+    before = listening()
+    nodes = ProxyNodes(core())
+    with monkeypatch.context() as context, caplog.at_level("INFO"):
+        context.setattr(socket, "socket", Forbidden)
+        await nodes.start()
+    why = "two for each, at 127.0.0.1: all cannot share two (Operation not permitted)"
+    assert nodes.listening == why
+    assert [r.message for r in caplog.records] == [f"= proxies listen by sockets of their own, {why}"]
+    assert await proxies(nodes) == ["127.0.0.1"] * 3
+    assert listening() == before
+    await nodes.close()
+
+
+async def test_a_failed_trial_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = listening()
+
+    async def refuse(*_: object) -> None:
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+
+    monkeypatch.setattr(shared_listener.SharedListener, "_test_address", refuse)
+    nodes = ProxyNodes(core())
+    await nodes.start()
+    assert "Connection refused" in nodes.listening
+    assert listening() == before
+    await nodes.close()
+
+
+# How the part for topics or services works off what it has to do.
+
+
+LOCAL = LocalSource("a/B", "http://x:1/")
+
+
+class OnePart(GraphPart):
+    """Topics of one linked peer, without a graph."""
+
+    verb = "publishes"
+    imports: Imports
+    exports: Exports
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.shown: list[str] = []
+        self.failing: set[str] = set()
+        self.settled = 0
+        link = SimpleNamespace(
+            name="far", busy=False, remote_endpoint=("x", 1), send_control=lambda data: self.sent.append(decode(data))
+        )
+        link.abort = self.sent.append
+        self.session = cast("PeerSession", SimpleNamespace(peer=1, link=link, linked=True))
+        shared = SimpleNamespace(counters=Counters(), rng=lambda: 0.5, context=context(), sessions={1: self.session})
+        super().__init__(cast("Any", shared), Exports, Imports)
+        self.imports.link_up(1, "far")
+        self.exports.link_up(1, "far")
+
+    def _look_at(self, name: str) -> None:
+        if name in self.failing:
+            raise RuntimeError("once")
+        self.exports.put(Source(name, "/n"), LOCAL)
+
+    def _names(self) -> Iterable[str]:
+        return ()
+
+    def _settled(self) -> None:
+        self.settled += 1
+
+    def publish(self, entry: Any) -> None:
+        """Note what is shown."""
+        self.shown.append(entry.name)
+
+
+async def until_settled(part: OnePart) -> None:
+    while not part.settled:
+        await asyncio.sleep(0)
+
+
+async def test_names_are_looked_at_and_told_in_slices_and_a_failing_one_holds_up_no_other(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    part = OnePart()
+    names = [f"/t{number}" for number in range(3 * limits.RESCANNED_AT_ONCE)]
+    part.failing = {names[3]}
+    part.look(names)
+    assert not part.idle
+    await until_settled(part)
+    told = [offer.topic for message in part.sent for offer in message.added]
+    assert told == [name for name in names if name != names[3]]
+    assert "once" in caplog.text
+
+
+async def test_advertisements_are_applied_in_order_and_too_many_bytes_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    part = OnePart()
+    names = [f"/t{number}" for number in range(2 * limits.APPLIED_AT_ONCE)]
+    for begin in range(0, len(names), 8):
+        offers = tuple(TopicOffer(name, "/n", "a/B") for name in names[begin : begin + 8])
+        part.advertised(part.session, encode(Advertise(offers)))
+    assert not part.shown
+    assert part.depends(part.session)
+    monkeypatch.setattr(limits, "ADVERTISED_WAITING_BYTES", 0)
+    part.advertised(part.session, encode(Advertise(removed=(Source("/t0", "/n"),))))
+    assert part.shown == names[: len(part.shown)]
+    assert len(part.shown) >= len(names) - 8
+    await until_settled(part)
+    assert part.shown == names
+    assert part.imports.get(1, Source("/t0", "/n")) is None
+    assert not part.depends(part.session)
+
+
+async def test_a_peer_that_sends_nonsense_for_an_advertisement_loses_its_link() -> None:
+    part = OnePart()
+    part.advertised(part.session, b'{"op": "advertise", "added": 7}')
+    await until_settled(part)
+    assert "broke the protocol" in part.sent[-1]
+
+
+async def test_what_a_lost_link_has_said_is_dropped() -> None:
+    part = OnePart()
+    part.direct_imports = part.direct_exports = cast("Any", SimpleNamespace(link_down=lambda _: None))
+    part.advertised(part.session, encode(Advertise((TopicOffer("/t", "/n", "a/B"),))))
+    part.link_down(part.session)
+    assert not part.depends(part.session)
+    await until_settled(part)
+    assert not part.shown
+
+
+async def test_a_too_long_advertisement_ends_the_link_unparsed() -> None:
+    part = OnePart()
+    payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
+    assert op_of(payload) == "advertise"
+    with pytest.raises(LimitExceeded):
+        part.advertised(part.session, payload)
