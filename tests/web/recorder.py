@@ -181,6 +181,20 @@ class Connection:
         return 0.0
 
 
+class PageConnection(Connection):
+    """Of a page of the monitor: a connection that says how much the page has not taken, and why it was ended."""
+
+    unsent = 0
+    refusal = reason = ""
+
+    def end(self, code: int, reason: str, refusal: str = "") -> None:
+        super().end(code, reason, refusal)
+        self.reason, self.refusal = reason, refusal
+
+    def arm(self) -> None:
+        """The test looks at the timer."""
+
+
 class Recorded:
     """One client with its session; `now` is the clock of all calls."""
 

@@ -20,24 +20,28 @@ import struct
 import time
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 from aiohttp import WSMsgType, web
 
 from rmpa.core.contract import ContractRule, Contracts
+from rmpa.core.errors import RmpaError
 from rmpa.observe.peer_info import LaneInfo, PeerAgent
 from rmpa.observe.snapshot import Snapshot
 from rmpa.observe.why.services import diagnose_module
+from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
-from rmpa.web.monitor import session as monitor
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.resources import ResourceFacts
+from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
+from tests.web.recorder import FakeHub, PageConnection, Recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
 
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.messages import Tree
@@ -47,6 +51,7 @@ STATIC = Path(__file__).parents[3] / "src/rmpa/web/static"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 TICK = 0.1
 SCENES = ("demo", "killed", "sick", "large", "cut", "mute", "sensors")
+_SPEEDS = struct.Struct("<6d")
 _SENSORS = {"/scan": "sensor_msgs/LaserScan", "/camera/image": "sensor_msgs/CompressedImage"}
 
 
@@ -223,9 +228,9 @@ class FakeServer:
     def __init__(self, scene: str = "demo", rights: Rights | None = None) -> None:
         self.agent = FakeAgent(scene)
         self.rights = rights or dataclasses.replace(FULL, drive=True)
-        self.speeds: list[monitor.Speed] = []
+        self.speeds: list[SimpleNamespace] = []
         self.reports: list[str] = []
-        self.asked: list[monitor.Question] = []
+        self.asked: list[SimpleNamespace] = []
         self.params: dict[str, Any] = {
             "/rosdistro": "noetic",
             "/use_sim_time": False,
@@ -295,11 +300,13 @@ class FakeServer:
         try:
             async for message in socket:
                 if message.type is WSMsgType.TEXT:
-                    await client.act(client.session.receive(message.data, time.monotonic()))
+                    client.session.received_frame(message.data, time.monotonic())
+                    await client.flush()
         finally:
             beat.cancel()
             self._open.discard(socket)
-            await client.act(client.session.close())
+            client.session.closing()
+            await client.flush()
         return socket
 
     def odometry(self) -> dict[str, Any]:
@@ -317,17 +324,17 @@ class FakeServer:
             },
         }
 
-    def answer(self, question: monitor.Question) -> Any:
+    async def answer(self, what: str, args: dict[str, Any]) -> Any:
         """The answer to a question of a page.
 
         Raises:
-            LookupError: There is none.
+            RmpaError: There is none.
         """
-        self.asked.append(question)
-        answer = getattr(self, f"_answer_{question.what}", None)
-        if answer is None:
-            raise LookupError(question.what)
-        return answer(question.args)
+        self.asked.append(SimpleNamespace(what=what, args=args))
+        try:
+            return getattr(self, f"_answer_{what}")(args)
+        except (AttributeError, LookupError):
+            raise RmpaError(f"this server cannot answer {what}") from None
 
     def _answer_why(self, args: dict[str, Any]) -> Any:
         if args["kind"] == "module":
@@ -407,13 +414,27 @@ class FakeServer:
         return {"value": args["value"], "text": f"{args['name']} is {args['value']} now"}
 
 
-class _Client:
+class _Client(Recorded):
+    """One page: the real session, with the calls of the hub written down and what it sends."""
+
     def __init__(self, server: FakeServer, socket: web.WebSocketResponse) -> None:
         self._server = server
         self._socket = socket
-        self._watched: dict[int, str] = {}
-        self._log = False
-        self.session = monitor.MonitorSession(server._details, self._decode, server.rights, time.monotonic())
+        self._log: Callable[[list[Any]], None] | None = None
+        mesh = SimpleNamespace(agent="pc", details=server._details, follow=lambda *_: None, unfollow=lambda _: None)
+        log = SimpleNamespace(follow=self._follow_log, unfollow=self._unfollow_log, refused=None)
+        answers, values = SimpleNamespace(answer=server.answer), SimpleNamespace(of=self._decode)
+        monitor: Any = SimpleNamespace(mesh=mesh, log=log, answers=answers, values=values)
+        hub: Any = FakeHub()
+        super().__init__(MonitorSession(hub, server.rights, lambda _: 0, "page", monitor, time.monotonic))
+        self.page = self.connection = self.session.connection = PageConnection(self)
+
+    def _follow_log(self, _page: object, show: Callable[[list[Any]], None]) -> list[Any]:
+        self._log = show
+        return []
+
+    def _unfollow_log(self, _page: object) -> None:
+        self._log = None
 
     def _decode(self, message: ReceivedMessage) -> Any:
         topic = message.topic
@@ -433,49 +454,36 @@ class _Client:
         return {"data": f"<script>alert(1)</script> {int(time.time())}", "values": list(range(200))}
 
     async def run(self) -> None:
-        await self.act(self.session.open("pc"))
+        self.session.opened()
         for tick in itertools.count():
-            now = time.monotonic()
             if tick % 2 == 0:
-                await self.act(self.session.update(self._server._next_state(), now))
-            for handle, topic in list(self._watched.items()):
-                kind = (
-                    "sensor_msgs/LaserScan"
-                    if "scan" in topic
-                    else "sensor_msgs/CompressedImage"
-                    if "image" in topic
-                    else "nav_msgs/Odometry"
-                )
-                received = ReceivedMessage(topic, kind, memoryview(b"\0" * 712), time.time_ns())
-                await self.act(self.session.receive_message(handle, received, now))
-            if self._log and tick % 10 == 0:
+                self.session._update(self._server._next_state())
+            for asked in self.all("subscribe"):
+                kind = next((kind for name, kind in _SENSORS.items() if name == asked.topic), "nav_msgs/Odometry")
+                if not asked.closed:
+                    asked.receive(ReceivedMessage(asked.topic, kind, memoryview(b"\0" * 712), time.time_ns()))
+            if self._log is not None and tick % 10 == 0:
                 line = {"n": tick, "at": time.time(), "level": "INFO", "node": self._server.logger}
-                await self.act(self.session.log([line | {"text": f"turn {tick}"}]))
-            await self.act(self.session.handle_timer(now))
+                self._log([line | {"text": f"turn {tick}"}])
+            self.session.handle_timer(time.monotonic())
+            await self.flush()
             await asyncio.sleep(TICK)
 
-    async def act(self, outputs: Iterator[monitor.Output]) -> None:
-        for output in list(outputs):
-            if isinstance(output, str | bytes):
-                if not self._socket.closed:
-                    await (
-                        self._socket.send_str(output) if isinstance(output, str) else self._socket.send_bytes(output)
-                    )
-            elif isinstance(output, monitor.Subscribe):
-                self._watched[output.id] = output.topic
-            elif isinstance(output, monitor.Unsubscribe):
-                self._watched.pop(output.id, None)
-            elif isinstance(output, monitor.Question):
-                try:
-                    await self.act(self.session.answer(output.id, self._server.answer(output)))
-                except LookupError:
-                    await self.act(self.session.refuse(output.id, f"this server cannot answer {output.what}"))
-            elif isinstance(output, monitor.Speed):
-                self._server.speeds.append(output)
-            elif isinstance(output, monitor.FollowLog):
-                self._log = output.on
-            elif isinstance(output, monitor.MonitorClose):
-                await self._socket.close(code=output.code, message=output.reason.encode())
+    async def flush(self) -> None:
+        """Do what the session has said since the last call."""
+        for opcode, (data,) in self.frames():
+            if self._socket.closed:
+                break
+            if opcode is Opcode.TEXT:
+                await self._socket.send_str(bytes(data).decode())
+            else:
+                await self._socket.send_bytes(bytes(data))
+        for asked in self.all("advertise"):
+            for speed in map(_SPEEDS.unpack, asked.published):
+                self._server.speeds.append(SimpleNamespace(linear=speed[0], angular=speed[5]))
+            asked.published.clear()
+        if self.page.ended:
+            await self._socket.close(code=self.page.ended[0], message=self.page.reason.encode())
 
 
 def _room(angle: float) -> float:

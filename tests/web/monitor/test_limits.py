@@ -28,6 +28,6 @@ def test_the_page_has_each_question_and_message() -> None:
         assert f"`{what}`" in PAGE
     for right in session.RIGHTS:
         assert f"`{right}`" in PAGE
-    for kind in (messages.Ack, messages.Look, messages.Watch, messages.Unwatch, messages.AskQuestion, messages.Log):
-        assert f"`{kind.__struct_config__.tag}`" in PAGE
+    for op in session.OPS:
+        assert f"`{op}`" in PAGE
     assert f"`{messages.SUBPROTOCOL}`" in PAGE

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import functools
 import logging
 import secrets
-import struct
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -16,186 +14,27 @@ from typing import TYPE_CHECKING, Final
 from aiohttp import WSCloseCode, web
 
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS, choose_subprotocol
 from rmpa.web.foxglove.session import FoxgloveSession
-from rmpa.web.gateways.connection import Session
-from rmpa.web.gateways.frame_writer import FrameSocket, Opcode
+from rmpa.web.gateways.frame_writer import FrameSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
-from rmpa.web.monitor.session import (
-    FollowLog,
-    MonitorClose,
-    MonitorSession,
-    Question,
-    Speed,
-    Subscribe,
-    Unsubscribe,
-)
+from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
-    from rmpa.web.gateways.connection import ClientConnection
+    from rmpa.web.gateways.connection import ClientConnection, Session
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
-    from rmpa.web.monitor.messages import Tree
     from rmpa.web.monitor.monitor import Monitor
-    from rmpa.web.monitor.session import Output as MonitorOutput
 
 
 _log = logging.getLogger(__name__)
-_TWIST: Final = "geometry_msgs/Twist"
-_SPEEDS: Final = struct.Struct("<6d")
-"""A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s."""
-
-
-class MonitorConnection(Session):
-    """One page of the monitor: what its ``MonitorSession`` asks of the hub, the agent and the robot.
-
-    Args:
-        hub: The hub.
-        rights: What the page may do.
-        priority: The priority of a topic's messages.
-        address: The page's, for logs.
-        monitor: What all pages share.
-    """
-
-    kind = "monitor"
-    dates_commands = True
-    timer_waits = False  # the robot is stopped in time, whatever waits for the page
-
-    def __init__(
-        self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str, monitor: Monitor
-    ) -> None:
-        # The joystick publishes by the hub, whatever else the page may publish: nothing.
-        super().__init__(hub, dataclasses.replace(rights, control=rights.drive), priority, address)
-        self._monitor = monitor
-        self._loop = asyncio.get_running_loop()
-        self._session = MonitorSession(
-            monitor.mesh.details, monitor.values.of, rights, self._loop.time(), lambda: self.connection.unsent
-        )
-        self._watches: dict[int, ClientSubscription] = {}
-        self._driven: ClientPublication | None = None
-
-    def opened(self) -> None:
-        """Greet the page, and show it the state."""
-        self._act(self._session.open(self._monitor.mesh.agent))
-        self._monitor.mesh.follow(self, self._show)
-
-    def closing(self) -> None:
-        """Stop the robot, and all that the page had open."""
-        self._monitor.mesh.unfollow(self)
-        self._monitor.log.unfollow(self)
-        self._act(self._session.close())
-
-    def received_frame(self, data: str | bytes, now: float) -> None:
-        """A message of the page."""
-        self._act(self._session.receive(data, now))
-
-    def warn(self, text: str, subject: str) -> None:
-        """Nothing: the page is sent the newest messages only."""
-
-    def next_timer(self) -> float | None:
-        """The session's."""
-        return self._session.next_timer()
-
-    def handle_timer(self, now: float) -> None:
-        """Do what is due."""
-        self._act(self._session.handle_timer(now))
-
-    def _show(self, state: Tree) -> None:
-        self._act(self._session.update(state, self._loop.time()))
-
-    def _act(self, outputs: Iterator[MonitorOutput]) -> None:
-        # What is done here may come back to the session: it must be done first.
-        # Of a session that fails, what it said before is done all the same: that may be the robot's stop.
-        said: list[MonitorOutput] = []
-        try:
-            for output in outputs:
-                said.append(output)  # noqa: PERF402 - extend() would lose what came before an error
-        except Exception:  # noqa: BLE001 - a fault of one page's session must not end the server
-            _log.exception("! the session of %s failed", self.name)
-            self.connection.end(WSCloseCode.INTERNAL_ERROR, "the server failed; its log says why")
-        for output in said:
-            match output:
-                case str():
-                    self.connection.push((Opcode.TEXT, (output.encode(),)))
-                case bytes():
-                    self.connection.push((Opcode.BINARY, (output,)))
-                case Question():
-                    self._ask(output)
-                case Speed():
-                    self._drive(output)
-                case FollowLog():
-                    self._follow_log(on=output.on)
-                case Subscribe():
-                    self._watch(output)
-                case Unsubscribe():
-                    self._watches.pop(output.id).close()
-                case MonitorClose():
-                    self.connection.end(output.code, output.reason, output.refusal)
-        self.connection.arm()
-
-    def _watch(self, wanted: Subscribe) -> None:
-        def failed(error: RmpaError) -> None:
-            self._watches.pop(wanted.id, None)
-            self._act(self._session.end_watch(wanted.id, *advised(error)))
-
-        def receive(message: ReceivedMessage) -> None:
-            self._act(self._session.receive_message(wanted.id, message, self._loop.time()))
-
-        try:
-            self._watches[wanted.id] = self.subscribe(wanted.topic, None, receive, failed)
-        except RmpaError as error:
-            failed(error)
-
-    def _follow_log(self, *, on: bool) -> None:
-        log = self._monitor.log
-        if not on:
-            log.unfollow(self)
-            return
-        if kept := log.follow(self, lambda lines: self._act(self._session.log(lines))):
-            self._act(self._session.log(kept, kept=True))
-        if log.refused is not None:
-            self._act(self._session.failed(str(log.refused)))
-
-    def _ask(self, question: Question) -> None:
-        self.run(
-            self._monitor.answers.answer(question.what, question.args),
-            lambda value: self._act(self._session.answer(question.id, value)),
-            lambda error: self._act(self._session.refuse(question.id, *advised(error))),
-        )
-
-    def _drive(self, speed: Speed) -> None:
-        def failed(error: RmpaError) -> None:
-            self._driven = None
-            self._act(self._session.failed(*advised(error)))
-
-        try:
-            if self._driven is None or self._driven.topic != speed.topic:
-                if self._driven is not None:
-                    self._driven.close()
-                self._driven = self.advertise(speed.topic, _TWIST, failed)
-        except RmpaError as error:
-            failed(error)
-        else:
-            self._driven.publish(_SPEEDS.pack(speed.linear, 0, 0, 0, 0, speed.angular))
-
-
-def advised(error: RmpaError) -> tuple[str, str]:
-    """The text of an error without its remedy, and the remedy."""
-    remedy = str(getattr(error, "remedy", ""))
-    return (str(error).removesuffix(f"; {remedy}"), remedy) if remedy else (str(error), "")
-
-
-# What the gateways count, for ``/metrics``; no I/O.
-
-
 PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
 """The gateways, as ``ClientConnection.kind`` names them."""
 REASONS: Final = ("handshake", "clients", "message", "message_size", "message_rate")
@@ -296,7 +135,7 @@ class Gateways:
                 self.refuse(address, "handshake", text)
                 return web.Response(status=400, text=f"{text}\n")
             await self._monitor.ready()
-            return await self._serve(request, MonitorConnection(*client, self._monitor), limits.REQUEST_MAX + 1)
+            return await self._serve(request, MonitorSession(*client, self._monitor), limits.REQUEST_MAX + 1)
         await self._hub.settled(limits.SETTLE)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         if protocol is not None:

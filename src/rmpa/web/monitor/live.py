@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import struct
@@ -9,17 +10,14 @@ from array import array
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-import msgspec
-
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.web.hub.node_link import Payload
     from rmpa.web.hub.topics import ReceivedMessage
-    from rmpa.web.monitor.messages import Watch
 
     Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
@@ -156,47 +154,34 @@ def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload
     Raises:
         RemoteProtocolError: The encoding cannot be shown, or the sizes do not fit together.
     """
-    if encoding in _DEPTHS:
-        return _depth_picture(width, height, encoding, step, data)
-    channels = _CHANNELS.get(encoding)
-    if channels is None:
+    letter, size = _DEPTHS.get(encoding, ("", _CHANNELS.get(encoding, 0)))
+    if not size:
         shown = ", ".join((*_CHANNELS, *_DEPTHS))
         raise RemoteProtocolError(f"images of the encoding {encoding[:40]!a} are not shown; these are: {shown}")
-    if width <= 0 or height <= 0 or step < width * channels or len(data) < step * (height - 1) + width * channels:
-        raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
-    every = max(1, math.ceil(math.sqrt(width * height / limits.IMAGE_PIXELS)))
-    source = memoryview(data)
-    columns = -(-width // every)
-    rows = range(0, height, every)
-    if channels == 1:
-        pixels = b"".join(bytes(source[row * step : row * step + width : every]) for row in rows)
-        return Picture("mono8", columns, len(rows), pixels, every)
-    order = (2, 1, 0) if encoding.startswith("bgr") else (0, 1, 2)
-    out = bytearray(columns * len(rows) * 3)
-    for at, row in enumerate(rows):
-        line = source[row * step : row * step + width * channels]
-        for colour, channel in enumerate(order):
-            out[at * columns * 3 + colour : (at + 1) * columns * 3 : 3] = bytes(line[channel :: channels * every])
-    return Picture("rgb8", columns, len(rows), bytes(out), every)
-
-
-def _depth_picture(width: int, height: int, encoding: str, step: int, data: Payload) -> Picture:
-    """Of one channel of 16 or 32 bits, as depth cameras have it: from black for the least value to white."""
-    letter, size = _DEPTHS[encoding]
     if width <= 0 or height <= 0 or step < width * size or len(data) < step * (height - 1) + width * size:
         raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
     every = max(1, math.ceil(math.sqrt(width * height / limits.IMAGE_PIXELS)))
     source = memoryview(data).cast("B")
-    rows = range(0, height, every)
-    values: list[float] = []
-    for row in rows:
-        line = source[row * step : row * step + width * size]
-        values += array(letter, bytes(line))[::every]
-    measured = [value for value in values if value > 0 and value < math.inf]  # 0 and NaN: nothing was measured
+    lines = [bytes(source[row * step : row * step + width * size]) for row in range(0, height, every)]
+    columns = -(-width // every)
+    if letter:
+        return Picture("mono8", columns, len(lines), _shades([array(letter, line)[::every] for line in lines]), every)
+    if size == 1:
+        return Picture("mono8", columns, len(lines), b"".join(line[::every] for line in lines), every)
+    out = bytearray(columns * len(lines) * 3)
+    for at, line in enumerate(lines):
+        for colour, channel in enumerate((2, 1, 0) if encoding.startswith("bgr") else (0, 1, 2)):
+            out[at * columns * 3 + colour : (at + 1) * columns * 3 : 3] = line[channel :: size * every]
+    return Picture("rgb8", columns, len(lines), bytes(out), every)
+
+
+def _shades(lines: Iterable[Iterable[float]]) -> bytes:
+    """Of one channel of 16 or 32 bits, as depth cameras have it: from black for the least value to white."""
+    values = [*itertools.chain.from_iterable(lines)]
+    measured = [value for value in values if 0 < value < math.inf]  # 0 and NaN: nothing was measured
     least, most = (min(measured), max(measured)) if measured else (0.0, 1.0)
     scale = 254 / (most - least) if most > least else 254.0
-    pixels = bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
-    return Picture("mono8", -(-width // every), len(rows), pixels, every)
+    return bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
 
 
 # --- watches ------------------------------------------------------------------------------------------------------
@@ -266,15 +251,20 @@ class WatchState:
     """One watch: the newest message, or samples of its fields, until the next frame is due.
 
     Args:
-        wanted: What the client asked for.
+        id_: Of the watch.
+        how: ``value``, ``plot``, ``image`` or ``scan``.
+        fields: The lines of a plot.
+        rate: Frames a second.
         decode: Gives a message's values: dicts, lists, numbers, strings; bytes for arrays of bytes.
     """
 
-    def __init__(self, wanted: Watch, decode: Decode) -> None:
-        self.wanted = wanted
+    def __init__(self, id_: int, how: str, fields: Sequence[str], rate: float, decode: Decode) -> None:
+        self._id = id_
+        self._how = how
+        self._rate = rate
         self._decode = decode
         self._newest: ReceivedMessage | None = None
-        self._paths = tuple(field_path(field) for field in wanted.fields)
+        self._paths = tuple(field_path(field) for field in fields)
         self._samples = SampleBuffer(len(self._paths))
         self._sent = -1e9
 
@@ -292,35 +282,27 @@ class WatchState:
     def due(self, now: float) -> float | None:
         """When the next frame may be sent; ``None`` while there is nothing to send."""
         waiting = len(self._samples) > 0 if self._paths else self._newest is not None
-        return max(now, self._sent + 1 / self.wanted.rate) if waiting else None
+        return max(now, self._sent + 1 / self._rate) if waiting else None
 
-    def frames(self, now: float) -> Iterator[str | bytes]:
-        """The frame that is due.
+    def frame(self, now: float) -> bytes | dict[str, Any]:
+        """The picture or message that is due.
 
         Raises:
             RmpaError: The message cannot be shown in that way; the text says why.
         """
-        message, self._newest = self._newest, None
-        self._sent = now
-        if message is None and not self._paths:
-            return
-        head = {"id": self.wanted.id}
-        if self._paths:
-            yield _text({"op": "points", **head, "columns": self._samples.take()})
-            return
-        if message is None:
-            return
+        message, self._newest, self._sent = self._newest, None, now
+        if self._paths or message is None:
+            return {"op": "points", "id": self._id, "columns": self._samples.take()}
         values = self._decode(message)
-        about = head | {"stamp": message.stamp_ns / 1e9, "type": message.type}
-        if self.wanted.how == "image":
-            yield _picture(message, values).frame(self.wanted.id, message.stamp_ns)
-        elif self.wanted.how == "scan":
-            yield _text({"op": "scan", **about, "scan": scan(values)})
-        else:
-            yield _text({"op": "value", **about, "size": len(message.payload), "value": cut(values)})
+        about = {"id": self._id, "stamp": message.stamp_ns / 1e9, "type": message.type}
+        if self._how == "image":
+            return _picture(message, values).frame(self._id, message.stamp_ns)
+        if self._how == "scan":
+            return {"op": "scan", **about, "scan": scan(values)}
+        return {"op": "value", **about, "size": len(message.payload), "value": cut(values)}
 
 
-def _picture(message: ReceivedMessage, values: Any) -> Any:
+def _picture(message: ReceivedMessage, values: Any) -> Picture:
     try:
         if message.type == "sensor_msgs/CompressedImage":
             return compressed_picture(str(values["format"]), values["data"])
@@ -330,7 +312,3 @@ def _picture(message: ReceivedMessage, values: Any) -> Any:
     except (KeyError, TypeError, ValueError):
         pass
     raise RemoteProtocolError(f"{message.type} is not an image")
-
-
-def _text(message: dict[str, Any]) -> str:
-    return msgspec.json.encode(message).decode()

@@ -1,103 +1,54 @@
-"""One client of the monitor: its messages and the agent's states in; frames and requests out; no I/O.
-
-The client gets a state, then patches, at most one in ``limits.PATCH_PERIOD`` and only while it acknowledges them: a
-slow browser gets fewer. The session keeps no queue, just the last state that it sent, which clients share.
-"""
+"""One page of the monitor: its messages and the agent's states in; frames, and calls of the hub, out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+import asyncio
+import contextlib
+import dataclasses
+import functools
+import logging
+import operator
+import struct
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 import msgspec
+from aiohttp import WSCloseCode
+from msgspec import Meta
 
 from rmpa.core.counters import TokenBucket
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.web import limits
+from rmpa.web.gateways.connection import Session, struct_of
+from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.monitor.live import WatchState
-from rmpa.web.monitor.messages import (
-    VERSION,
-    Ack,
-    AskQuestion,
-    Drive,
-    Log,
-    Look,
-    ReleaseJoystick,
-    Unwatch,
-    Watch,
-    difference,
-    parse,
-)
+from rmpa.web.monitor.messages import VERSION, Tree, difference
 from rmpa.web.monitor.questions import QUESTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.topics import ReceivedMessage
-    from rmpa.web.monitor.live import Decode
-    from rmpa.web.monitor.messages import Tree, Value
+    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
+    from rmpa.web.monitor.monitor import Monitor
 
-RIGHTS = ("view", "control", "drive")
+_log = logging.getLogger(__name__)
+Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
+Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters"]
+How: TypeAlias = Literal["value", "plot", "image", "scan"]
+Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
+"""Of a joystick: a share of the fastest that is allowed."""
+RIGHTS: Final = ("view", "control", "drive")
 """What a page may have, as ``hello`` lists it."""
-_NO_TOKEN = "this page may not read parameters", "open it with a token: rmpa web --token-file FILE, or --control"
-_NO_CONTROL = "this page may only look", "start rmpa web with --control"
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """The server finds the answer and gives it to ``MonitorSession.answer`` or ``refuse``."""
-
-    id: int
-    what: str
-    args: dict[str, Any]  # the edge: each question has its own
-
-
-@dataclass(frozen=True, slots=True)
-class Speed:
-    """A geometry_msgs/Twist for ``topic``: m/s and rad/s."""
-
-    topic: str
-    linear: float
-    angular: float
-
-
-@dataclass(frozen=True, slots=True)
-class Subscribe:
-    """The messages of a topic are wanted for the watch ``id``."""
-
-    id: int
-    topic: str
-
-
-@dataclass(frozen=True, slots=True)
-class Unsubscribe:
-    """The watch ``id`` has ended."""
-
-    id: int
-
-
-@dataclass(frozen=True, slots=True)
-class FollowLog:
-    """Whether the server is to pass lines of the log to ``MonitorSession.log``."""
-
-    on: bool
-
-
-@dataclass(frozen=True, slots=True)
-class MonitorClose:
-    """The client is to be disconnected, with this close code of RFC 6455 and reason.
-
-    ``refusal`` is counted: ``message``, ``message_size`` or ``message_rate``.
-    """
-
-    code: int
-    reason: str
-    refusal: str
-
-
-Output: TypeAlias = str | bytes | Subscribe | Unsubscribe | Question | Speed | FollowLog | MonitorClose
+_NO_TOKEN: Final = (
+    "this page may not read parameters",
+    "open it with a token: rmpa web --token-file FILE, or --control",
+)
+_NO_CONTROL: Final = "this page may only look", "start rmpa web with --control"
+_TWIST: Final = "geometry_msgs/Twist"
+_SPEEDS: Final = struct.Struct("<6d")
+"""A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s."""
 
 
 class Joystick:
@@ -119,26 +70,22 @@ class Joystick:
         self._number = 0
         self._released = 0
         self._until = 0.0
-        self._topic = ""
         self._told_late = False
-
-    @property
-    def topic(self) -> str:
+        self.topic = ""
         """The topic that is driven; empty while the robot is stopped."""
-        return self._topic
 
     @property
     def due(self) -> float | None:
         """When the robot is to be stopped, if no further command comes."""
-        return self._until if self._topic else None
+        return self._until if self.topic else None
 
-    def takes(self, command: Drive, now: float) -> bool:
+    def takes(self, hold: int, n: int, at: float, now: float) -> bool:
         """Whether a command is to be obeyed: it is not too old, and of the present hold or a later one."""
-        if abs(now - command.at) > limits.DRIVE_TIMEOUT:
+        if abs(now - at) > limits.DRIVE_TIMEOUT:
             return False
-        if command.hold <= self._released or (command.hold, command.n) <= (self._hold, self._number):
+        if hold <= self._released or (hold, n) <= (self._hold, self._number):
             return False
-        self._hold, self._number = command.hold, command.n
+        self._hold, self._number = hold, n
         self._told_late = False
         return True
 
@@ -147,267 +94,381 @@ class Joystick:
 
         The first one after a stop only arms: one command alone, whatever kept it, moves nothing.
         """
-        armed, self._topic = self._topic == topic, topic
+        armed, self.topic = self.topic == topic, topic
         self._until = now + limits.DRIVE_TIMEOUT
         return armed
 
-    def is_new_late(self, command: Drive, now: float) -> bool:
+    def is_new_late(self, at: float, now: float) -> bool:
         """Whether a refused command is the first since the last obeyed one that came too late."""
-        told, self._told_late = self._told_late, self._told_late or now - command.at > limits.DRIVE_TIMEOUT
+        told, self._told_late = self._told_late, self._told_late or now - at > limits.DRIVE_TIMEOUT
         return self._told_late and not told
 
     def release(self, hold: int) -> None:
         """The stick was let go: nothing more of that hold is obeyed."""
         self._released = max(self._released, hold)
 
-    def stop(self) -> str:
-        """The robot stops; returns the topic that was driven, or nothing."""
-        topic, self._topic = self._topic, ""
-        return topic
 
+class StatePatches:
+    """The states of one page: it gets a state, then patches, paced, and only while it acknowledges them.
 
-class MonitorSession:
-    """One client.
+    A slow browser gets fewer. There is no queue, just the last state that was sent, which pages share.
 
     Args:
-        details: Gives all that is known of one thing, by kind and name (``view.details``).
-        decode: Gives a message's values.
-        rights: What the client may do.
         now: Seconds of the clock of all further calls.
-        unsent: Bytes that the client's connection has not taken; above zero no live frame is sent.
     """
+
+    def __init__(self, now: float) -> None:
+        self._state: Tree | None = None
+        self._shown: Tree | None = None
+        self._looks: tuple[tuple[Kind, str], ...] = ()
+        self._number = self._acknowledged = 0
+        self._sent = now - limits.PATCH_PERIOD
+        self._stale = False
+
+    def update(self, state: Tree) -> None:
+        """The newest state, which is never changed after that."""
+        self._state, self._stale = state, True
+
+    def look(self, at: tuple[tuple[Kind, str], ...]) -> None:
+        """What the page shows: it wants the details of it."""
+        self._looks, self._stale = at, True
+
+    def acknowledge(self, number: int) -> None:
+        """The page shows that state or patch, and all before it."""
+        self._acknowledged = max(self._acknowledged, min(number, self._number))
+
+    @property
+    def due(self) -> float | None:
+        """When something is to be sent; ``None`` for not before something else happens."""
+        unread = self._number - self._acknowledged
+        if not self._stale or self._state is None or unread >= limits.UNACKNOWLEDGED_MAX:
+            return None
+        return self._sent + limits.PATCH_PERIOD
+
+    def take(self, now: float, details: Callable[[str, str], Tree | None]) -> dict[str, Any] | None:
+        """The state or patch to send now; ``details`` are of one thing, by kind and name."""
+        if self._state is None or self.due is None or now < self.due:
+            return None
+        self._stale, self._sent = False, now
+        found = {f"{kind}:{name}": details(kind, name) for kind, name in self._looks}
+        wanted: Tree = {**self._state, "detail": {key: tree for key, tree in found.items() if tree is not None}}
+        shown, self._shown = self._shown, wanted
+        patch = difference(shown, wanted) if shown is not None else {}
+        if shown is not None and not patch:
+            return None
+        self._number += 1
+        news = {"op": "state", "state": wanted} if shown is None else {"op": "patch", "patch": patch}
+        return {**news, "n": self._number}
+
+
+class MonitorSession(Session):
+    """One page. Each method ``op_NAME`` is called for a message of it: its keywords are the members.
+
+    Args:
+        hub: The hub.
+        rights: What the page may do.
+        priority: The priority of a topic's messages.
+        address: The page's, for logs.
+        monitor: What all pages share.
+        clock: Monotonic seconds; the event loop's unless it is given.
+    """
+
+    kind = "monitor"
+    dates_commands = True
+    timer_waits = False  # the robot is stopped in time, whatever waits for the page
 
     def __init__(
         self,
-        details: Callable[[str, str], Tree | None],
-        decode: Decode,
+        hub: Hub,
         rights: Rights,
-        now: float,
-        unsent: Callable[[], int] = lambda: 0,
+        priority: Callable[[str], int],
+        address: str,
+        monitor: Monitor,
+        clock: Callable[[], float] | None = None,
     ) -> None:
-        self._details = details
-        self._decode = decode
-        self._rights = rights
-        self._unsent = unsent
+        # The joystick publishes by the hub, whatever else the page may publish: nothing.
+        super().__init__(hub, dataclasses.replace(rights, control=rights.drive), priority, address)
+        self._may = rights
+        self._monitor = monitor
+        self._clock = clock or asyncio.get_running_loop().time
+        self._opened = self._looked = self._clock()
+        self._tick = self._opened + limits.TICK_PERIOD
         self._bucket = TokenBucket(limits.REQUEST_RATE, limits.REQUEST_BURST)
-        self._state: Tree | None = None
-        self._shown: Tree | None = None
-        self._looks: tuple[tuple[str, str], ...] = ()
-        self._number = self._acknowledged = 0
-        self._patched = now - limits.PATCH_PERIOD
-        self._stale = False
-        self._looked = now
-        self._tick = now + limits.TICK_PERIOD
-        self._watches: dict[int, WatchState] = {}
+        self._patches = StatePatches(self._opened)
+        self._watches: dict[int, tuple[WatchState, ClientSubscription | None]] = {}
         self._questions: set[int] = set()
         self._joystick = Joystick()
-        self._opened = now
+        self._driven: ClientPublication | None = None
 
-    # --- the client ---
+    # --- the connection ---------------------------------------------------------------------------------------
 
-    def open(self, agent: str) -> Iterator[Output]:
-        """The first message, before any state; ``agent`` is the name of the agent's module."""
+    def opened(self) -> None:
+        """Greet the page, and show it the state."""
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN}
-        about = {"version": VERSION, "agent": agent, "period": limits.PATCH_PERIOD, "fastest": fastest}
-        about["at"] = self._opened
-        yield _text({"op": "hello", **about, "may": [right for right in RIGHTS if getattr(self._rights, right)]})
+        may = [right for right in RIGHTS if getattr(self._may, right)]
+        about = {"agent": self._monitor.mesh.agent, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
+        self._send({"op": "hello", "version": VERSION, "at": self._opened, **about})
+        self._monitor.mesh.follow(self, self._update)
 
-    def receive(self, text: str | bytes, now: float) -> Iterator[Output]:
-        """A message of the client."""
-        if not self._bucket.take(now):
-            yield MonitorClose(1008, f"more than {limits.REQUEST_RATE:g} messages a second", "message_rate")
-            return
-        try:
-            message = parse(text)
-        except RmpaError as error:
-            refusal = "message_size" if isinstance(error, LimitExceeded) else "message"
-            yield MonitorClose(1008, ascii(str(error))[1:-1][:100], refusal)
-            return
-        try:
-            yield from self._act(message, now)
-        except RmpaError as error:
-            yield self._failed(getattr(message, "id", 0), str(error))
-
-    def _act(self, message: object, now: float) -> Iterator[Output]:
-        if isinstance(message, Ack):
-            self._acknowledged = max(self._acknowledged, min(message.n, self._number))
-        elif isinstance(message, Look):
-            self._looks, self._stale = message.at, True
-        elif isinstance(message, Watch):
-            yield from self._watch(message)
-        elif isinstance(message, Unwatch):
-            if self._watches.pop(message.id, None):
-                yield Unsubscribe(message.id)
-        elif isinstance(message, AskQuestion):
-            yield from self._ask(message, now)
-        elif isinstance(message, Log):
-            yield FollowLog(message.on)
-        elif isinstance(message, Drive):
-            yield from self._drive(message, now)
-        elif isinstance(message, ReleaseJoystick):
-            self._joystick.release(message.hold)
-            yield from self._stop()
-        yield from self.handle_timer(now)
-
-    def _watch(self, message: Watch) -> Iterator[Output]:
-        _check_topic(message.topic)
-        if message.id in self._watches:
-            raise RemoteProtocolError(f"watch {message.id} is in use")
-        if len(self._watches) >= limits.WATCHES_MAX:
-            raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        self._watches[message.id] = WatchState(message, self._decode)
-        yield Subscribe(message.id, message.topic)
-
-    def _ask(self, message: AskQuestion, now: float) -> Iterator[Output]:
-        if message.what not in QUESTIONS:
-            raise RemoteProtocolError(f"there is no question {message.what[:40]!a}")
-        needed = QUESTIONS[message.what][0]
-        if needed and not getattr(self._rights, needed):
-            yield self._failed(message.id, *(_NO_TOKEN if needed == "view" else _NO_CONTROL))
-        elif needed == "control" and now - message.at > limits.ORDER_AGE:
-            # One that TCP kept over a cut must not act long after the page has given it up.
-            late = min(now - message.at, now - self._opened)
-            text = f"the order may have come {late:.0f} s late, and is not carried out"
-            yield self._failed(message.id, text, "look at what is, and repeat it")
-        elif message.id in self._questions or len(self._questions) >= limits.ASKS_MAX:
-            yield self._failed(message.id, f"{len(self._questions)} questions wait for an answer already")
-        else:
-            self._questions.add(message.id)
-            yield Question(message.id, message.what, message.args)
-
-    def _drive(self, message: Drive, now: float) -> Iterator[Output]:
-        if not self._rights.drive:
-            yield self._failed(0, "this page may not drive", "start rmpa web with --drive")
-            return
-        _check_topic(message.topic)
-        joystick = self._joystick
-        if not joystick.takes(message, now):
-            if joystick.is_new_late(message, now):
-                late = f"commands reach the server {now - message.at:.1f} s late, and are dropped"
-                yield self._failed(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is")
-            return
-        if joystick.topic != message.topic:
-            yield from self._stop()
-        if joystick.drive(message.topic, now):
-            yield Speed(message.topic, message.linear * limits.DRIVE_SPEED, message.angular * limits.DRIVE_TURN)
-        else:
-            yield Speed(message.topic, 0.0, 0.0)
-
-    def _stop(self) -> Iterator[Output]:
-        topic = self._joystick.stop()
-        if topic:
-            yield Speed(topic, 0.0, 0.0)
-
-    def close(self) -> Iterator[Output]:
-        """The connection has ended: the robot is stopped, and what was open is closed."""
-        yield from self._stop()
-        yield from map(Unsubscribe, self._watches)
-        self._watches.clear()
+    def closing(self) -> None:
+        """Stop the robot, and all that the page had open."""
+        self._monitor.mesh.unfollow(self)
+        self._monitor.log.unfollow(self)
+        self._stop()
         self._questions.clear()
 
-    # --- the server ---
+    def received_frame(self, data: str | bytes, now: float) -> None:
+        """A message of the page."""
+        if not self._bucket.take(now):
+            text = f"more than {limits.REQUEST_RATE:g} messages a second"
+            self.connection.end(WSCloseCode.POLICY_VIOLATION, text, "message_rate")
+        elif len(data) > limits.REQUEST_MAX:
+            self._malformed(f"{len(data)} exceeds {limits.REQUEST_MAX} bytes of a monitor's request", "message_size")
+        else:
+            try:
+                message = DECODER.decode(data)
+            except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+                self._malformed(f"not a monitor's request: {error}")
+                return
+            fields = msgspec.structs.asdict(message)
+            try:
+                getattr(self, type(message).__name__)(now, **fields)
+            except RmpaError as error:
+                self._failed(fields.get("id", 0), error)
+            self.handle_timer(now)
 
-    def update(self, state: Tree, now: float) -> Iterator[Output]:
-        """The newest state, which is never changed after that."""
-        self._state, self._stale = state, True
-        yield from self.handle_timer(now)
+    def _malformed(self, text: str, refusal: str = "message") -> None:
+        self.connection.end(WSCloseCode.POLICY_VIOLATION, ascii(text)[1:-1][:100], refusal)
 
-    def receive_message(self, handle: int, message: ReceivedMessage, now: float) -> Iterator[Output]:
-        """A message for one of the watches."""
-        watch = self._watches.get(handle)
-        if watch is None:
-            return
-        try:
-            watch.receive(message)
-        except RmpaError as error:
-            yield from self.end_watch(handle, str(error))
-            yield Unsubscribe(handle)
-        yield from self._flush(now)
-
-    def end_watch(self, handle: int, error: str, remedy: str = "") -> Iterator[Output]:
-        """The hub cannot subscribe, or the subscription has ended."""
-        if self._watches.pop(handle, None):
-            yield self._failed(handle, error, remedy)
-
-    def answer(self, question: int, value: Value | Any) -> Iterator[Output]:
-        """The answer to a question."""
-        if question in self._questions:
-            self._questions.discard(question)
-            yield _text({"op": "answer", "id": question, "value": value})
-
-    def refuse(self, question: int, error: str, remedy: str = "") -> Iterator[Output]:
-        """A question has no answer."""
-        if question in self._questions:
-            self._questions.discard(question)
-            yield self._failed(question, error, remedy)
-
-    def failed(self, error: str, remedy: str = "") -> Iterator[Output]:
-        """What the page ordered cannot be done, and is neither a watch nor a question: driving."""
-        yield self._failed(0, error, remedy)
-
-    def log(self, lines: list[dict[str, Any]], *, kept: bool = False) -> Iterator[Output]:
-        """Lines of the log, oldest first; new ones are left out while the client does not take what was sent."""
-        if kept or self._unsent() == 0:
-            yield _text({"op": "log", "lines": lines[-limits.LOG_LINES :]})
+    def warn(self, text: str, subject: str) -> None:
+        """Nothing: the page is sent the newest messages only."""
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is to be called; ``None`` for not before something else happens."""
-        dues: list[float | None] = [self._tick, self._joystick.due]
-        if self._unsent() == 0:
-            dues += [watch.due(0.0) for watch in self._watches.values()]
+        """When something is due that the page waits for, or the robot must be stopped."""
+        dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due]
+        if self.connection.unsent == 0:
+            dues += [watch.due(0.0) for watch, _ in self._watches.values()]
         elif self._watches:
             dues.append(self._looked + limits.UNSENT_RETRY)
-        if self._stale and self._state is not None and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX:
-            dues.append(self._patched + limits.PATCH_PERIOD)
-        return min((due for due in dues if due is not None), default=None)
+        return min(due for due in dues if due is not None)
 
-    def handle_timer(self, now: float) -> Iterator[Output]:
-        """Send what is due, and stop a robot that no client commands any more."""
+    def handle_timer(self, now: float) -> None:
+        """Send what is due, and stop a robot that no page commands any more."""
         self._looked = now
         if self._joystick.due is not None and now >= self._joystick.due:
-            yield from self._stop()
-        if (
-            self._stale
-            and now >= self._patched + limits.PATCH_PERIOD
-            and self._number - self._acknowledged < limits.UNACKNOWLEDGED_MAX
-        ):
-            yield from self._send_state(now)
-        yield from self._flush(now)
-        if now >= self._tick:
-            self._tick = now + limits.TICK_PERIOD
-            if self._unsent() == 0:
-                # Scripts do not see WebSocket's pings: a page that misses some ticks takes the connection for lost.
-                yield _text({"op": "tick", "at": now})
+            self._stop()
+        with self._turn():
+            if (news := self._patches.take(now, self._monitor.mesh.details)) is not None:
+                self._send(news)
+            self._flush(now)
+            if now >= self._tick:
+                self._tick = now + limits.TICK_PERIOD
+                if self.connection.unsent == 0:
+                    # Scripts do not see WebSocket's pings: a page that misses ticks takes the connection for lost.
+                    self._send({"op": "tick", "at": now})
 
-    def _send_state(self, now: float) -> Iterator[Output]:
-        if self._state is None:
-            return
-        self._stale, self._patched = False, now
-        found = {f"{kind}:{name}": self._details(kind, name) for kind, name in self._looks}
-        wanted: Tree = {**self._state, "detail": {key: tree for key, tree in found.items() if tree is not None}}
-        shown, self._shown = self._shown, wanted
-        if shown is None:
-            self._number += 1
-            yield _text({"op": "state", "n": self._number, "state": wanted})
-        elif patch := difference(shown, wanted):
-            self._number += 1
-            yield _text({"op": "patch", "n": self._number, "patch": patch})
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        """A fault of one page's session must not end the server, nor keep states from other pages."""
+        try:
+            yield
+        except Exception:  # noqa: BLE001 - as it says
+            _log.exception("! the session of %s failed", self.name)
+            self.connection.end(WSCloseCode.INTERNAL_ERROR, "the server failed; its log says why")
+        self.connection.arm()
 
-    def _flush(self, now: float) -> Iterator[Output]:
-        if self._unsent() > 0:
+    def _send(self, message: dict[str, Any]) -> None:
+        self.connection.push((Opcode.TEXT, (msgspec.json.encode(message),)))
+
+    def _failed(self, id_: int, error: RmpaError) -> None:
+        """What the page ordered cannot be done: a watch, a question, or (0) neither."""
+        remedy = str(getattr(error, "remedy", ""))
+        text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
+        self._refuse(id_, text, remedy)
+
+    def _refuse(self, id_: int, error: str, remedy: str = "") -> None:
+        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy})
+
+    # --- states and details -----------------------------------------------------------------------------------
+
+    def _update(self, state: Tree) -> None:
+        self._patches.update(state)
+        self.handle_timer(self._clock())
+
+    def op_ack(self, _: float, *, n: int) -> None:
+        """The state or patch number ``n`` is shown, and all before it."""
+        self._patches.acknowledge(n)
+
+    def op_look(
+        self, _: float, *, at: Annotated[tuple[tuple[Kind, str], ...], Meta(max_length=limits.LOOKS_MAX)] = ()
+    ) -> None:
+        """The page shows these things and wants their details; none of others. Each is ``[kind, name]``."""
+        self._patches.look(at)
+
+    # --- live messages ----------------------------------------------------------------------------------------
+
+    def op_watch(
+        self,
+        _: float,
+        *,
+        id: Id,  # noqa: A002 - the protocol's word
+        topic: str,
+        how: How,
+        fields: Annotated[tuple[str, ...], Meta(max_length=limits.FIELDS_MAX)] = (),
+        rate: Annotated[float, Meta(gt=0, le=limits.WATCH_RATE_MAX)] = 5.0,
+    ) -> None:
+        """Messages of a topic: its newest values, lines of a plot, images, or laser scans."""
+        if (how == "plot") != bool(fields):
+            self._malformed(f"a plot has 1 to {limits.FIELDS_MAX} fields, everything else none")
             return
-        for handle, watch in list(self._watches.items()):
+        _check_topic(topic)
+        if id in self._watches:
+            raise RemoteProtocolError(f"watch {id} is in use")
+        if len(self._watches) >= limits.WATCHES_MAX:
+            raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
+        watch = WatchState(id, how, fields, rate, self._monitor.values.of)
+        self._watches[id] = watch, None
+
+        def receive(message: ReceivedMessage) -> None:
+            with self._turn():
+                try:
+                    watch.receive(message)
+                except RmpaError as error:
+                    self._end_watch(id, error)
+                self._flush(self._clock())
+
+        def failed(error: RmpaError) -> None:
+            with self._turn():
+                self._end_watch(id, error)
+
+        try:
+            subscription = self.subscribe(topic, None, receive, failed)
+        except RmpaError as error:
+            self._end_watch(id, error)
+        else:
+            self._watches[id] = watch, subscription
+
+    def op_unwatch(self, _: float, *, id: Id) -> None:  # noqa: A002
+        """No more messages of that watch."""
+        self._end_watch(id)
+
+    def _end_watch(self, id_: int, error: RmpaError | None = None) -> None:
+        _, subscription = self._watches.pop(id_, (None, None))
+        if subscription is not None:
+            subscription.close()
+        if error is not None:
+            self._failed(id_, error)
+
+    def _flush(self, now: float) -> None:
+        for id_, (watch, _) in [*self._watches.items()] if self.connection.unsent == 0 else ():
             due = watch.due(now)
             if due is None or due > now:
                 continue
             try:
-                yield from watch.frames(now)
+                frame = watch.frame(now)
             except RmpaError as error:
-                yield from self.end_watch(handle, str(error))
-                yield Unsubscribe(handle)
+                self._end_watch(id_, error)
+            else:
+                self.connection.push((Opcode.BINARY, (frame,))) if isinstance(frame, bytes) else self._send(frame)
 
-    def _failed(self, id_: int, error: str, remedy: str = "") -> str:
-        return _text({"op": "failed", "id": id_, "error": error, "remedy": remedy})
+    # --- questions and the log --------------------------------------------------------------------------------
+
+    def op_ask(self, now: float, *, id: Id, what: str, args: dict[str, Any] = {}, at: float = 0.0) -> None:  # noqa: A002, B006 - copied by msgspec
+        """A question or an order that has one answer; ``at`` is as of ``drive``."""
+        if what not in QUESTIONS:
+            raise RemoteProtocolError(f"there is no question {what[:40]!a}")
+        needed = QUESTIONS[what][0]
+        if needed and not getattr(self._may, needed):
+            self._refuse(id, *(_NO_TOKEN if needed == "view" else _NO_CONTROL))
+        elif needed == "control" and now - at > limits.ORDER_AGE:
+            # One that TCP kept over a cut must not act long after the page has given it up.
+            late = min(now - at, now - self._opened)
+            text = f"the order may have come {late:.0f} s late, and is not carried out"
+            self._refuse(id, text, "look at what is, and repeat it")
+        elif id in self._questions or len(self._questions) >= limits.ASKS_MAX:
+            self._refuse(id, f"{len(self._questions)} questions wait for an answer already")
+        else:
+            self._questions.add(id)
+            self.run(
+                self._monitor.answers.answer(what, args),
+                functools.partial(self._answered, id),
+                functools.partial(self._unanswered, id),
+            )
+
+    def _answered(self, id_: int, value: Any) -> None:
+        if id_ in self._questions:
+            self._questions.discard(id_)
+            self._send({"op": "answer", "id": id_, "value": value})
+
+    def _unanswered(self, id_: int, error: RmpaError) -> None:
+        if id_ in self._questions:
+            self._questions.discard(id_)
+            self._failed(id_, error)
+
+    def op_log(self, _: float, *, on: bool) -> None:
+        """Whether lines of the log are wanted, oldest first; those that are kept come at once."""
+        log = self._monitor.log
+        if not on:
+            log.unfollow(self)
+            return
+        if kept := log.follow(self, self._log):
+            self._send({"op": "log", "lines": kept})
+        if log.refused is not None:
+            self._failed(0, log.refused)
+
+    def _log(self, lines: list[dict[str, Any]]) -> None:
+        if self.connection.unsent == 0:  # left out while the page does not take what was sent
+            self._send({"op": "log", "lines": lines})
+
+    # --- driving ----------------------------------------------------------------------------------------------
+
+    def op_drive(self, now: float, *, topic: str, linear: Tilt, angular: Tilt, hold: int, n: int, at: float) -> None:
+        """A joystick; repeated every 0.1 s while it is held.
+
+        ``hold`` numbers the times that the stick was taken, and ``n`` the commands, both rising; ``at`` is when it
+        was made, by the server's clock as the page knows it (``Joystick``).
+        """
+        if not self._may.drive:
+            self._refuse(0, "this page may not drive", "start rmpa web with --drive")
+            return
+        _check_topic(topic)
+        joystick = self._joystick
+        if not joystick.takes(hold, n, at, now):
+            if joystick.is_new_late(at, now):
+                late = f"commands reach the server {now - at:.1f} s late, and are dropped"
+                self._refuse(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is")
+            return
+        if joystick.topic != topic:
+            self._stop()
+        if joystick.drive(topic, now):
+            self._publish(topic, linear * limits.DRIVE_SPEED, angular * limits.DRIVE_TURN)
+        else:
+            self._publish(topic, 0.0, 0.0)
+
+    def op_release(self, _: float, *, hold: int) -> None:
+        """The joystick is let go: the robot is stopped at once, and nothing more of that hold drives it."""
+        self._joystick.release(hold)
+        self._stop()
+
+    def _stop(self) -> None:
+        topic, self._joystick.topic = self._joystick.topic, ""
+        if topic:
+            self._publish(topic, 0.0, 0.0)
+
+    def _publish(self, topic: str, linear: float, angular: float) -> None:
+        def failed(error: RmpaError) -> None:
+            self._driven = None
+            self._failed(0, error)
+
+        try:
+            if self._driven is None or self._driven.topic != topic:
+                if self._driven is not None:
+                    self._driven.close()
+                self._driven = self.advertise(topic, _TWIST, failed)
+        except RmpaError as error:
+            failed(error)
+        else:
+            self._driven.publish(_SPEEDS.pack(linear, 0, 0, 0, 0, angular))
 
 
 def _check_topic(topic: str) -> None:
@@ -420,5 +481,12 @@ def _check_topic(topic: str) -> None:
         raise RemoteProtocolError(f"{topic[:80]!a} is not a topic's name; write it as /name")
 
 
-def _text(message: dict[str, Any]) -> str:
-    return msgspec.json.encode(message).decode()
+OPS: Final = {
+    name.removeprefix("op_"): struct_of(method, tag_field="op", tag=name.removeprefix("op_"))
+    for name, method in vars(MonitorSession).items()
+    if name.startswith("op_")
+}
+"""The members of each message of a page (docs/design/monitor-protocol.md)."""
+DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
+    functools.reduce(operator.or_, OPS.values())
+)
