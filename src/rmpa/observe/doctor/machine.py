@@ -9,6 +9,7 @@ import os
 import resource
 import shutil
 import socket
+import struct
 import subprocess
 import threading
 import time
@@ -180,18 +181,8 @@ _UNSYNCHRONISED: Final = 0x40
 """STA_UNSYNC of adjtimex(2)."""
 
 
-class _Timex(ctypes.Structure):
-    """The beginning of ``struct timex`` (adjtimex(2)), with room for the rest of it."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_char * 512),
-    )
+_TIMEX: Final = struct.Struct("@I4li")
+"""The beginning of ``struct timex`` (adjtimex(2)): modes, offset, frequency, greatest and estimated error, status."""
 
 
 def clocks(given: DoctorInput) -> Iterable[Check]:
@@ -202,13 +193,12 @@ def clocks(given: DoctorInput) -> Iterable[Check]:
     before = time.time() - time.monotonic()
     time.sleep(limits.DOCTOR_CLOCK_LOOK)
     stepped = time.time() - time.monotonic() - before
-    told, synchronised = _Timex(), None
-    try:
-        if ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told)) >= 0:
-            synchronised = not told.status & _UNSYNCHRONISED
-    except (OSError, AttributeError):
-        pass
-    yield from judge_clock(stepped, synchronised, told.maxerror * 1e-6, time.gmtime().tm_year)
+    timex, synchronised, error = ctypes.create_string_buffer(512), None, 0
+    with contextlib.suppress(OSError, AttributeError):
+        if ctypes.CDLL(None, use_errno=True).adjtimex(timex) >= 0:
+            *_, error, _, status = _TIMEX.unpack_from(timex)
+            synchronised = not status & _UNSYNCHRONISED
+    yield from judge_clock(stepped, synchronised, error * 1e-6, time.gmtime().tm_year)
     for name, shown in given.snapshots.items():
         yield from judge_sim_time(name, read_sim_time(shown.agent.core_uri))
 

@@ -230,7 +230,7 @@ def diagnose_topic(ends: Ends, peer: str, later: Ends | None = None) -> tuple[Di
 
 def _walk(way: Way) -> Iterable[Check]:
     """The stages up to the first that fails, or after which nothing is sent."""
-    for stage in STAGES:
+    for stage in (*STAGES, *(FLOW_STAGES if way.flows else ())):
         if (check := stage(way)) is not None:
             yield check
             if check.level is FAIL or check.name == UNASKED:
@@ -436,10 +436,8 @@ def _route(way: Way) -> Check | None:
     return Check("route", FAIL, text, f"it is tried again by itself; on {peer}: rosnode info {route.node}")
 
 
-def _sent(way: Way) -> Check | None:
+def _sent(way: Way) -> Check:
     told, peer, node = way.told_later, way.peer, way.now.node
-    if not way.flows:
-        return None
     if told is None:
         return Check("sent", UNKNOWN, f"{peer} did not tell")
     if told.oversized:
@@ -460,10 +458,8 @@ def _sent(way: Way) -> Check | None:
     return Check("sent", OK, text)
 
 
-def _arrived(way: Way) -> Check | None:
+def _arrived(way: Way) -> Check:
     now, told = way.now, way.told_later
-    if not way.flows:
-        return None
     moved = now.messages - way.before.messages
     sent = told.messages - way.told.messages if way.told is not None and told is not None else 0
     rate = float(now.contract.get("max_rate") or core_limits.CONTRACT_RATE_MAX)
@@ -486,10 +482,8 @@ def _arrived(way: Way) -> Check | None:
     return Check("arrived", OK, text)
 
 
-def _contract(way: Way) -> Check | None:
+def _contract(way: Way) -> Check:
     route = way.now
-    if not way.flows:
-        return None
     missing = {key: getattr(route, key) for key in ("lost", "late", "expired") if getattr(route, key)}
     events = {kind: count for kind, count in route.events.items() if kind != "messages_lost"}
     if not missing and not events:
@@ -503,9 +497,7 @@ def _contract(way: Way) -> Check | None:
     return Check("contract", WARN, ", ".join(parts), remedy)
 
 
-def _reader(way: Way) -> Check | None:
-    if not way.flows:
-        return None
+def _reader(way: Way) -> Check:
     after = way.readers_later
     if not after:
         return Check("reader", FAIL, "its subscribers have just left", "start them again")
@@ -524,6 +516,8 @@ def _reader(way: Way) -> Check | None:
 
 STAGES: Final[tuple[Callable[[Way], Check | None], ...]] = (
     *(_policy_there, _permission_there, _reachable, _offer, _limit, _policy_here, _permission_here, _type, _graph),
-    *(_subscriber, _md5, _transport, _connection, _route, _sent, _arrived, _contract, _reader),
+    *(_subscriber, _md5, _transport, _connection, _route),
 )
 """The stages of one publisher, in order. The walk ends at the first that fails."""
+FLOW_STAGES: Final[tuple[Callable[[Way], Check], ...]] = (_sent, _arrived, _contract, _reader)
+"""Those that follow where the route is open, and messages pass the agents."""
