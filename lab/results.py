@@ -1,4 +1,4 @@
-"""How a measurement of ``lab.bench`` ends: verdicts on the terminal, the result as JSON, and its picture."""
+"""How a measurement of ``lab.bench`` ends: verdicts on the terminal, and the result as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from lab.findings import Claim, Panel
+    from lab.findings import Claim
 
 RESULTS: Final = Path(__file__).parent / "results"
 _WORDS: Final = {True: "reached", False: "not reached", None: "too few samples to say"}
@@ -30,9 +30,8 @@ def finish(
     file: Path | None = None,
     *,
     claims: Sequence[Claim] = (),
-    panels: Sequence[Panel] = (),
 ) -> dict[str, object]:
-    """Print the verdicts, write ``results/DATE-NAME.json`` and a picture with the same name; return the result.
+    """Print the verdicts, write ``results/DATE-NAME.json``; return the result.
 
     Args:
         console: Where to print.
@@ -41,7 +40,6 @@ def finish(
         result: What came out; the claims are added to it as ``targets``.
         file: Gets the JSON as well.
         claims: What was to be reached.
-        panels: Of the picture, from left to right.
     """
     for claim in claims:
         sign = "≥" if claim.at_least else "≤"
@@ -50,14 +48,7 @@ def finish(
     if claims:
         result = {**result, "targets": [_target(claim) for claim in claims]}
     written = write(name, settings, result, file)
-    drawn = ""
-    if panels:
-        from lab.figures.drawing import draw
-        from lab.findings import Figure
-
-        png, _ = draw(Figure(written.stem, name, "", tuple(panels)), (), written.parent)
-        drawn = f" and {png.name}"
-    console.print(f"written: {written}{drawn}")
+    console.print(f"written: {written}")
     return result
 
 

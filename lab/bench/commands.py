@@ -47,7 +47,7 @@ class Measurement:
     parts: Collection[str] = ()
 
 
-_WEB: Final = "rmpa web beside rosbridge_suite's server and foxglove-sdk's"
+_WEB: Final = "rmpa web beside foxglove-sdk's server"
 _GATEWAY: Final = "sites joined by gateways, beside a bare pair of Zenoh programs"
 MEASUREMENTS: Final[dict[str, Measurement]] = {
     # What of path cannot start here is left out.

@@ -15,13 +15,12 @@ from lab import machine, samples
 from lab.bed.bench import Bed
 from lab.bed.processes import Process
 from lab.bench import schedule
-from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import dash, percentiles, ratio, table_of, us, usage_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
     from pathlib import Path
 
     from rich.console import Console
@@ -89,8 +88,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "hogs": _HOGS, "node_priority": schedule.NODE_PRIORITY}
-    panels = shapes.tails(_panels(scores, titles), "from due to there, µs", _DEADLINE)
-    return finish(console, "load", settings, result, json, claims=[target], panels=panels)
+    return finish(console, "load", settings, result, json, claims=[target])
 
 
 @contextmanager
@@ -134,7 +132,3 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
             ratios = [dash(ratio(row.p99, base)) for base in bases]
             table.add_row(name, beside, *cells, *counts, *ratios, us(samples.summary(one.from_send).p999))
     return table
-
-
-def _panels(scores: Scores, titles: dict[str, str]) -> dict[str, dict[str, Sequence[float]]]:
-    return {name: {titles[key]: scores[key, name].latencies for key in titles} for name in _CONDITIONS}

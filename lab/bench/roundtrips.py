@@ -16,7 +16,6 @@ from lab.bed.bench import Bed
 from lab.bed.processes import BedError
 from lab.bench.contenders import ENTRIES, SIZES
 from lab.bench.schedule import HostLateness
-from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.usage import Meter, Usage, add
@@ -120,12 +119,7 @@ def path(quick: bool, console: Console, json: Path | None = None, only: Sequence
     usage = [(title, scores[key, small].usage, len(scores[key, small].trips)) for key, title in titles.items()]
     console.print(tables.usage_table(f"processes on the path, {tables.size(small)}", usage, "round trip"))
     result: dict[str, object] = {"rows": rows(scores, titles), "left_out": left_out, **host.finish(console)}
-    shown = {
-        tables.size(size): {title: [trip / 2000 for trip in scores[key, size].trips] for key, title in titles.items()}
-        for size in plan.trips
-    }
-    panels = shapes.shares(shown, "one way, µs")
-    return finish(console, "path", asdict(plan), result, json, claims=wanted, panels=panels)
+    return finish(console, "path", asdict(plan), result, json, claims=wanted)
 
 
 def claims(scores: Scores) -> list[Claim]:

@@ -20,7 +20,6 @@ import psutil
 
 from lab.bed.bench import Bed
 from lab.bed.transport import require
-from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import dash, ratio, size, table_of, usage_row, usage_table
@@ -299,7 +298,6 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         result,
         json,
         claims=_targets(scores),
-        panels=shapes.bars(_bars(scores), "times direct roscpp, flat out"),
     )
 
 
@@ -371,13 +369,3 @@ def _table(bytes_each: int, scores: Scores) -> Table:
         dropped = "-" if not middle.dropped else " + ".join(str(count) for count in middle.dropped.values())
         table.add_row(title, *cells, dropped, f"{middle.others:.0f}")
     return table
-
-
-def _bars(scores: Scores) -> dict[str, dict[str, float]]:
-    groups: dict[str, dict[str, float]] = {}
-    for (key, bytes_each), score in scores.items():
-        base = scores["direct", bytes_each].received
-        lines = {"flat out": score.received, "without loss": score.lossless or 0.0}
-        for how, rate in lines.items():
-            groups.setdefault(size(bytes_each), {})[f"{WAYS[key][0]}, {how}"] = ratio(rate, base) or 0.0
-    return groups

@@ -1,4 +1,4 @@
-"""``rmpa web`` beside rosbridge_suite's server and foxglove-sdk's: messages, slow clients, pages.
+"""``rmpa web`` beside foxglove-sdk's server: messages, slow clients, pages.
 
 The servers stand beside each other on this machine and take turns; each has a publisher of its own.
 """
@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Final
 from lab import tables
 from lab.bed.bench import Bed
 from lab.bed.processes import BedError
-from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import dash, ratio, table_of
 from lab.web import page
 from lab.web.messages import Load, Way, stall
-from lab.web.rosbridge_suite import RosbridgeSuite, why_no_suite
-from lab.web.servers import start_rmpa, start_sdk, start_suite, why_no_sdk
+from lab.web.servers import start_rmpa, start_sdk, why_no_sdk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,14 +24,12 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from lab.findings import Panel
     from lab.web.servers import WebServer
 
 PARTS: Final = ("messages", "slow", "page")
 """What ``--only`` can choose."""
 _MIB: Final = 1 << 20
 _CLIENTS: Final = 4
-_SUITE_TARGET: Final = 5.0
 _SDK_TARGET: Final = 1.5
 _SLOW_TARGET: Final = 16.0
 """Megabytes of 2^20 bytes."""
@@ -44,7 +40,7 @@ _PAINT_TARGET: Final = 1000.0
 _BYTES_TARGET: Final = 250.0
 """KB of 1,000 bytes."""
 _MODULES: Final = 16
-_SLOW_WAYS: Final = ("rmpa cbor-raw", "rmpa foxglove", "suite cbor-raw", "sdk foxglove")
+_SLOW_WAYS: Final = ("rmpa cbor-raw", "rmpa foxglove", "sdk foxglove")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +76,6 @@ class _Run:
     servers: list[WebServer]
     claims: list[Claim] = field(default_factory=list)
     result: dict[str, object] = field(default_factory=dict)
-    panels: list[Panel] = field(default_factory=list)
 
     def each(self, what: str, servers: Sequence[WebServer], act: Callable[[WebServer], None]) -> None:
         """Do the same with each server; what a server other than ``rmpa web`` cannot do is left out, and said."""
@@ -110,33 +105,23 @@ def measure(
     run = _Run(Bed(), plan, console, [])
     with run.bed:
         if {*only} - {"page"}:
-            settings["rosbridge_suite"] = _start(run)
+            _start(run)
         for name in [name for name in _PARTS if name in only]:
             console.print(name, style="dim")
             if name == "page":
                 run.bed.close()  # its agent would have a peer with 1,200 topics
             _PARTS[name](run)
-    return finish(console, "web", settings, run.result, json, claims=run.claims, panels=run.panels)
+    return finish(console, "web", settings, run.result, json, claims=run.claims)
 
 
-def _start(run: _Run) -> dict[str, object]:
-    """Start all servers that can run here; returns what is to be known of rosbridge_suite's."""
+def _start(run: _Run) -> None:
+    """Start all servers that can run here."""
     agent = run.bed.agent()
     run.servers.append(start_rmpa(run.bed, agent))
     if reason := why_no_sdk():
         run.leave_out("foxglove-sdk", reason)
     else:
         run.servers.append(start_sdk(run.bed, agent))
-    if reason := why_no_suite():
-        run.leave_out("rosbridge_suite", reason)
-        return {}
-    try:
-        suite = RosbridgeSuite.unpack(run.bed.home)
-        run.servers.append(start_suite(run.bed, suite))
-    except BedError as error:
-        run.leave_out("rosbridge_suite", str(error))
-        return {}
-    return {"commit": suite.commit, "libraries": suite.libraries}
 
 
 # --- messages -----------------------------------------------------------------------------------------------------
@@ -177,12 +162,7 @@ def _messages(run: _Run) -> None:
         })  # fmt: skip
     run.console.print(table)
     run.result["messages"] = rows
-    run.panels += shapes.bars({"1 MB to 4 clients": {key: cost or 0.0 for key, cost in costs.items()}}, "µs of CPU")
     size = f"{tables.size(plan.load.size)} to {_CLIENTS} clients, CPU"
-    raw = costs.get("suite cbor-raw")
-    for how in ("cbor-raw", "foxglove"):
-        text = f"{size}: rosbridge_suite (cbor-raw) / rmpa web ({how})"
-        run.claim(text, ratio(raw, costs.get(f"rmpa {how}")), _SUITE_TARGET, at_least=True)
     text = f"{size}: rmpa web / foxglove-sdk (Foxglove)"
     run.claim(text, ratio(costs.get("rmpa foxglove"), costs.get("sdk foxglove")), _SDK_TARGET)
 

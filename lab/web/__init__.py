@@ -1,1 +1,1 @@
-"""Clients and servers of the measurement ``web``: rosbridge_suite's and foxglove-sdk's server beside ``rmpa web``."""
+"""Clients and servers of the measurement ``web``: foxglove-sdk's server beside ``rmpa web``."""

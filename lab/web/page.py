@@ -15,7 +15,7 @@ from lab.bed.chromium import BINARY, Chromium, PageError
 from lab.bed.processes import BedError
 from lab.usage import Meter
 from lab.web.servers import program, rmpa_web
-from lab.web.websocket import TEXT, WebSocket
+from lab.web.websocket import WebSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
 
 if TYPE_CHECKING:
@@ -131,12 +131,12 @@ def serve(process: Process, port: int, seconds: float) -> Served:
 def _next_state(client: WebSocket, op: str) -> int:
     """Wait for one of these and acknowledge it; returns its bytes."""
     while True:
-        frame = client.receive()
-        message: dict[str, Any] = json.loads(frame.payload) if frame.opcode == TEXT else {}
+        text = client.receive()
+        message: dict[str, Any] = json.loads(text) if isinstance(text, str) else {}
         if message.get("op") in ("state", "patch"):
             client.send(json.dumps({"op": "ack", "n": message["n"]}))
             if message["op"] == op and (op == "patch" or "modules" in message["state"]):
-                return frame.size
+                return len(text)
 
 
 def _follow(client: WebSocket, seconds: float) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 Only the one whose turn it is has anything to do.
 
-``rmpa web`` and foxglove-sdk's server are beside one agent, whose core they share; rosbridge_suite's has a roscore.
+``rmpa web`` and foxglove-sdk's server are beside one agent, whose core they share.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.ros import Ros
-    from lab.web.rosbridge_suite import RosbridgeSuite
     from lab.web.subscriptions import How
 
 _ROOT: Final = Path(__file__).parents[2]
@@ -132,15 +131,6 @@ def start_sdk(bed: Bed, agent: Agent) -> WebServer:
     process = ros.start(sys.executable, NODES / "foxglove_server.py", *words, name="foxglove-sdk")
     process.wait_event("up")
     return WebServer("sdk", "foxglove-sdk", port, "/", ("foxglove",), process, ros, _source(ros, topic), topic)
-
-
-def start_suite(bed: Bed, suite: RosbridgeSuite) -> WebServer:
-    """rosbridge_suite's servers at a roscore, with a publisher."""
-    ros, port, topic = bed.shell(), free_port(), "/for_suite"
-    ros.roscore()
-    process, _ = suite.start(ros, port)
-    hows: tuple[How, ...] = ("cbor-raw", "cbor", "json")
-    return WebServer("suite", "rosbridge_suite", port, "/", hows, process, ros, _source(ros, topic), topic)
 
 
 def _source(ros: Ros, topic: str) -> Process:

@@ -8,10 +8,9 @@ import re
 from typing import TYPE_CHECKING, Final, Literal
 
 from lab.nodes.node import HEAD
-from lab.web.websocket import BINARY, TEXT
 
 if TYPE_CHECKING:
-    from lab.web.websocket import Frame, WebSocket
+    from lab.web.websocket import WebSocket
 
 How = Literal["foxglove", "cbor-raw", "cbor", "json"]
 """Foxglove's protocol, or an encoding of rosbridge's."""
@@ -20,14 +19,12 @@ TYPE: Final = "std_msgs/UInt8MultiArray"
 """Of the measured messages."""
 FOXGLOVE: Final = "foxglove.sdk.v1"
 """The only subprotocol that foxglove-sdk's server accepts."""
-KEPT: Final = 512
-"""Bytes of a frame in which the head is found."""
 _LAYOUT: Final = 12
 """Bytes of a ROS 1 message of ``TYPE`` before its data: no dimensions, the offset, and the data's length."""
 _DATA_OPCODE: Final = 1
 _DATA_HEADER: Final = 13
 """Of a Foxglove message: opcode, subscription (4 bytes), time (8)."""
-_JSON: Final = re.compile(rb'"data":\s*"([A-Za-z0-9+/=]{24})')
+_JSON: Final = re.compile(r'"data":\s*"([A-Za-z0-9+/=]{24})')
 _CBOR: Final = {"cbor-raw": b"ebytes", "cbor": b"ddata"}
 """The key before the byte string that matters, with its CBOR head: text of 5 and of 4 bytes."""
 
@@ -58,31 +55,31 @@ def wait_channel(client: WebSocket, topic: str) -> int:
         BedError: The server closed the connection, or does not advertise it in time.
     """
     while True:
-        frame = client.receive()
-        if frame.opcode != TEXT:
+        text = client.receive()
+        if not isinstance(text, str):
             continue
-        message = json.loads(frame.payload)
+        message = json.loads(text)
         if message.get("op") == "advertise":
             for channel in message["channels"]:
                 if channel["topic"] == topic:
                     return int(channel["id"])
 
 
-def head_of(frame: Frame, how: How) -> tuple[int, int, int] | None:
-    """Round, sequence and due ns of a measured message; ``None``: the frame is none.
+def head_of(message: str | bytes, how: How) -> tuple[int, int, int] | None:
+    """Round, sequence and due ns of a measured message; ``None``: it is none.
 
     Args:
-        frame: With its first ``KEPT`` bytes at the least.
+        message: What the server sent.
         how: The protocol and encoding.
     """
-    data = frame.payload
+    data, at = message if isinstance(message, bytes) else b"", -1
     if how == "foxglove":
-        at = _DATA_HEADER + _LAYOUT if frame.opcode == BINARY and data[:1] == bytes((_DATA_OPCODE,)) else -1
+        at = _DATA_HEADER + _LAYOUT if data[:1] == bytes((_DATA_OPCODE,)) else -1
     elif how == "json":
-        found = _JSON.search(data) if frame.opcode == TEXT else None
+        found = _JSON.search(message) if isinstance(message, str) else None
         data, at = (base64.b64decode(found[1]), 0) if found else (b"", -1)
     else:
-        at = _byte_string(data, _CBOR[how]) if frame.opcode == BINARY else -1
+        at = _byte_string(data, _CBOR[how])
         at += _LAYOUT if at >= 0 and how == "cbor-raw" else 0
     if at < 0 or len(data) < at + HEAD.size:
         return None

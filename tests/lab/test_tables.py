@@ -1,4 +1,4 @@
-"""What is said of a measurement: verdicts only where the samples say it, numbers, pictures."""
+"""What is said of a measurement: verdicts only where the samples say it, numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from lab import results
-from lab.figures import shapes
 from lab.findings import Claim
 from lab.tables import dash, size, us
 
@@ -26,27 +25,18 @@ def test_a_claim_is_reached_missed_or_unknown(value: float | None, at_least: boo
     assert Claim("x", value, 1.0, at_least=at_least).reached is reached
 
 
-def test_a_measurement_ends_with_verdicts_a_file_and_a_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_measurement_ends_with_verdicts_and_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results, "RESULTS", tmp_path / "results")
     out = io.StringIO()
     claims = [Claim("p99", 2.0, 1.0), Claim("share", None, 0.9, at_least=True)]
-    panels = {"one": {"a": [float(n) for n in range(1, 2000)], "b": []}, "two": {"a": [1.0, 2.0]}}
-    drawn = [
-        *shapes.shares(panels, "µs"),
-        *shapes.tails(panels, "µs", 3.0),
-        *shapes.bars({"x": {"a": 1.0}}, "µs"),
-        *shapes.lines({"x": {"a": [(1, 1.0), (2, 3.0)]}}, "times"),
-    ]
     console = Console(file=out, width=200)
-    results.finish(console, "short", {"hz": 1}, {"rows": []}, tmp_path / "copy", claims=claims, panels=drawn)
+    results.finish(console, "short", {"hz": 1}, {"rows": []}, tmp_path / "copy", claims=claims)
     assert "p99: 2.00 (to reach: ≤ 1): not reached" in out.getvalue()
     assert "share: - (to reach: ≥ 0.9): too few samples to say" in out.getvalue()
     document = json.loads((tmp_path / "copy").read_text())
     assert [row["reached"] for row in document["result"]["targets"]] == [False, None]
     assert (document["measurement"], document["settings"]) == ("short", {"hz": 1})
-    assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".json", ".png", ".svg"]
+    assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".json"]
 
 
 def test_numbers_as_text() -> None:
