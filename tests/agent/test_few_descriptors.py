@@ -23,7 +23,6 @@ from rmpa.bridge import proxies as proxy_nodes
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.control_client import ControlClient
-from rmpa.observe.control_server import ControlServer
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
@@ -73,34 +72,6 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [text for text in texts if "trust is off" not in text]
 
 
-async def exhausted(use: Use) -> None:
-    """Let a client wait for a descriptor for a while."""
-    before = refused(use)
-    await until(lambda: refused(use) >= before + 10)
-
-
-@pytest.mark.usefixtures("fresh")
-async def test_the_core_serves_again(caplog: pytest.LogCaptureFixture) -> None:
-    core = RosCore("127.0.0.1", 0)
-    await core.start()
-    client = socket.socket()
-    client.setblocking(False)
-    try:
-        with descriptors_left(0):
-            await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", core.port))
-            call = serialize_call("getPid", ["/test"])
-            head = b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: %d\r\n\r\n" % len(call)
-            await asyncio.get_running_loop().sock_sendall(client, head + call)
-            await exhausted(Use.CORE)
-        async with asyncio.timeout(10):
-            assert b"200 OK" in await asyncio.get_running_loop().sock_recv(client, 4096)
-        await until(lambda: not DESCRIPTORS.problem)
-    finally:
-        client.close()
-        await core.close()
-    assert len(lines(caplog)) <= 3
-
-
 @pytest.mark.usefixtures("fresh")
 async def test_subscribers_are_served_again(caplog: pytest.LogCaptureFixture) -> None:
     publication = Publication("/t", "/p", STRING)
@@ -123,30 +94,6 @@ async def test_subscribers_are_served_again(caplog: pytest.LogCaptureFixture) ->
         client.close()
         server.close()
         publication.withdraw()
-    assert len(lines(caplog)) <= 2
-
-
-@pytest.mark.usefixtures("fresh")
-async def test_the_control_socket_answers_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """asyncio's own server logged once for each place of its backlog, in each round: 119 MB in 75 s."""
-    server = ControlServer(tmp_path, "low", {"echo": lambda args: args})
-    await server.start()
-    clients = [socket.socket(socket.AF_UNIX) for _ in range(5)]
-    try:
-        with descriptors_left(0):
-            for client in clients:
-                client.setblocking(False)
-                client.connect(str(server.path))
-            await exhausted(Use.LINK)
-        for client in clients:
-            await asyncio.get_running_loop().sock_sendall(client, b'{"op":"echo","args":{}}\n')
-            async with asyncio.timeout(10):
-                assert b'"ok":true' in await asyncio.get_running_loop().sock_recv(client, 4096)
-        await until(lambda: not DESCRIPTORS.problem)
-    finally:
-        for client in clients:
-            client.close()
-        await server.close()
     assert len(lines(caplog)) <= 2
 
 

@@ -292,15 +292,3 @@ async def test_a_service_without_a_server_is_refused_with_the_reason(
             await connect(b, "/boo")
         a.core.call("unregisterService", "/ghost", "/boo", "rosrpc://127.0.0.1:1")
         await until(lambda: not provider(b, "/boo"))
-
-
-async def test_a_hundred_services_appear_at_the_peer(settings: Callable[..., Settings]) -> None:
-    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
-        for number in range(100):
-            a.core.call(
-                "registerService", f"/n{number % 50}", f"/s{number}", server.node.service_uri, server.node.uri
-            )
-        await until(lambda: sum(name.startswith("/s") for name in b.core.state().services) == 100)
-        for number in range(100):
-            a.core.call("unregisterService", f"/n{number % 50}", f"/s{number}", server.node.service_uri)
-        await until(lambda: not any(name.startswith("/s") for name in b.core.state().services))

@@ -226,16 +226,6 @@ def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
     assert one.membership.events()[-1] == PeerEvent("lost", who(2), reason=membership.GOODBYE)
 
 
-def was_linked(one: Harness) -> Speaker:
-    """Peer 2, which had a link."""
-    speaker = Speaker(who(2))
-    one.hear(speaker())
-    one.membership.link_up(who(2), one.now)
-    one.membership.link_down(who(2).guid, one.now)
-    one.membership.events()
-    return speaker
-
-
 def test_a_forged_goodbye_is_refuted_by_a_later_beacon(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())

@@ -252,19 +252,6 @@ def test_with_an_agent_of_an_earlier_release_all_is_relayed(
     assert older == "b" or conditions(b)["/chatter"] == "release"
 
 
-def test_measuring_tools_are_relayed_and_disturb_nothing(modules: ModuleFactory) -> None:
-    a, b = modules("a", "b", config=AUTO)
-    on_the_network(a, b)
-    talker = a.ros.rospy("talker", topic="/chatter", rate=100)
-    listener = b.ros.rospy("listener", topic="/chatter")
-    wait_direct(listener, talker)
-    code, said = b.agent.rmpa("topic", "hz", "/chatter", "--count", "200")
-    assert code == 0, said
-    assert "at the agent, from a" in said, said
-    assert links(listener, talker) == 1
-    unbroken(flows(listener, 100))
-
-
 @pytest.mark.parametrize("client", ["roscpp", "rospy"])
 def test_the_first_message_is_not_late(modules: ModuleFactory, client: str) -> None:
     """One node subscribes to a relayed and to a direct topic of one publisher, which counts the same on both."""

@@ -19,47 +19,8 @@ from lab.bed.processes import CommandFailed, Deadline, Process, eventually, run
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.interop.conftest import ShellFactory
 
 CLIENTS = ["rospy", "roscpp"]
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize(("talker", "listener"), [("rospy", "roscpp"), ("roscpp", "rospy")])
-def test_nodes_agree_on_the_payload(shell: ShellFactory, talker: str, listener: str) -> None:
-    ros = shell()
-    ros.master()
-    heard = ros.node(listener, "listener", topic="/chatter", count=50)
-    heard.wait_event("up")
-    ros.node(talker, "talker", topic="/chatter", rate=200, count=50, size=5000, wait=1)
-    report = heard.wait_event("done")
-    assert (report["bad"], report["gaps"], report["doubled"], report["last"]) == (0, 0, 0, 50)
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize("client", CLIENTS)
-def test_echo_node_answers(shell: ShellFactory, client: str) -> None:
-    ros = shell()
-    ros.master()
-    ros.node(client, "echo", topic="/ask", reply="/answer", nodelay=True).wait_event("up")
-    heard = ros.roscpp("listener", topic="/answer", count=5)
-    ros.roscpp("talker", topic="/ask", rate=50)
-    assert heard.wait_event("done")["bad"] == 0
-
-
-@pytest.mark.ros
-def test_latched_talker_reaches_a_late_listener(shell: ShellFactory) -> None:
-    ros = shell()
-    ros.master()
-    ros.rospy("talker", topic="/map", count=1, latch=True).wait_event("done")
-    assert ros.roscpp("listener", topic="/map", count=1).wait_event("done")["last"] == 1
-
-
-@pytest.mark.ros
-def test_roscore_and_tools(shell: ShellFactory) -> None:
-    ros = shell()
-    ros.roscore()
-    eventually(lambda: "/rosout" in ros.tool("rosnode", "list").split(), what="roscore's own node, which comes later")
 
 
 @pytest.mark.netns

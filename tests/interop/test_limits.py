@@ -39,38 +39,6 @@ def beyond(agent: Agent, peer: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_nodes_beyond_the_limit_are_reported_and_come_with_a_reload(agent: AgentFactory, shell: ShellFactory) -> None:
-    far = agent(name="far")
-    near = agent(name="near", config="[limits]\nnodes = 2\n")
-    far.wait_peer("near")
-    there, here = shell(port=far.core_port), shell(port=near.core_port)
-    for number in range(4):
-        there.start("rostopic", "pub", "-r", "10", f"/t{number}", "std_msgs/String", f"data: number {number}")
-
-    def listed() -> set[str]:
-        return {line for line in here.tool("rostopic", "list").splitlines() if line.startswith("/t")}
-
-    def hides() -> bool:
-        return len(listed()) == 2 and bool(beyond(near, "far"))
-
-    eventually(hides, 60.0, what="two nodes are shown, and the others are told")
-    (hidden,) = beyond(near, "far")
-    assert (hidden["kind"], hidden["limit"], hidden["hidden"]) == ("nodes", 2, 2)
-    missing = ({f"/t{number}" for number in range(4)} - listed()).pop()
-    code, text = near.rmpa("why", f"far:{missing}")
-    assert code == 1
-    assert "it stops at: limit" in text
-    assert "raise limits.nodes" in text
-    assert "stay hidden here" in near.rmpa("peer", "list")[1]
-
-    (near.home / "near.toml").write_text("[limits]\nnodes = 4\n", encoding="utf-8")
-    assert "limits" in near.rmpa("reload")[1]
-    eventually(lambda: len(listed()) == 4, 30.0, what="all of them are here")
-    assert missing in listed()
-    eventually(lambda: not beyond(near, "far"), 30.0, what="nothing is hidden any more")
-    assert here.tool("rostopic", "echo", "-n1", missing).startswith("data:")
-
-
 @pytest.fixture
 def dribblers() -> Iterator[list[int]]:
     """Seven hundred connections to the port that is put into the list, each with a byte now and then."""

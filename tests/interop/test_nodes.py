@@ -34,21 +34,6 @@ def test_two_machines_with_one_address_are_told_as_a_conflict(lab: Lab, agent: A
     assert all(f"its address {b.address} is also that of peer" in peer.conflicts[0] for peer in conflicts())
 
 
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_a_node_that_only_subscribes_is_known_to_rosnode_in_the_other_module(
-    modules: ModuleFactory, client: str
-) -> None:
-    a, b = modules("a", "b")
-    b.ros.node(client, "listener", topic="/nothing", name="viewer").wait_event("up")
-    eventually(lambda: "/rmpa/b/viewer" in a.ros.tool("rosnode", "list").split(), what="the viewer of b")
-    assert "Node [/rmpa/b/viewer]" in a.ros.tool("rosnode", "info", "/rmpa/b/viewer")
-    assert "xmlrpc reply from http://127" in a.ros.tool("rosnode", "ping", "-c", "1", "/rmpa/b/viewer")
-    assert "/nothing" not in a.topics()
-    assert "/nothing" in a.agent.rmpa("node", "info", "b:/viewer")[1]
-    a.ros.tool("rosnode", "kill", "/rmpa/b/viewer")
-    eventually(lambda: "/rmpa/b/viewer" not in a.ros.tool("rosnode", "list").split(), what="the end of it")
-
-
 def test_nodes_are_pinged_and_ended_across_modules(modules: ModuleFactory) -> None:
     """What stock tools and ours do to the nodes of two modules."""
     a, b = modules("a", "b")

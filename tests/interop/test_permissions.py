@@ -160,20 +160,3 @@ def test_what_the_permissions_say_crosses_and_a_reload_closes_and_opens_it(
     assert base.agent.rmpa("reload")[0] == 0
     has_remote(joystick, "/odom", "base", there=False)
     eventually(lambda: "/display" not in base.ros.tool("rosnode", "info", "/say_odom"), what="no direct connection")
-
-
-def test_parameters_and_nodes_of_another_module_need_permission(pair: tuple[Module, Module]) -> None:
-    base, joystick = pair
-    for key in ("/speed/max", "/secret"):
-        base.ros.tool("rosparam", "set", key, "5")
-    assert joystick.agent.rmpa("param", "get", "/speed/max", "--peer", "base") == (0, "5")
-    code, said = joystick.agent.rmpa("param", "get", "/secret", "--peer", "base")
-    assert code != 0
-    assert "the permissions there do not let joystick read or set /secret" in said
-    assert "/secret" not in joystick.agent.rmpa("param", "list", "--peer", "base")[1]
-    talker = base.ros.rospy("talker", "__name:=vital", topic="/odom", rate=10)
-    talker.wait_event("up")
-    code, said = joystick.agent.rmpa("node", "kill", "base:/vital")
-    assert code != 0
-    assert "the permissions there do not let joystick end /vital" in said
-    assert talker.returncode is None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -37,7 +36,6 @@ AS_NOBODY: Final = (
     "--clear-groups",
 )
 WITHOUT_RIGHTS: Final = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource")
-NO_LIMIT: Final = resource.RLIM_INFINITY
 
 
 @dataclass(slots=True)

@@ -8,14 +8,12 @@ from __future__ import annotations
 import json
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from lab.bed.agents import RMPA
 from lab.bed.namespaces import Lab
-from lab.bed.processes import Process, eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import flows, whole
 from tests.interop.recordings import recorded
 from tests.interop.ros import Ros, lacks
@@ -30,7 +28,6 @@ pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(120)]
 
 LONG: Final = 40.0
-RESOURCES: Final = Path(__file__).parent / "resources"
 _DETECTED: Final = 2.0
 """Seconds after which a killed module must be gone at the other site: 0.2 on a machine of its own, see lab/bench."""
 
@@ -118,22 +115,6 @@ def test_an_action_runs_at_the_other_site(joined: JoinedModules) -> None:
         client.wait_event("feedback", LONG, since=since)
         client.tell("cancel")
         assert client.wait_event("done", LONG, since=since)["state"] == "PREEMPTED"
-
-
-def test_parameters_and_resources_of_the_other_site(joined: JoinedModules) -> None:
-    arm, base = joined.arm, joined.base
-
-    def asked(*words: str) -> str:
-        code, output = base.agent.rmpa(*words, timeout=LONG)
-        return output if code == 0 else ""
-
-    lamp = arm.host.command([RMPA, "run", RESOURCES / "lamp.py", "--name", arm.name, "--no-state"])
-    with Process(lamp, env=arm.agent.env, name="lamp"):
-        eventually(lambda: "/lamp " in asked("resource", "list"), LONG, what="/lamp among the resources", every=0.5)
-    arm.ros.tool("rosparam", "set", "/speed", "1.5")
-    eventually(lambda: "1.5" in asked("param", "get", "--peer", "warehouse/arm", "/speed"), what="/speed of arm")
-    assert base.agent.rmpa("param", "set", "--peer", "warehouse/arm", "/speed", "2.5")[0] == 0
-    assert "2.5" in arm.ros.tool("rosparam", "get", "/speed")
 
 
 def test_nothing_crosses_without_a_subscriber(joined: JoinedModules) -> None:

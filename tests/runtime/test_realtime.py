@@ -17,7 +17,6 @@ from rmpa.runtime import process as realtime
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-INFINITY: Final = resource.RLIM_INFINITY
 NOBODY: Final = 65534
 
 CHILD: Final = """

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 zenoh = pytest.importorskip("zenoh")
 
 SCAN = "rmpa/1/home/arm/t/sensor_msgs%LaserScan/scan"
-SECRET = "rmpa/1/home/arm/t/std_msgs%String/secret/key"
 
 
 @pytest.fixture
