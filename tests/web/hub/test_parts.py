@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core.errors import LimitExceeded
+from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.web import limits
 from rmpa.web.hub.node_link import NodeLink
 from rmpa.web.hub.params import ParamMirror
-from rmpa.web.hub.services import AssetError, read_asset
+from rmpa.web.hub.services import read_asset
 from rmpa.web.hub.topics import PayloadBuffers
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def test_a_file_is_found_wherever_its_package_is_in_the_workspace(workspace: Pat
 
 @pytest.mark.parametrize("path", ["../../secret", "out", "meshes/../../../secret", "/etc/passwd"])
 def test_nothing_outside_of_the_package_is_read(workspace: Path, path: str) -> None:
-    with pytest.raises(AssetError, match="outside of its package"):
+    with pytest.raises(RmpaError, match="outside of its package"):
         read(workspace, f"package://arm/{path}")
 
 
@@ -153,6 +153,10 @@ def test_nothing_outside_of_the_package_is_read(workspace: Path, path: str) -> N
         ("package://arm/meshes", "has no file meshes"),
         ("package://leg/link.stl", "package leg is not found; source its workspace"),
         ("package://../secret", "is not found"),
+        ("package://arm/%2e%2e/%2e%2e/secret", "has no file"),
+        ("package:///etc/passwd", "write package://NAME/PATH"),
+        ("/etc/passwd", "write package://NAME/PATH"),
+        ("package://arm/a\0b", "write package://NAME/PATH"),
         ("file:///etc/passwd", "write package://NAME/PATH"),
         ("package://arm", "write package://NAME/PATH"),
         (f"package://{'a' * 300}/link.stl", "cannot be read: File name too long"),
@@ -160,7 +164,7 @@ def test_nothing_outside_of_the_package_is_read(workspace: Path, path: str) -> N
     ],
 )
 def test_what_cannot_be_had_is_told(workspace: Path, uri: str, text: str) -> None:
-    with pytest.raises(AssetError) as error:
+    with pytest.raises(RmpaError) as error:
         read(workspace, uri)
     assert text in str(error.value)
 

@@ -65,10 +65,6 @@ _SCHEME: Final = "package://"
 _MANIFESTS: Final = ("package.xml", "manifest.xml")
 
 
-class AssetError(RmpaError):
-    """A file cannot be had."""
-
-
 def read_asset(uri: str, most: int, environ: Mapping[str, str]) -> bytes:
     """Read a file of a package; this blocks.
 
@@ -78,16 +74,16 @@ def read_asset(uri: str, most: int, environ: Mapping[str, str]) -> bytes:
         environ: Has ROS_PACKAGE_PATH and CMAKE_PREFIX_PATH.
 
     Raises:
-        AssetError: There is no such package or file, or it is outside of the package.
+        RmpaError: There is no such package or file, or it is outside of the package.
         LimitExceeded: The file is larger than ``most``.
     """
     package, _, path = uri.removeprefix(_SCHEME).partition("/")
     if not uri.startswith(_SCHEME) or not package or not path or "\0" in path:
-        raise AssetError(f"{uri[:200]!r} is not the file of a package; write package://NAME/PATH")
+        raise RmpaError(f"{uri[:200]!r} is not the file of a package; write package://NAME/PATH")
     try:
         return _find(package, path, most, environ)
     except OSError as error:  # such as a name that is too long
-        raise AssetError(f"{uri[:200]} cannot be read: {error.strerror}") from error
+        raise RmpaError(f"{uri[:200]} cannot be read: {error.strerror}") from error
 
 
 def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> bytes:
@@ -97,12 +93,12 @@ def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> byt
         root = folder.resolve()
         file = (root / path).resolve()
         if not file.is_relative_to(root):
-            raise AssetError(f"{path[:200]} is outside of its package {package[:200]}")
+            raise RmpaError(f"{path[:200]} is outside of its package {package[:200]}")
         if file.is_file():
             return _read(file, most)
     if found:
-        raise AssetError(f"package {package} has no file {path[:200]}")
-    raise AssetError(f"package {package[:200]} is not found; source its workspace where rmpa web starts")
+        raise RmpaError(f"package {package} has no file {path[:200]}")
+    raise RmpaError(f"package {package[:200]} is not found; source its workspace where rmpa web starts")
 
 
 def _read(file: Path, most: int) -> bytes:
@@ -113,7 +109,7 @@ def _read(file: Path, most: int) -> bytes:
                 raise LimitExceeded(f"asset {file.name}", size, most)
             return stream.read(most)
     except OSError as error:
-        raise AssetError(f"{file.name} cannot be read: {error.strerror}") from error
+        raise RmpaError(f"{file.name} cannot be read: {error.strerror}") from error
 
 
 def _folders(package: str, environ: Mapping[str, str]) -> Iterator[Path]:

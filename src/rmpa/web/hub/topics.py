@@ -45,12 +45,8 @@ class PayloadBuffers:
         self._limit = kept_bytes
         self._kept: deque[bytearray] = deque()
         """Those used last are at the right."""
-        self._bytes = 0
-
-    @property
-    def bytes(self) -> int:
+        self.bytes = 0
         """Bytes of the buffers that are kept."""
-        return self._bytes
 
     def copy(self, data: memoryview) -> memoryview:
         """A read-only copy, which stays as it is while there is a view of it."""
@@ -60,10 +56,10 @@ class PayloadBuffers:
         buffer = self._unused(size)
         if buffer is None:
             buffer = bytearray(size)
-            self._bytes += size
+            self.bytes += size
         self._kept.append(buffer)
-        while self._bytes > self._limit or len(self._kept) > limits.PAYLOAD_BUFFERS_MAX:
-            self._bytes -= len(self._kept.popleft())
+        while self.bytes > self._limit or len(self._kept) > limits.PAYLOAD_BUFFERS_MAX:
+            self.bytes -= len(self._kept.popleft())
         view = memoryview(buffer)[:size]
         view[:] = data
         return view.toreadonly()
@@ -71,7 +67,7 @@ class PayloadBuffers:
     def clear(self) -> None:
         """Keep no buffer; those in use end with their last view."""
         self._kept.clear()
-        self._bytes = 0
+        self.bytes = 0
 
     def _unused(self, size: int) -> bytearray | None:
         """Take out the buffer that was used last, of those that are large enough and not far too large.

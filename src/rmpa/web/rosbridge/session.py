@@ -45,14 +45,6 @@ LEVELS: Final = ("none", "error", "warning", "info")
 """Each includes those before it."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Wish:
-    interval: float
-    length: int
-    fragment_size: int | None
-    compression: Compression
-
-
 class _Topic(ClientStream):
     """A subscribed topic: several ids of one topic are one subscription of the hub.
 
@@ -74,7 +66,8 @@ class _Topic(ClientStream):
         self.topic = topic
         self.type = kind
         self.throttle = Throttle(session.queued)
-        self.wishes: dict[Id, _Wish] = {}
+        self.wishes: dict[Id, tuple[float, int, int | None, Compression]] = {}
+        """What each id asked for: interval, queue, fragment size and compression."""
         self.judged_at: float | None = None
         """When it fails, if the topic is not there by then."""
         self._compression = Compression.NONE
@@ -84,10 +77,10 @@ class _Topic(ClientStream):
 
     def choose(self) -> None:
         """Choose from all wishes."""
-        wishes = self.wishes.values()
-        self.throttle.configure(min(each.interval for each in wishes), max(each.length for each in wishes))
-        self._compression = max(each.compression for each in wishes)
-        self._fragment_size = min((each.fragment_size for each in wishes if each.fragment_size), default=None)
+        intervals, lengths, sizes, compressions = zip(*self.wishes.values(), strict=True)
+        self.throttle.configure(min(intervals), max(lengths))
+        self._compression = max(compressions)
+        self._fragment_size = min(filter(None, sizes), default=None)
 
     def frames(self, message: ReceivedMessage, now: float) -> list[OutFrame]:
         """The frames of a message; none where it is held back."""
@@ -304,7 +297,7 @@ class RosbridgeSession(Session):
         chosen = Compression.parse(compression)
         kind = type_name(type_) if type_ else None
         interval = whole(throttle_rate, "throttle_rate") / 1000
-        wish = _Wish(interval, whole(queue_length, "queue_length"), _fragment_size(fragment_size), chosen)
+        wish = interval, whole(queue_length, "queue_length"), _fragment_size(fragment_size), chosen
         if chosen is Compression.CBOR_RAW:
             kind = None  # bytes of any type
         there = self._topics.get(topic)
