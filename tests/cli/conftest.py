@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,13 +19,14 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
+from rmpa.cli.main import main
 from rmpa.observe.control_server import ControlServer, Handler
 from rmpa.observe.snapshot import PingReply, Snapshot
 from rmpa.ros.core.embedded import RosCore
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
+    from collections.abc import Coroutine, Iterator
     from types import TracebackType
 
 DEADLINE = 30.0
@@ -155,6 +157,31 @@ def core(background: Background) -> Iterator[RosCore]:
     assert core is not None
     yield core
     background.do(core.close())
+
+
+Rmpa = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def rmpa(
+    core: RosCore,
+    place: Place,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
+) -> Rmpa:
+    """Runs a verb of the test file's ``GROUP`` within this process, at the core: exit code, output, errors."""
+    for name in ("ROS_PACKAGE_PATH", "PYTHONPATH", "CMAKE_PREFIX_PATH", "RMPA_AGENT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(place.path)), ("NO_COLOR", "1")):
+        monkeypatch.setenv(name, value)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main((*request.module.GROUP, *words))
+        return code, *capsys.readouterr()
+
+    return run
 
 
 def with_core(uri: str) -> Snapshot:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
-from rmpa.cli.main import main
 from rmpa.cli.node import _untold
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.observe.snapshot import UnreachableInfo
@@ -20,28 +18,13 @@ from rmpa.ros.node.node import Node
 from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Background, Place
+    from tests.cli.conftest import Background, Rmpa
 
-Rmpa = Callable[..., tuple[int, str, str]]
+GROUP = ("node",)
 JOY = "http://10.0.0.2:1/"
-
-
-@pytest.fixture
-def rmpa(core: RosCore, place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Rmpa:
-    """Runs ``rmpa node`` within this process: exit code, output, errors."""
-    monkeypatch.delenv("RMPA_AGENT", raising=False)
-    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(place.path)), ("NO_COLOR", "1")):
-        monkeypatch.setenv(name, value)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main(["node", *words])
-        return code, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

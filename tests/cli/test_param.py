@@ -15,7 +15,6 @@ from rmpa.bridge.params import rules as transfer
 from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.observe.control_server import ControlServer
-from rmpa.observe.snapshot import FollowedInfo
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
 from tests.observe.samples import SNAPSHOT
 
@@ -98,13 +97,7 @@ def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
         del kept[key]
         return {}
 
-    rows = (
-        FollowedInfo(key="/a", owner="base", owner_key="/b", state="followed", size=12),
-        FollowedInfo(key="/c", owner="arm", owner_key="/c", state="refused", problem="it may not be read"),
-    )
-    server = ControlServer(
-        place.path, "pad", {"snapshot": lambda _: SNAPSHOT, "param": ask, "followed": lambda _: rows}
-    )
+    server = ControlServer(place.path, "pad", {"snapshot": lambda _: SNAPSHOT, "param": ask})
     background.do(server.start())
     yield kept
     background.do(server.close())
@@ -124,18 +117,6 @@ def test_a_peers(place: Place, peer: dict[str, Any]) -> None:
     code, _, err = place.run("param", "get", "--peer", "base", "/nothing")
     assert code == 1
     assert "there is no parameter /nothing" in err
-
-
-def test_followed(place: Place, peer: dict[str, Any]) -> None:
-    code, out, err = place.run("param", "followed")
-    assert code == 0
-    assert [line.split() for line in out.splitlines()] == [
-        ["KEY", "STATE", "OWNER", "SIZE"],
-        ["/a", "followed", "base:/b", "12", "B"],
-        ["/c", "refused", "arm:/c", "-"],
-    ]
-    assert err == "! /c: it may not be read\n"
-    assert place.json("param", "followed", "--json")[0][0]["owner_key"] == "/b"  # type: ignore[index]
 
 
 _SCALARS = (

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError
 from rmpa.resource.client import ResourceClient
 from rmpa.resource.descriptor import describe
@@ -24,28 +22,12 @@ from tests.resource.test_node import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from rmpa.ros.core.embedded import RosCore
-    from tests.cli.conftest import Background
+    from tests.cli.conftest import Background, Rmpa
 
-Rmpa = Callable[..., tuple[int, str, str]]
+GROUP = ()
 ARRAY = "diagnostic_msgs/DiagnosticArray"
-
-
-@pytest.fixture
-def rmpa(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Rmpa:
-    """Runs ``rmpa`` within this process: exit code, output, errors."""
-    monkeypatch.delenv("RMPA_AGENT", raising=False)
-    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(tmp_path)), ("NO_COLOR", "1")):
-        monkeypatch.setenv(name, value)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main(words)
-        return code, *capsys.readouterr()
-
-    return run
 
 
 def sonar() -> Resource:
@@ -137,12 +119,6 @@ def rows(rmpa: Rmpa, *words: str) -> list[list[str]]:
 
 
 def test_resources_here_and_at_peers(rmpa: Rmpa, running: ResourceNode, remote: object) -> None:
-    assert rows(rmpa, "resource", "list") == [
-        ["RESOURCE", "STATE", "ROLE"],
-        ["/sonar", "active", "sensing"],
-        ["base:/lidar", "active", "sensing"],
-        ["base:/sonar", "active", "sensing"],
-    ]
     assert "\x1b" not in rmpa("resource", "list")[1]
     assert "2 modules have a resource /sonar: what is asked" in rmpa("resource", "list")[2]
     listed = as_json(rmpa, "resource", "list")
@@ -159,26 +135,6 @@ def test_resources_here_and_at_peers(rmpa: Rmpa, running: ResourceNode, remote: 
 
 
 def test_all_of_a_resource(rmpa: Rmpa, running: ResourceNode) -> None:
-    code, out, _ = rmpa("resource", "info")
-    assert code == 0
-    lines = [" ".join(line.split()) for line in out.splitlines()]
-    for line in (
-        "Resource: /sonar (sensing, simulated)",
-        "State: active",
-        "Profile: slow",
-        "Health: OK: profile slow",
-        "/sonar/ranges sensor_msgs/Range deadline 0.1 s",
-        "gain 1 dB 0.5 .. of the amplifier",
-        "beam wide wide | narrow",
-        "accuracy not measured min performance",
-        "slow 1 rate 10 Hz, accuracy 0.05 m cheap",
-        "docked /battery.charging and ~gain > 3",
-        "away by hand",
-        "measure 2 Hz (parameter pace)",
-        "clean 0.1 Hz",
-        "/eye nothing at present 3",
-    ):
-        assert line in lines, out
     about = as_json(rmpa, "resource", "info", "sonar")
     assert about["parameters"] == {"gain": 1.0, "beam": "wide", "pace": 2.0, "profile": "", "context": ""}
     assert about["health"]["values"]["profile"] == "slow"
@@ -261,12 +217,6 @@ def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
     assert rmpa("context", "set", "sonar", "away") == (0, "", "")
     assert running.adapter.loop.profile == "fast"
     assert rmpa("context", "get", "sonar") == (0, "away\n", "")
-    table = [" ".join(line.split()) for line in rmpa("context", "list")[1].splitlines()]
-    assert table == [
-        "CONTEXT NOW WHEN REQUIRES PROFILES OUTPUTS",
-        "docked /battery.charging and ~gain > 3 - any all",
-        "away by hand by hand rate >= 20 Hz fast all",
-    ]
     code, _, err = rmpa("context", "set", "sonar", "awya")
     assert (code, err) == (2, "rmpa: CONTEXT: there is no context 'awya'; did you mean away?\n")
     assert rmpa("context", "set", "sonar", "--auto")[0] == 0

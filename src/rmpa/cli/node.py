@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from msgspec.structs import replace
 
 from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, unknown_name
-from rmpa.cli.options import (
-    Options,
-    Selection,
-    argument,
-    flag,
-    graph_verb,
-    ping_options,
-    selection_options,
-    summary,
-)
+from rmpa.cli.options import Options, Selection, argument, flag, graph_verb, ping_options, selection_options, summary
 from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import is_own, proxied_node, proxied_peer

@@ -277,11 +277,9 @@ def read_documents(text: str, where: str) -> list[XmlRpcValue]:
     try:
         documents = list(yaml.load_all(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise RmpaError(f"{where}{_place(error)}: not YAML: {_problem(error)}") from None
-    for document in documents:
-        for key, problem in _unstorable(document):
-            raise RmpaError(f"{where}: {f'{key}: ' if key else ''}{problem}")
-    return [_plain(document) for document in documents]
+        problem = str(getattr(error, "problem", None) or error).splitlines()[0]
+        raise RmpaError(f"{where}{_place(error)}: not YAML: {problem}") from None
+    return [_storable(document, where) for document in documents]
 
 
 def _place(error: Exception) -> str:
@@ -289,39 +287,32 @@ def _place(error: Exception) -> str:
     return f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
 
 
-def _problem(error: Exception) -> str:
-    return str(getattr(error, "problem", None) or error).splitlines()[0]
+def _storable(value: Any, where: str, key: str = "", depth: int = 0) -> Any:
+    """A value in the types of XML-RPC, where a date always has a time.
 
-
-def _unstorable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[str, str]]:
-    """The parts of a value that no parameter can hold: key and problem of each."""
+    Raises:
+        RmpaError: No parameter can hold it, or a part of it: with ``where`` and the part's key.
+    """
+    problem = ""
     if depth > ros_limits.PARAM_DEPTH_MAX:
-        yield key.partition("[")[0], f"nested deeper than {ros_limits.PARAM_DEPTH_MAX} levels"
+        key, problem = key.partition("[")[0], f"nested deeper than {ros_limits.PARAM_DEPTH_MAX} levels"
     elif isinstance(value, dict):
-        for name, member in value.items():
-            if not isinstance(name, str):
-                yield key, f"the key {name!r} is not a string; put it in quotes"
-            else:
-                yield from _unstorable(member, f"{key}/{name}", depth + 1)
+        strange = [name for name in value if not isinstance(name, str)]
+        if not strange:
+            return {name: _storable(each, where, f"{key}/{name}", depth + 1) for name, each in value.items()}
+        problem = f"the key {strange[0]!r} is not a string; put it in quotes"
     elif isinstance(value, list | tuple):
-        for index, member in enumerate(value):
-            yield from _unstorable(member, f"{key}[{index}]", depth + 1)
+        return [_storable(each, where, f"{key}[{index}]", depth + 1) for index, each in enumerate(value)]
     elif value is None:
-        yield key, "null is no value of a parameter; write '' for an empty string, or leave it out"
+        problem = "null is no value of a parameter; write '' for an empty string, or leave it out"
     elif isinstance(value, int) and not isinstance(value, bool) and not -_INT_MAX - 1 <= value <= _INT_MAX:
-        yield key, f"{value} does not fit the 32 bits of a parameter; write it with a point, or in quotes"
-    elif not isinstance(value, bool | int | float | str | bytes | date):
-        yield key, f"a {type(value).__name__} cannot be a parameter"
-
-
-def _plain(value: Any) -> Any:
-    """A value in the types of XML-RPC, where a date always has a time."""
-    if isinstance(value, dict):
-        return {name: _plain(member) for name, member in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(member) for member in value]
-    if isinstance(value, date) and not isinstance(value, datetime):
+        problem = f"{value} does not fit the 32 bits of a parameter; write it with a point, or in quotes"
+    elif isinstance(value, date) and not isinstance(value, datetime):
         return datetime(value.year, value.month, value.day)  # noqa: DTZ001 - XML-RPC's dates have no zone
+    elif not isinstance(value, bool | int | float | str | bytes | date):
+        problem = f"a {type(value).__name__} cannot be a parameter"
+    if problem:
+        raise RmpaError(f"{where}: {f'{key}: ' if key else ''}{problem}")
     return value
 
 

@@ -11,16 +11,7 @@ import click
 import msgspec
 
 from rmpa.cli.graph import find_peer
-from rmpa.cli.options import (
-    Options,
-    Selection,
-    agent_verb,
-    argument,
-    flag,
-    limit_options,
-    ping_options,
-    summary,
-)
+from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.cli.topic import shown_state
 from rmpa.config.values import did_you_mean
@@ -247,7 +238,7 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
                 if sent:
                     time.sleep(interval)
                 sent += 1
-                times += _ping_once(client, found, sent, options)
+                _ping_once(client, found, sent, times, options)
     of = SampleSummary.of(times)
     figures = {"min": of.minimum, "avg": of.mean, "max": of.maximum, "sd": of.sd}
     lost = 100 * (sent - len(times)) / sent if sent else 0
@@ -258,8 +249,8 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
     return 0 if times else 1
 
 
-def _ping_once(client: ControlClient, peer: PeerInfo, number: int, options: Options) -> list[float]:
-    """Ping a peer and print the result; return its time, or nothing."""
+def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[float], options: Options) -> None:
+    """Ping a peer, note its time, and print the result, at which Ctrl-C may end the command."""
     reply, problem = PingReply(times=()), "no answer"
     try:
         reply = client.call("ping", PingReply, peer=peer.guid, count=1)  # by GUID: two peers may have the same name
@@ -269,9 +260,9 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, options: Opti
     told = {"peer": peer.name, "seq": number, "time": elapsed, "remote": reply.remote}
     if elapsed is None:
         options.show(told | {"error": problem}, f"{peer.name}: seq={number} {problem}")
-        return []
-    options.show(told, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
-    return [elapsed]
+    else:
+        times.append(elapsed)
+        options.show(told, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
 
 
 name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")

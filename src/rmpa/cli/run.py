@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ctypes
 import gc
 import logging
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +23,7 @@ import click
 
 from rmpa.cli.options import argument, flag, verb
 from rmpa.cli.output import print_error, printable
-from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.runtime import limits
 
 if TYPE_CHECKING:
@@ -183,13 +185,8 @@ def _line_in(path: Path, error: BaseException) -> int | None:
     """The line of the user's file at which an exception was raised."""
     if isinstance(error, SyntaxError) and error.filename == str(path):
         return error.lineno
-    line = None
-    trace = error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return line
+    frames = traceback.extract_tb(error.__traceback__)
+    return next((frame.lineno for frame in reversed(frames) if frame.filename == str(path)), None)
 
 
 def _set(resources: Sequence[Resource], text: str) -> None:
@@ -217,18 +214,14 @@ def _set(resources: Sequence[Resource], text: str) -> None:
 
 def _read(parameter: Parameter, text: str) -> bool | int | float | str:
     """Convert a text to the parameter's type."""
-    if isinstance(parameter.default, str):
-        return text
-    if isinstance(parameter.default, bool):
-        words = {"true": True, "false": False, "1": True, "0": False}
-        if text.lower() not in words:
-            raise ConfigError(f"parameter {parameter.name}", f"{text!r} is no bool", "true or false")
-        return words[text.lower()]
+    is_bool = isinstance(parameter.default, bool)
+    words = {"true": True, "false": False, "1": True, "0": False}
     try:
-        return type(parameter.default)(text)
-    except ValueError:
-        example = f"for example {parameter.default!r}"
-        raise ConfigError(f"parameter {parameter.name}", f"{text!r} is no {parameter.type}", example) from None
+        return words[text.lower()] if is_bool else type(parameter.default)(text)
+    except (KeyError, ValueError):
+        what = "bool" if is_bool else parameter.type
+        example = "true or false" if is_bool else f"for example {parameter.default!r}"
+        raise ConfigError(f"parameter {parameter.name}", f"{text!r} is no {what}", example) from None
 
 
 class ModuleAgent:
@@ -284,11 +277,10 @@ class ModuleAgent:
         """
         deadline = time.monotonic() + _STARTS
         while self._uri is None:
+            text = f"it does not answer after {_STARTS:g} s" if time.monotonic() > deadline else ""
             if self.process is not None and self.process.poll() is not None:
                 text = f"it ended with code {self.process.returncode}"
-                raise StartError(f"agent {self.name}", text, "what it said stands above")
-            if time.monotonic() > deadline:
-                text = f"it does not answer after {_STARTS:g} s"
+            if text:
                 raise StartError(f"agent {self.name}", text, "what it said stands above")
             time.sleep(0.02)
             self._uri = _core_of(self.name)
@@ -314,11 +306,8 @@ def _core_of(name: str) -> str | None:
 
     for found in find_agents(os.environ):
         if found.name == name:
-            try:
-                with ControlClient(found.path) as client:
-                    return client.agent().core_uri
-            except (UnreachableError, RmpaError):
-                return None
+            with contextlib.suppress(RmpaError), ControlClient(found.path) as client:
+                return client.agent().core_uri
     return None
 
 

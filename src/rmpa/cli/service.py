@@ -11,16 +11,7 @@ import click
 
 from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
 from rmpa.cli.messages import fill_stamps, read_values, to_text
-from rmpa.cli.options import (
-    FiniteRange,
-    Options,
-    Selection,
-    argument,
-    flag,
-    graph_verb,
-    selection_options,
-    summary,
-)
+from rmpa.cli.options import FiniteRange, Options, Selection, argument, flag, graph_verb, selection_options, summary
 from rmpa.cli.output import Table, duration, print_json, printable, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
