@@ -156,6 +156,12 @@ def read_name(text: str, what: str = "topic") -> GraphName:
     return GraphName("/" + name.strip("/"), peer or None)
 
 
+def suggestion(word: str, known: Iterable[str], otherwise: str) -> str:
+    """The remedy for a misspelt word: the nearest one that is known, or what else helps."""
+    near = did_you_mean(word, known)
+    return f"did you mean {printable(near)}?" if near else otherwise
+
+
 def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
     """The peer of that name or GUID.
 
@@ -166,11 +172,8 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
         if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
             return info
     names = [info.name for info in snapshot.peers]
-    near = did_you_mean(wanted, names)
     known = f"known are {', '.join(names)}" if names else "no peer is known yet"
-    raise RmpaError(
-        f"{snapshot.agent.name} knows no peer {wanted!r}; " + (f"did you mean {near}?" if near else known)
-    )
+    raise RmpaError(f"{snapshot.agent.name} knows no peer {wanted!r}; {suggestion(wanted, names, known)}")
 
 
 def require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
@@ -231,8 +234,7 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> RmpaError:
         name: The name.
         known: Those that there are.
     """
-    near = did_you_mean(name, known)
-    return RmpaError(f"no {what} {name}; " + (f"did you mean {near}?" if near else f"`rmpa {what} list` shows all"))
+    return RmpaError(f"no {what} {name}; {suggestion(name, known, f'`rmpa {what} list` shows all')}")
 
 
 def warn_unpublished(master: Master, graph: Graph, wanted: GraphName) -> None:
@@ -245,8 +247,8 @@ def warn_unpublished(master: Master, graph: Graph, wanted: GraphName) -> None:
     """
     if any(map(wanted.matches, graph.publishers.get(wanted.name, ()))):
         return
-    near = did_you_mean(wanted.name, graph.publishers) if wanted.name not in graph.publishers else None
-    hint = f"did you mean {near}?" if near else f"`rmpa why {wanted}` says why" if master.agent is not None else ""
+    why = f"`rmpa why {wanted}` says why" if master.agent is not None else ""
+    hint = why if wanted.name in graph.publishers else suggestion(wanted.name, graph.publishers, why)
     warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""))
 
 

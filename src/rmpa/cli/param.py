@@ -18,9 +18,9 @@ import click
 import yaml
 
 from rmpa.bridge.params.rules import key_problem
+from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, agent_verb, argument, completes, flag, graph_verb
 from rmpa.cli.output import Painted, Table, json_text, size, warn
-from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name, resolve_name
 from rmpa.observe import limits as observe_limits
@@ -103,9 +103,7 @@ class MasterParams:
         reply = self._call(method, key)
         if reply.code != 1:
             known = {name for full in self.names() for name in with_namespaces(full)}
-            near = did_you_mean(key, known)
-            hint = f"did you mean {near}?" if near else "`rmpa param list`"
-            raise RmpaError(f"{self.title} has no parameter {key}; {hint}")
+            raise RmpaError(f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}")
         return reply
 
     def _call(self, method: str, *params: XmlRpcValue) -> RosReply:

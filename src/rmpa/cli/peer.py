@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import click
 import msgspec
 
-from rmpa.cli.graph import find_peer
+from rmpa.cli.graph import find_peer, suggestion
 from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.cli.topic import shown_state
-from rmpa.config.values import did_you_mean
 from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
@@ -356,8 +355,7 @@ def site_info(site: str, name: str | None, options: Options) -> int:
     found = next((each for each in report.sites if each.name == site), None)
     if found is None:
         known = [each.name for each in report.sites]
-        near = did_you_mean(site, known)
-        hint = f"did you mean {near}?" if near else f"known are {', '.join(known)}"
+        hint = suggestion(site, known, f"known are {', '.join(known)}")
         raise RmpaError(f"{report.gateway} knows no site {printable(site)!r}; {hint}")
     options.show(report, _site_text(report, found))
     return 0 if found.state in ("this site", "joined") else 1

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.policy import OUTSIDE_GUID
-from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, with_node
+from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
 from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.config.rules import ROS2
-from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import proxied_node, proxied_peer
 from rmpa.resource.descriptor import TOPIC, Descriptor
@@ -106,8 +105,7 @@ class ResourceGraph:
             wanted, remedy = read_name(text, "resource"), "say whose is meant"
             found = tuple(s for s in self.seen if s.path == wanted.name and wanted.matches(s.caller))
             if not found:
-                near = did_you_mean(str(wanted), map(str, self.seen))
-                hint = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
+                hint = suggestion(str(wanted), map(str, self.seen), "`rmpa resource list` shows all")
                 raise RmpaError(f"no resource {printable(str(wanted))}; {hint}")
         found = tuple(each for each in found if each.peer is None) or found
         if not found:
@@ -397,6 +395,5 @@ def known_name(what: str, text: str, known: Iterable[str]) -> None:
     """
     names = list(known)
     if text not in names:
-        near = did_you_mean(text, names)
-        remedy = f"did you mean {printable(near)}?" if near else f"there are {printable(', '.join(names)) or 'none'}"
+        remedy = suggestion(text, names, f"there are {printable(', '.join(names)) or 'none'}")
         raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)

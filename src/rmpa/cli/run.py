@@ -195,7 +195,7 @@ def _set(resources: Sequence[Resource], text: str) -> None:
     Raises:
         ConfigError: There is no such parameter, there are several, or the value does not fit.
     """
-    from rmpa.config.values import did_you_mean
+    from rmpa.cli.graph import suggestion
 
     key, equals, value = text.partition("=")
     if not equals:
@@ -205,8 +205,8 @@ def _set(resources: Sequence[Resource], text: str) -> None:
     if len(fits) != 1:
         if fits:
             raise ConfigError("--set", f"{key} is a parameter of several resources", f"say {' or '.join(fits)}")
-        near = did_you_mean(key, [*known, *(name.partition(".")[2] for name in known)])
-        remedy = f"did you mean {near}?" if near else f"there are {', '.join(known) or 'none'}"
+        names = [*known, *(name.partition(".")[2] for name in known)]
+        remedy = suggestion(key, names, f"there are {', '.join(known) or 'none'}")
         raise ConfigError("--set", f"there is no parameter {key}", remedy)
     known[fits[0]].value = _read(known[fits[0]], value)
     known[fits[0]].given = True

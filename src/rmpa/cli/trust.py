@@ -10,7 +10,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
@@ -77,25 +77,24 @@ class Module:
         """How its agent runs: ``secured``, ``plain`` or ``off``."""
         return "off" if self.trust is None else self.trust.agent
 
-    def with_place(self) -> Self:
-        """Check that the module has a state directory.
+    @property
+    def place(self) -> Path:
+        """Its state directory.
 
         Raises:
             StartError: There is none.
         """
         if self.state is None:
             raise StartError("the state directory", "is not known: there is no home", "set RMPA_STATE_DIR")
-        return self
-
-    @property
-    def place(self) -> Path:
-        """The state directory of a module ``with_place``."""
-        assert self.state is not None  # noqa: S101 - it was checked
         return self.state
 
     @property
     def store(self) -> TrustStore:
-        """The keys and certificates of a module ``with_place``."""
+        """Its keys and certificates.
+
+        Raises:
+            StartError: There is no state directory.
+        """
         return TrustStore(self.place, self.name)
 
     def call(self, what: str, reply: type[_T], **args: object) -> _T:
@@ -201,8 +200,7 @@ def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Comman
     def decorate(function: Callable[..., None]) -> click.Command:
         @functools.wraps(function)
         def command(name: str | None, config: str | None, options: Options, **given: Any) -> None:
-            module = find_module(name, {"config": config}, os.environ)
-            function(module.with_place(), options, **given)
+            function(find_module(name, {"config": config}, os.environ), options, **given)
 
         return json_verb(*parameters, name_option, config_option)(command)
 
