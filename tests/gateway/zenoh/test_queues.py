@@ -71,7 +71,7 @@ async def test_a_message_larger_than_the_bound_still_goes_alone(lane: SendingLan
 
 
 def lane_took(made: QueuedPublisher) -> bool:
-    return made.waiting == 1 and not made._queue
+    return made.waiting == 1 and not made._items
 
 
 async def test_a_flood_does_not_starve_another_publisher_of_its_priority(lane: SendingLane) -> None:

@@ -16,14 +16,14 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.gateway import limits
 from rmpa.runtime.tls import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from rmpa.gateway.neighbour import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
@@ -56,7 +56,55 @@ def keep_thread_state() -> None:
         ctypes.pythonapi.PyGILState_Ensure()
 
 
-class ArrivalQueue(Generic[_T]):
+class BoundedQueue(Generic[_T]):
+    """Items with their sizes in bytes; beyond its bounds the oldest go, but one always fits. Its user has a lock.
+
+    Args:
+        messages: Items that wait at most.
+        size: Bytes that wait at most.
+    """
+
+    def __init__(self, messages: int, size: int) -> None:
+        self._messages = messages
+        self._limit = size
+        self._items: deque[tuple[_T, int]] = deque()
+        self._bytes = 0
+        self.dropped = 0
+        """Items that found no room."""
+
+    def _push(self, items: Iterable[tuple[_T, int]], *, besides: int = 0) -> list[_T]:
+        """Queue items; return those that were dropped. ``besides``: items that count, and wait elsewhere."""
+        for item in items:
+            self._items.append(item)
+            self._bytes += item[1]
+        dropped = []
+        while len(self._items) > 1 and (len(self._items) + besides > self._messages or self._bytes > self._limit):
+            old, size = self._items.popleft()
+            self._bytes -= size
+            dropped.append(old)
+        self.dropped += len(dropped)
+        return dropped
+
+    def take_turn(self, messages: int = _TURN_MESSAGES) -> tuple[list[_T], int]:
+        """Take the oldest items, as many as go in one turn, and their bytes."""
+        turn: list[_T] = []
+        size = 0
+        while self._items and len(turn) < messages and size < _TURN_BYTES:
+            item, each = self._items.popleft()
+            turn.append(item)
+            size += each
+        self._bytes -= size
+        return turn, size
+
+    def _clear(self) -> list[_T]:
+        """Forget what waits, and return it."""
+        items = [item for item, _ in self._items]
+        self._items.clear()
+        self._bytes = 0
+        return items
+
+
+class ArrivalQueue(BoundedQueue[_T]):
     """What arrived for one subscriber, and waits for the event loop.
 
     Args:
@@ -75,54 +123,35 @@ class ArrivalQueue(Generic[_T]):
         size: int,
         discard: Callable[[_T], None] | None = None,
     ) -> None:
+        super().__init__(messages, size)
         self._arrivals = arrivals
         self._deliver = deliver
-        self._messages = messages
-        self._bytes = size
         self._discard = discard
-        self._items: deque[tuple[_T, int]] = deque()
-        """Each with its size."""
-        self._waiting_bytes = 0
         self._scheduled = False
         self._closed = False
-        self.dropped = 0
-        """Items that found no room."""
 
     def add(self, item: _T, size: int = 0) -> None:
         """Queue one item of ``size`` bytes, from any thread."""
         with self._arrivals.lock:
             if self._closed:
                 return
-            self._items.append((item, size))
-            self._waiting_bytes += size
-            while len(self._items) > self._messages or (self._waiting_bytes > self._bytes and len(self._items) > 1):
-                old, old_size = self._items.popleft()
-                self._waiting_bytes -= old_size
-                self.dropped += 1
-                self._arrivals.refused["zenoh.arrival.dropped"] += 1
-                if self._discard is not None:
-                    self._arrivals.discarded.append((self._discard, old))
+            dropped = self._push(((item, size),))
+            if dropped:
+                self._arrivals.refused["zenoh.arrival.dropped"] += len(dropped)
+                self._give_back(dropped)
             if not self._scheduled:
-                self._scheduled = True
-                self._arrivals.schedule(self)
+                self.reschedule()
 
     def close(self) -> None:
         """Forget what waits; nothing is delivered afterwards."""
         with self._arrivals.lock:
             self._closed = True
-            if self._discard is not None:
-                self._arrivals.discarded.extend((self._discard, item) for item, _ in self._items)
-                self._arrivals.wake()
-            self._items.clear()
-            self._waiting_bytes = 0
+            self._give_back(self._clear())
+            self._arrivals.wake()
 
-    def take(self) -> tuple[_T, int] | None:
-        """Take the oldest item, and its size; ``None`` if none waits. The caller has the lock."""
-        if not self._items:
-            return None
-        item = self._items.popleft()
-        self._waiting_bytes -= item[1]
-        return item
+    def _give_back(self, items: list[_T]) -> None:
+        if self._discard is not None:
+            self._arrivals.discarded.extend((self._discard, item) for item in items)
 
     def reschedule(self) -> None:
         """Queue up for another turn if something waits. The caller has the lock."""
@@ -219,7 +248,7 @@ class Arrivals:
                 if not self._ready:
                     break
                 queue = self._ready.popleft()
-                taken, taken_bytes = self._take_turn(queue, min(messages, _TURN_MESSAGES))
+                taken, taken_bytes = queue.take_turn(min(messages, _TURN_MESSAGES))
                 queue.reschedule()
             with CollectedSends():  # one system call for what goes to one peer
                 for item in taken:
@@ -227,18 +256,6 @@ class Arrivals:
             messages -= len(taken)
             size -= taken_bytes
         return _DRAIN_MESSAGES - messages
-
-    @staticmethod
-    def _take_turn(queue: ArrivalQueue[object], messages: int) -> tuple[list[object], int]:
-        taken: list[object] = []
-        taken_bytes = 0
-        while len(taken) < messages and taken_bytes < _TURN_BYTES:
-            entry = queue.take()
-            if entry is None:
-                break
-            taken.append(entry[0])
-            taken_bytes += entry[1]
-        return taken, taken_bytes
 
 
 # Publishers behind bounded queues, and the threads that put their messages to Zenoh.
@@ -252,14 +269,7 @@ class Arrivals:
 # of each publisher are dropped, and counted.
 
 
-class PutHandle(Protocol):
-    """What puts: a publisher of the Zenoh library, once it is declared."""
-
-    def put(self, payload: bytes, *, attachment: bytes | None = None) -> None:
-        """Hand one message to Zenoh."""
-
-
-class QueuedPublisher:
+class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
     """A publisher that queues, with the bounds of its QoS; each message has its own attachment.
 
     Args:
@@ -270,25 +280,22 @@ class QueuedPublisher:
     """
 
     def __init__(self, lane: SendingLane, key: str, qos: ZenohQos, undeclare: Callable[[], None]) -> None:
+        super().__init__(qos.messages, qos.bytes)
         self._lane = lane
         self.key: Final = key
-        self._qos = qos
         self._undeclare = undeclare
-        self.handle: PutHandle | None = None
+        self.handle: Any = None
         """Zenoh's publisher; nothing is sent before it is declared."""
-        self._queue: deque[tuple[bytes, bytes]] = deque()
-        self._queue_bytes = 0
         self._taken = 0
         self._scheduled = False
         self._flush_timer: asyncio.TimerHandle | None = None
         self._closed = False
         self.sent = 0
-        self.dropped = 0
 
     @property
     def waiting(self) -> int:
         """Messages in the queue, with those whose turn it is."""
-        return len(self._queue) + self._taken
+        return len(self._items) + self._taken
 
     def put(self, payload: Buffer, attachment: bytes = b"") -> int:
         """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
@@ -296,20 +303,15 @@ class QueuedPublisher:
 
     def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
         """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
-        size = 0
-        for message in messages:
-            size += len(message[0])
         with self._lane.changed:
             if self._closed:
                 self.dropped += len(messages)
                 return len(messages)
-            self._queue.extend(messages)
-            self._queue_bytes += size
-            dropped = self._make_room()
+            dropped = self._push(((message, len(message[0])) for message in messages), besides=self._taken)
             self._schedule()
-        return dropped
+        return len(dropped)
 
-    def declared(self, handle: PutHandle) -> None:
+    def declared(self, handle: Any) -> None:
         """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
         with self._lane.changed:
             self.handle = handle
@@ -321,21 +323,15 @@ class QueuedPublisher:
             if self._closed:
                 return
             self._closed = True
-            empty = not self._queue and not self._taken
+            empty = not self.waiting
         if empty:
             self._undeclare()
         else:
             self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
 
-    def take_turn(self) -> list[tuple[bytes, bytes]]:
+    def begin_turn(self) -> list[tuple[bytes, bytes]]:
         """Take the messages of one turn. The caller has the lane's lock."""
-        turn: list[tuple[bytes, bytes]] = []
-        size = 0
-        while self._queue and len(turn) < _TURN_MESSAGES and size < _TURN_BYTES:
-            message = self._queue.popleft()
-            turn.append(message)
-            size += len(message[0])
-        self._queue_bytes -= size
+        turn, _ = self.take_turn()
         self._taken = len(turn)
         return turn
 
@@ -354,26 +350,15 @@ class QueuedPublisher:
         """Queue up for another turn, or end. The caller has the lane's lock."""
         self._taken = 0
         self._scheduled = False
-        if self._queue:
+        if self._items:
             self._schedule()
         elif self._closed:
             self._lane.call_loop(self._flushed)
 
     def _schedule(self) -> None:
-        if self._queue and not self._scheduled and self.handle is not None:
+        if self._items and not self._scheduled and self.handle is not None:
             self._scheduled = True
             self._lane.schedule(self)
-
-    def _make_room(self) -> int:
-        dropped = 0
-        while len(self._queue) > 1 and (
-            len(self._queue) + self._taken > self._qos.messages or self._queue_bytes > self._qos.bytes
-        ):
-            old = self._queue.popleft()
-            self._queue_bytes -= len(old[0])
-            dropped += 1
-        self.dropped += dropped
-        return dropped
 
     def _flushed(self) -> None:
         if self._flush_timer is not None:
@@ -383,9 +368,7 @@ class QueuedPublisher:
 
     def _give_up(self) -> None:
         with self._lane.changed:
-            self.dropped += len(self._queue)
-            self._queue.clear()
-            self._queue_bytes = 0
+            self.dropped += len(self._clear())
         self._flushed()
 
 
@@ -452,7 +435,7 @@ class SendingLane:
                 if self._stopped:
                     return
                 publisher = self._ready.popleft()
-                turn = publisher.take_turn()
+                turn = publisher.begin_turn()
             publisher.send(turn)
             now = time.monotonic()
             if now >= window_end:
@@ -462,7 +445,7 @@ class SendingLane:
             with self.changed:
                 publisher.end_turn()
 
-    def put(self, handle: PutHandle | None, key: str, payload: bytes, attachment: bytes) -> bool:
+    def put(self, handle: Any, key: str, payload: bytes, attachment: bytes) -> bool:
         """Put one message; return whether Zenoh took it. Called from the lane's thread."""
         if self._stopped or handle is None:
             return False
