@@ -22,9 +22,10 @@ from rmpa.gateway.neighbour import ZenohReply
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Mapping
 
     from rmpa.config.rules import GatewaySettings
+    from rmpa.gateway.zenoh.threads import Arrivals
     from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds of the line's rate that the kernel's buffer of a connection holds, which counts them twice. In that buffer
@@ -252,40 +253,28 @@ class SocketTuning:
             return 0
         wanted = {found for each in there - self._tuned if (found := _address(each)) is not None}
         self._tuned = there
-        count = sum(self._tune(number, wanted) for number in _sockets()) if wanted else 0
+        try:
+            numbers = [int(entry.name) for entry in _FILES.iterdir()] if wanted else []
+        except OSError:
+            return 0  # no /proc, or no file descriptor is left
+        count = sum(self._tune(number, wanted) for number in numbers)
         _log.debug("= %d of Zenoh's sockets hold at most %d bytes unsent", count, self._unsent)
         return count
 
     def _tune(self, number: int, wanted: Collection[tuple[str, int]]) -> bool:
         try:
-            found = socket.socket(fileno=os.dup(number))
-        except OSError:
-            return False  # closed meanwhile
-        with found:
-            try:
+            if not stat.S_ISSOCK(os.fstat(number).st_mode):
+                return False
+            with socket.socket(fileno=os.dup(number)) as found:
                 if found.family not in (socket.AF_INET, socket.AF_INET6) or found.type != socket.SOCK_STREAM:
                     return False
                 address, port = found.getpeername()[:2]
                 if (address.removeprefix("::ffff:"), port) not in wanted:
                     return False
                 found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, self._unsent)
-            except OSError:
-                return False  # not connected, or no TCP
-        return True
-
-
-def _sockets() -> Iterator[int]:
-    """The numbers of this process's open sockets."""
-    try:
-        names = [entry.name for entry in _FILES.iterdir()]
-    except OSError:
-        return  # no /proc, or no file descriptor is left
-    for name in names:
-        try:
-            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                yield int(name)
         except OSError:
-            continue
+            return False  # closed meanwhile, not connected, or no TCP
+        return True
 
 
 def _address(endpoint: str) -> tuple[str, int] | None:
@@ -360,49 +349,19 @@ def content(data: Any) -> bytes:
     return b"" if data is None else bytes(data.to_bytes())
 
 
-class AnswerBudget:
-    """What waits in memory for Zenoh to take it: a client that does not read its answers holds them all up.
-
-    Args:
-        refuse: Counts an answer that found no room, by its reason; called from any thread.
-    """
-
-    def __init__(self, refuse: Callable[[str], None]) -> None:
-        self._refuse = refuse
-        self._lock = threading.Lock()
-        self._answers = self._bytes = 0
-
-    def take(self, size: int) -> bool:
-        """Reserve room for an answer of ``size`` bytes; one alone always has it."""
-        with self._lock:
-            full = self._answers >= limits.ANSWERS_WAITING_MAX or self._bytes + size > limits.ANSWER_BYTES_MAX
-            if not (self._answers and full):
-                self._answers += 1
-                self._bytes += size
-                return True
-        self._refuse("zenoh.answer.limit")
-        return False
-
-    def free(self, size: int) -> None:
-        """Give the room back, once Zenoh has the answer."""
-        with self._lock:
-            self._answers -= 1
-            self._bytes -= size
-
-
 class ArrivedQuery:
     """A query that has come, and whose answers go out by a thread.
 
     Args:
         query: Zenoh's query.
         worker: The thread that answers.
-        budget: Room for the answers that wait.
+        arrivals: Has room for the answers that wait.
     """
 
-    def __init__(self, query: Any, worker: SerialWorker, budget: AnswerBudget) -> None:
+    def __init__(self, query: Any, worker: SerialWorker, arrivals: Arrivals) -> None:
         self._query: Any = query
         self._worker = worker
-        self._budget = budget
+        self._arrivals = arrivals
         self.key = str(query.key_expr)
         self.parameters = str(query.parameters)
         self.payload = content(query.payload)
@@ -413,7 +372,7 @@ class ArrivedQuery:
         query = self._query
         if query is None:
             return
-        if not self._budget.take(len(payload)):
+        if not self._arrivals.take_room(len(payload)):
             self.reply_error(_BUSY)
             return
         body = payload if isinstance(payload, bytes) else bytes(payload)
@@ -423,7 +382,7 @@ class ArrivedQuery:
         try:
             query.reply(key, body, attachment=attachment or None)
         finally:
-            self._budget.free(len(body))
+            self._arrivals.free_room(len(body))
 
     def reply_error(self, text: str) -> None:
         """Answer with an error, and finish."""
@@ -444,38 +403,27 @@ class PendingGet:
 
     Args:
         done: Resolved in the event loop with all answers, as soon as there are too many.
-        call_loop: Calls a function in the event loop, from any thread.
-        refuse: Counts an answer that is dropped, by its reason; called from any thread.
+        arrivals: Counts answers that are dropped, and calls functions in the event loop.
     """
 
-    def __init__(
-        self,
-        done: asyncio.Future[list[ZenohReply]],
-        call_loop: Callable[[Callable[[], None]], None],
-        refuse: Callable[[str], None],
-    ) -> None:
+    def __init__(self, done: asyncio.Future[list[ZenohReply]], arrivals: Arrivals) -> None:
         self._done = done
-        self._call_loop = call_loop
-        self._refuse = refuse
+        self._arrivals = arrivals
         self._lock = threading.Lock()
         self._replies: list[ZenohReply] = []
         self._bytes = 0
-        self._full = False
-
-    @property
-    def unfinished(self) -> bool:
+        self.unfinished = False
         """Whether it was resolved because there were too many answers, and more may come."""
-        return self._full
 
     def add(self, reply: Any) -> None:
         """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""
-        if self._full:
-            self._refuse("zenoh.reply.limit")
+        if self.unfinished:
+            self._arrivals.refuse("zenoh.reply.limit")
             return
         sample = reply.ok
         if sample is not None:
             if sample.attachment is not None and len(sample.attachment) > limits.ATTACHMENT_MAX:
-                self._refuse("zenoh.attachment.long")
+                self._arrivals.refuse("zenoh.attachment.long")
                 return
             answer = ZenohReply(str(sample.key_expr), content(sample.payload), content(sample.attachment), ok=True)
         elif reply.replier_id is None or not reply.replier_id.eid:
@@ -484,19 +432,19 @@ class PendingGet:
             answer = ZenohReply("", content(reply.err.payload), b"", ok=False)
         size = len(answer.payload) + len(answer.attachment) + len(answer.key)
         with self._lock:
-            self._full = bool(self._replies) and (
+            self.unfinished = bool(self._replies) and (
                 len(self._replies) >= limits.REPLIES_MAX or self._bytes + size > limits.REPLY_BYTES_MAX
             )
-            if not self._full:
+            if not self.unfinished:
                 self._bytes += size
                 self._replies.append(answer)
                 return
-        self._refuse("zenoh.reply.limit")
+        self._arrivals.refuse("zenoh.reply.limit")
         self.finish()
 
     def finish(self) -> None:
         """Resolve with what has come; called from any thread, and again without effect."""
-        self._call_loop(self._settle)
+        self._arrivals.call(self._settle)
 
     def collected(self) -> list[ZenohReply]:
         """The answers up to now."""

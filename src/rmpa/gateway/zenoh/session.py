@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
 from rmpa.gateway.neighbour import ZenohPriority, ZenohSample
-from rmpa.gateway.zenoh.config import AnswerBudget, ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
+from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, keep_thread_state
 from rmpa.runtime.accept import in_thread
 
@@ -114,7 +114,6 @@ class OpenSession:
         self._loop = loop
         self.zid = str(session.zid())
         self._arrivals = Arrivals(loop)
-        self._budget = AnswerBudget(self._arrivals.refuse)
         self._declarations = SerialWorker("zenoh declarations")
         self._queries = SerialWorker("zenoh queries")
         self._lanes: dict[ZenohPriority, SendingLane] = {}
@@ -261,7 +260,7 @@ class OpenSession:
             ):
                 query.drop()
                 return
-            arrival = ArrivedQuery(query, self._queries, self._budget)
+            arrival = ArrivedQuery(query, self._queries, self._arrivals)
             queue.add(arrival, len(arrival.payload))
 
         def declare() -> list[Any]:
@@ -283,7 +282,7 @@ class OpenSession:
         zenoh = self._zenoh
         self._check(selector.partition("?")[0])
         done: asyncio.Future[list[ZenohReply]] = self._loop.create_future()
-        pending = PendingGet(done, self._call_loop, self._arrivals.refuse)
+        pending = PendingGet(done, self._arrivals)
         cancellation = zenoh.CancellationToken()
         body = payload if isinstance(payload, bytes) else bytes(payload)
 
@@ -383,10 +382,6 @@ class OpenSession:
             return True
         self._arrivals.refuse("zenoh.key.long")
         return False
-
-    def _call_loop(self, function: Callable[[], None]) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop was closed before the session
-            self._loop.call_soon_threadsafe(function)
 
     def _check(self, key: str) -> None:
         """Refuse a key that Zenoh would refuse later, in another thread."""

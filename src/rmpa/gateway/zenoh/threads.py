@@ -11,6 +11,7 @@ one, which costs 20 µs. So above ``_BUSY_MESSAGES`` in a period the loop is not
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import threading
@@ -190,6 +191,33 @@ class Arrivals:
         self._closed = False
         self._window_end = 0.0
         self._in_window = 0
+        self._answers = self._answer_bytes = 0
+        """What waits in memory for Zenoh to take it; guarded by ``lock``."""
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Call a function in the loop, from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop was closed before the session
+            self._loop.call_soon_threadsafe(function)
+
+    def take_room(self, size: int) -> bool:
+        """Reserve room for an answer of ``size`` bytes; one alone always has it.
+
+        A client that does not read its answers holds them all up.
+        """
+        with self.lock:
+            full = self._answers >= limits.ANSWERS_WAITING_MAX or self._answer_bytes + size > limits.ANSWER_BYTES_MAX
+            if self._answers and full:
+                self.refused["zenoh.answer.limit"] += 1
+                return False
+            self._answers += 1
+            self._answer_bytes += size
+        return True
+
+    def free_room(self, size: int) -> None:
+        """Give the room back, once Zenoh has the answer."""
+        with self.lock:
+            self._answers -= 1
+            self._answer_bytes -= size
 
     def refuse(self, reason: str) -> None:
         """Count something that was refused, from any thread."""
