@@ -2,12 +2,11 @@
 
 *Flat out*, the publisher sends as fast as roscpp takes it, and what is too much is dropped where it first does not
 fit: mostly in the publisher's own queue. What arrived is the figure; the share of what was sent that did not arrive
-stands beside it. *Without loss* is the highest rate of which practically all arrives.
+stands beside it.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import statistics
 import time
@@ -45,8 +44,6 @@ _DIRECT_LIMIT: Final = 0.95
 """What the direct transport is to reach of roscpp over the same cable."""
 _TOPIC: Final = "/flood"
 _CORES: Final = 2
-_LOSSLESS: Final = 0.001
-"""The share that may be lost for a rate to count as carried."""
 _SETTLE: Final = 1.0
 """Seconds from the first message to the begin of a window, usually: queues are as full as they get."""
 _FIRST_DEADLINE: Final = 30.0
@@ -61,16 +58,14 @@ class ThroughputPlan:
     Args:
         seconds: Of each window.
         rounds: Windows flat out, of each way in turn.
-        bisections: Steps of the search for the rate without loss.
     """
 
     seconds: float
     rounds: int
-    bisections: int
 
 
-FULL: Final = ThroughputPlan(5.0, 3, 6)
-QUICK: Final = ThroughputPlan(2.0, 1, 3)
+FULL: Final = ThroughputPlan(5.0, 3)
+QUICK: Final = ThroughputPlan(2.0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,26 +168,6 @@ class FloodWay:
             dropped=dropped,
         )
 
-    def lossless(self, bytes_each: int, seconds: float, between: tuple[float, float], steps: int) -> float | None:
-        """The highest rate found of which practically all arrives; ``None`` if no rate that was tried did.
-
-        Args:
-            bytes_each: Of a message.
-            seconds: Of each try.
-            between: Messages a second: where to look.
-            steps: Tries; each halves the range, in octaves.
-        """
-        low, high = between
-        best = None
-        for _ in range(steps):
-            rate = math.sqrt(low * high)
-            window = self.window(bytes_each, seconds, rate)
-            if window.lost <= _LOSSLESS:
-                low, best = rate, max(best or 0.0, window.received)
-            else:
-                high = rate
-        return best
-
 
 def _busy() -> float:
     """Seconds so far in which the cores that we may use were busy, with whatever it was."""
@@ -243,11 +218,9 @@ class ThroughputScore:
 
     Args:
         windows: Flat out, one a round.
-        lossless: Messages a second without loss; ``None`` if no rate that was tried had none.
     """
 
     windows: list[Window] = field(default_factory=list)
-    lossless: float | None = None
 
     @property
     def received(self) -> float:
@@ -274,13 +247,6 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
                 for key, (_, start) in WAYS.items():
                     with Bed() as bed:
                         scores[key, bytes_each].windows.append(start(bed).window(bytes_each, plan.seconds))
-        console.print("the rates without loss", style="dim")
-        for (key, bytes_each), score in scores.items():
-            with Bed() as bed:
-                # Flat out the processes take the cores from each other: without loss it may be more, or much less.
-                between = (score.received / 8, 1.5 * scores["direct", bytes_each].received)
-                way = WAYS[key][1](bed)
-                score.lossless = way.lossless(bytes_each, min(2.0, plan.seconds), between, plan.bisections)
     for bytes_each in _LIMITS:
         console.print(_table(bytes_each, scores))
         middles = [(title, scores[key, bytes_each].middle) for key, (title, _) in WAYS.items()]
@@ -344,16 +310,14 @@ def _row(key: str, bytes_each: int, scores: Scores) -> dict[str, object]:
         "sent_per_s": middle.sent,
         "lost_share": middle.lost,
         "agents_dropped": middle.dropped,
-        "lossless_per_s": score.lossless,
         "to_direct": ratio(score.received, base.received),
-        "lossless_to_direct": ratio(score.lossless, base.lossless),
         "processes": {name: usage_row(usage, _messages(middle)) for name, usage in middle.usage.items()},
         "others_cpu_percent": middle.others,
     }
 
 
 def _table(bytes_each: int, scores: Scores) -> Table:
-    heads = ["messages/s", "to direct", "MB/s", "sent/s", "lost, %", "without loss/s", "to direct"]
+    heads = ["messages/s", "to direct", "MB/s", "sent/s", "lost, %"]
     heads += ["agents dropped", "others' CPU, %"]
     table = table_of(f"{size(bytes_each)}: counted at the far node", ("way",), heads)
     base = scores["direct", bytes_each]
@@ -362,10 +326,6 @@ def _table(bytes_each: int, scores: Scores) -> Table:
         middle = score.middle
         cells = [f"{score.received:.0f}", dash(ratio(score.received, base.received))]
         cells += [f"{score.received * bytes_each / 1e6:.1f}", f"{middle.sent:.0f}", f"{100 * middle.lost:.1f}"]
-        cells += [
-            "-" if score.lossless is None else f"{score.lossless:.0f}",
-            dash(ratio(score.lossless, base.lossless)),
-        ]
         dropped = "-" if not middle.dropped else " + ".join(str(count) for count in middle.dropped.values())
         table.add_row(title, *cells, dropped, f"{middle.others:.0f}")
     return table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.bench.throughput import Count, FloodWay, ThroughputScore, Window, lost_between, rate_of
+from lab.bench.throughput import Count, ThroughputScore, Window, lost_between, rate_of
 
 
 def window(received: float) -> Window:
@@ -25,14 +25,3 @@ def test_the_figures_are_those_of_the_median_round() -> None:
     score = ThroughputScore([window(30.0), window(10.0), window(20.0)])
     assert score.received == 20.0
     assert score.middle.received == 20.0
-
-
-@pytest.mark.parametrize("carried", [150.0, 900.0, 1_900.0])
-def test_the_rate_without_loss_is_found_between_the_bounds(carried: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    def tried(_way: FloodWay, _bytes: int, _seconds: float, rate: float) -> Window:
-        return Window(min(rate, carried), rate, max(0.0, 1 - carried / rate), {}, 0.0)
-
-    monkeypatch.setattr(FloodWay, "window", tried)
-    way = object.__new__(FloodWay)
-    assert way.lossless(64, 1.0, (100.0, 2_000.0), 12) == pytest.approx(carried, rel=0.01)
-    assert way.lossless(64, 1.0, (3_000.0, 9_000.0), 4) is None
