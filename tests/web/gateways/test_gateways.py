@@ -236,6 +236,9 @@ async def test_a_client_that_stops_reading_costs_its_bound_and_no_other_a_messag
             figures = server.gateways.figures()["foxglove"]
             assert (figures.clients, figures.queued, figures.dropped) == (2, *queues[1])
             stuck.socket._response.connection.transport.abort()  # type: ignore[union-attr]
+            await until(lambda: len(server.gateways.connections) == 1)
+            gone = server.gateways.figures()["foxglove"]
+            assert (gone.clients, gone.queued, gone.dropped) == (1, 0, figures.dropped)
 
 
 async def _under_way(server: Server, publisher: Publisher, client: Client, payload: bytes) -> None:

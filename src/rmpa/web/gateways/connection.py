@@ -11,7 +11,6 @@ import contextlib
 import inspect
 import logging
 import socket
-import struct
 from abc import abstractmethod
 from collections import deque
 from functools import partial
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.topics import ReceivedMessage
 
 _log = logging.getLogger(__name__)
-_PING: Final = struct.Struct("!I")
 _UNANSWERED_MAX: Final = 8
 """Pings without an answer, behind which no further one is sent: they wait as the client's frames do."""
 _CONTROL_HEADER: Final = 6
@@ -207,11 +205,11 @@ class CommandAge:
             return None
         self._number = self._number + 1 & 0xFFFFFFFF
         self._sent.append((self._number, now))
-        return _PING.pack(self._number)
+        return self._number.to_bytes(4, "big")
 
     def pong(self, payload: bytes) -> None:
         """A ping is answered, and with it all before it (RFC 6455, section 5.5.3)."""
-        number = _PING.unpack(payload)[0] if len(payload) == _PING.size else None
+        number = int.from_bytes(payload, "big")
         if any(each == number for each, _ in self._sent):
             while self._sent:
                 each, self._younger_than = self._sent.popleft()
@@ -362,7 +360,6 @@ class ClientConnection:
                 for task in tasks:
                     task.cancel()
                 session.hub.disconnect(session)
-                self.queue = FairQueue()
                 if self._out is not None:
                     self._out.close()
                 if tasks:

@@ -352,7 +352,7 @@ def _bound(table: OrderedDict[Any, Any], most: int) -> None:
         table.popitem(last=False)
 
 
-class GraphWatch:
+class GraphWatch(GraphTable):
     """The graph, always the last one that was told or read, and the clients that follow it.
 
     Args:
@@ -363,10 +363,10 @@ class GraphWatch:
 
     # More than 12 fields: three say how the graph comes, and two are for tests and for the monitor's page.
     def __init__(self, link: NodeLink, calls: ServiceCalls, master_back: Callable[[], None]) -> None:
+        super().__init__(calls.found, calls.forget)
         self._link = link
         link.on_registration = self.look
         self._calls = calls
-        self._table = GraphTable(calls.found, calls.forget)
         self._master_back = master_back
         self._followers: dict[Follower, Callable[[], None]] = {}
         self._task: asyncio.Task[None] | None = None
@@ -382,21 +382,6 @@ class GraphWatch:
         """Whether ``take`` has given the graph, and tells its changes: then the master is not asked for it."""
         self.reads = 0
         """How often it was read from the master."""
-
-    @property
-    def topics(self) -> Mapping[str, GraphTopic]:
-        """By name, in order of names."""
-        return self._table.topics
-
-    @property
-    def services(self) -> Mapping[str, GraphService]:
-        """By name, in order of names."""
-        return self._table.services
-
-    @property
-    def nodes(self) -> Sequence[str]:
-        """In order of names."""
-        return self._table.nodes
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -420,7 +405,7 @@ class GraphWatch:
     def take(self, rows: GraphRows) -> None:
         """Take all rows of the agent, or those that have changed since."""
         self.taken = self.told = True
-        if self._table.update(rows) or not self.loaded.is_set():
+        if self.update(rows) or not self.loaded.is_set():
             self._tell()
 
     def lose(self) -> None:
@@ -438,10 +423,12 @@ class GraphWatch:
             changed()
         return follower
 
-    def saw_type(self, topic: str, type_: str) -> None:
-        """A publisher of a topic has this type; the master knows one only."""
-        if self._table.saw_type(topic, type_):
+    def saw_type(self, topic: str, type_: str) -> bool:
+        """A publisher of a topic has this type; the master knows one only. Returns whether the graph differs now."""
+        differs = super().saw_type(topic, type_)
+        if differs:
             self._tell()
+        return differs
 
     async def find(self, service: str) -> str:
         """The type of a service that the graph does not say; the graph has it then.
@@ -452,7 +439,7 @@ class GraphWatch:
         type_, _ = await self._calls.find(service)
         known = self.services.get(service)
         if known is not None and known.type != type_:
-            self._found()
+            self._found_types()
         return type_
 
     async def find_all(self) -> None:
@@ -465,12 +452,12 @@ class GraphWatch:
             for search in pending:
                 search.cancel()
             await asyncio.gather(*searches, return_exceptions=True)
-            self._found()
+            self._found_types()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _found(self) -> None:
-        self._table.found_services()
+    def _found_types(self) -> None:
+        self.found_services()
         self._tell()
 
     async def _run(self) -> None:
@@ -523,7 +510,7 @@ class GraphWatch:
         if self.taken:
             return False  # what was told meanwhile is newer
         self._documents = documents
-        return self._table.update(rows)
+        return self.update(rows)
 
     def _tell(self) -> None:
         self.loaded.set()

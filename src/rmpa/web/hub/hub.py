@@ -81,15 +81,13 @@ class Hub:
             self.link.start()
             self.graph.start()
 
-    async def settled(self, timeout: float) -> bool:  # noqa: ASYNC109 - of a first client, who goes on without it
+    async def settled(self, timeout: float) -> None:  # noqa: ASYNC109 - of a first client, who goes on without it
         """Start, and wait until the graph and the parameters are known, at most ``timeout`` seconds."""
         self.start()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await self.graph.loaded.wait()
                 await self.params.loaded.wait()
-                return True
-        return False
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

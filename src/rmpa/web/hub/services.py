@@ -95,21 +95,14 @@ def _find(package: str, path: str, most: int, environ: Mapping[str, str]) -> byt
         if not file.is_relative_to(root):
             raise RmpaError(f"{path[:200]} is outside of its package {package[:200]}")
         if file.is_file():
-            return _read(file, most)
+            with file.open("rb") as stream:
+                data = stream.read(most + 1)
+            if len(data) > most:
+                raise LimitExceeded(f"asset {file.name}", file.stat().st_size, most)
+            return data
     if found:
         raise RmpaError(f"package {package} has no file {path[:200]}")
     raise RmpaError(f"package {package[:200]} is not found; source its workspace where rmpa web starts")
-
-
-def _read(file: Path, most: int) -> bytes:
-    try:
-        with file.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if size > most:
-                raise LimitExceeded(f"asset {file.name}", size, most)
-            return stream.read(most)
-    except OSError as error:
-        raise RmpaError(f"{file.name} cannot be read: {error.strerror}") from error
 
 
 def _folders(package: str, environ: Mapping[str, str]) -> Iterator[Path]:

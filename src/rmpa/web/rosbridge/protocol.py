@@ -303,12 +303,8 @@ def _cbor_raw_head(topic: str) -> bytes:
 
 
 def _cbor_length(major: int, length: int) -> bytes:
-    if length < 24:
-        return bytes((major | length,))
-    for code, kind, bound in ((24, ">BB", 1 << 8), (25, ">BH", 1 << 16), (26, ">BI", 1 << 32)):
-        if length < bound:
-            return struct.pack(kind, major | code, length)
-    return struct.pack(">BQ", major | 27, length)
+    encoded = cbor2.dumps(length)
+    return bytes((major | encoded[0],)) + encoded[1:]
 
 
 # --- PNG -------------------------------------------------------------------------------------------------------
