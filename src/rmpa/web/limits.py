@@ -189,25 +189,15 @@ WEB_RESPONSE_TIMEOUT: Final = 30.0
 """Seconds from a request to the end of its response; a client that does not read is disconnected then."""
 WEB_IDLE_TIMEOUT: Final = 75.0
 """Seconds that a connection is kept without a request; Prometheus asks every 15 to 60 s."""
-WEB_LINGER: Final = 1.0
-"""Seconds in which the rest of a refused body is read, so that the client sees the refusal and no reset."""
-WEB_BACKLOG: Final = 128
-"""Connections that wait to be accepted."""
-WEB_SHUTDOWN_TIMEOUT: Final = 2.0
-"""Seconds for responses under way when the server ends."""
 WEB_TOPICS: Final = 2000
 """Topics and services beyond which those that nothing uses are left out of the snapshots that the server reads again
 and again: the monitor and /metrics show no more of them, and each takes the agent 0.03 ms."""
 WEB_WHOLE_AGE: Final = 2.0
 """Seconds that a snapshot of which nothing is left out is shared; the API alone asks for it."""
-WEB_WHOLE_TIMEOUT: Final = 8.0
-"""Seconds for the agent to answer with all of a large graph, which takes it a second of processor time."""
 WEB_SNAPSHOT_AGE: Final = 0.1
 """Seconds that a snapshot is shared before the agent is asked again: less than the monitor's pause between two."""
 WEB_AGENT_TIMEOUT: Final = 2.0
 """Seconds for the agent to answer; it takes milliseconds, and Prometheus waits for 10 s."""
-WEB_TOKEN_BYTES: Final = 32
-"""Random bytes of a token that is made: 256 bits cannot be guessed."""
 WEB_TOKEN_LENGTH_MIN: Final = 16
 """Characters of a token that the user chose."""
 WEB_TOKEN_FILE_MAX: Final = 4096
@@ -243,8 +233,6 @@ WATCH_RATE_MAX: Final = 10.0
 """Values, images and scans a second of one watch."""
 FIELDS_MAX: Final = 8
 """Numeric fields of one plot: as many lines as can be told apart."""
-FIELD_CHARACTERS: Final = 256
-"""Characters of a field's path, as ``pose.pose.position.x``."""
 ASKS_MAX: Final = 16
 """Questions of one client (why, calls, parameters) that wait for their answer."""
 POINTS_MAX: Final = 64
@@ -265,12 +253,8 @@ SERVICES_SHOWN: Final = 2000
 """Services in a state; further ones are counted."""
 NODES_SHOWN: Final = 2000
 """Nodes in a state; further ones are counted."""
-PARAMETER_NAMES_SHOWN: Final = 5000
-"""Names of parameters that a search is given."""
 MODULES_SHOWN: Final = 256
 """Modules in a state; further ones are counted. A ring of more could not be read."""
-FLOW_TOPICS: Final = 8
-"""Topics that a flow names; the busiest first."""
 LOG_LINES: Final = 500
 """Lines of the log that are kept for a page that opens it."""
 LOG_CHARACTERS: Final = 1024
@@ -285,8 +269,6 @@ AGENT_SETTLES: Final = 10.0
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""
 FORGET_AFTER: Final = 600.0
 """Time for which a module that has left the roster is still shown."""
-RATE_SMOOTHING: Final = 1.0
-"""Time constant of a link's byte rates."""
 ORDER_AGE: Final = 5.0
 """Seconds that an order of a page may be old: less than the page waits for a word before it gives all up."""
 DRIVE_TIMEOUT: Final = 0.3
@@ -305,10 +287,6 @@ UNSENT_RETRY: Final = 0.1
 """Pause before it is looked again whether a page has taken what was sent."""
 ANSWERS_AT_ONCE: Final = 4
 """Questions of all pages together that wait for the agent, each in a thread: `why` takes seconds."""
-VALUES_BYTES: Final = 4 * MIB
-"""Bytes of the messages whose decoded values are kept for further pages; values take some ten times as much."""
-DECISION_DEPTH: Final = 32
-"""Objects and arrays within each other in what a Smart Resource says of its decision; a deeper one is not shown."""
 STATE_PAUSE_MAX: Final = 0.5
 """The longest pause between two snapshots."""
 

@@ -71,7 +71,7 @@ def field_path(text: str) -> tuple[str, ...]:
         RemoteProtocolError: It is no path.
     """
     path = tuple(_INDEX.sub(r".\1", text).split("."))
-    if not text or len(text) > limits.FIELD_CHARACTERS or not all(path):
+    if not text or len(text) > 256 or not all(path):
         raise RemoteProtocolError(f"not a field's path: {text[:80]!a}")
     return path
 

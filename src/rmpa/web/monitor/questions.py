@@ -169,7 +169,7 @@ class Answers:
     @question("param_names", needs="view")
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
-        names = islice(self._hub.params.values((), "/"), limits.PARAMETER_NAMES_SHOWN)
+        names = islice(self._hub.params.values((), "/"), 5000)
         return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
     @question("set_param", needs="control")

@@ -12,7 +12,7 @@ import msgspec
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
-from rmpa.core.limits import KIB
+from rmpa.core.limits import KIB, MIB
 from rmpa.resource.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.descriptor import Descriptor
 from rmpa.resource.loop import LEVEL_FOR
@@ -25,7 +25,6 @@ from rmpa.web.monitor.messages import Tree, without_nulls
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from rmpa.web.hub.graph import GraphTopic
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, Payload
     from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
@@ -140,6 +139,8 @@ def resource_flows(facts: Sequence[ResourceFacts], own: str) -> dict[str, Tree]:
     return {key: flow for key, flow in found.items() if own not in key.split(">")}
 
 
+_KEPT: Final = 4 * MIB
+"""Bytes of the messages whose values are kept for further pages; values take some ten times as much."""
 _OVERHEAD: Final = 64 * KIB
 """Bytes that an entry counts beside its payload, so that small messages do not gather."""
 
@@ -167,7 +168,7 @@ class MessageValues:
             codec = codec_for(self._hub.types.version(message.type, message.md5sum))
             known = message.payload, codec.json_values(message.payload)
         last[key] = known
-        while sum(len(payload) + _OVERHEAD for payload, _ in last.values()) > limits.VALUES_BYTES:
+        while sum(len(payload) + _OVERHEAD for payload, _ in last.values()) > _KEPT:
             del last[next(iter(last))]
         return known[1]
 
@@ -186,18 +187,28 @@ _TOPICS: Final = {
     "parameter_updates": (CONFIG_TYPE, _LOOKED_AT),
 }
 """The topics below each resource, with their types."""
-_BAD: Final = frozenset({"WARN", "ERROR", "STALE"})
 
 
 @dataclass(slots=True, eq=False)
 class _Path:
-    """The subscriptions below one path; several modules may have a resource of that path."""
+    """What is followed below one path; several modules may have a resource of that path, by their names."""
 
+    name: str
     subscriptions: dict[str, ClientSubscription | None] = field(default_factory=dict)
     """By the last part of the topic's name; ``None``: the rules deny it."""
     publishers: frozenset[str] = frozenset()
     """The nodes that publish the descriptor."""
+    heard: dict[str | None, ResourceFacts] = field(default_factory=dict)
+    """Those included whose descriptor has not come yet."""
+    since: dict[str | None, float] = field(default_factory=dict)
+    """Since when each resource has its level: as it says itself, or else since it was heard with it."""
     looked: float = -1e9
+
+    def unsubscribe(self, topics: Iterable[str]) -> None:
+        """End some subscriptions."""
+        for topic in [*topics]:
+            if (subscription := self.subscriptions.pop(topic)) is not None:
+                subscription.close()
 
 
 class ResourceWatch:
@@ -224,14 +235,12 @@ class ResourceWatch:
         self._follower: Follower | None = None
         self._paths: dict[str, _Path] = {}
         self._wanted = False
-        self._since: dict[str, tuple[str, float]] = {}
-        self._heard: dict[str, ResourceFacts] = {}
-        """By key, those included whose descriptor has not come yet."""
 
     @property
     def facts(self) -> dict[str, ResourceFacts]:
         """The resources, by ``ResourceFacts.key``."""
-        return {key: facts for key, facts in self._heard.items() if facts.descriptor}
+        heard = (facts for path in self._paths.values() for facts in path.heard.values())
+        return {facts.key: facts for facts in heard if facts.descriptor}
 
     def start(self) -> None:
         """Begin to follow the graph."""
@@ -241,14 +250,16 @@ class ResourceWatch:
         """End all subscriptions."""
         if self._follower is not None:
             self._follower.close()
-        for path in [*self._paths]:
-            self._forget(path)
+        for path in self._paths.values():
+            path.unsubscribe(path.subscriptions)
+        self._paths.clear()
 
     def show_all(self, *, wanted: bool) -> None:
         """Whether the state of each resource is shown anywhere."""
         if wanted != self._wanted:
             self._wanted = wanted
-            self._follow_all()
+            for path in self._paths.values():
+                self._follow(path)
 
     def look(self, key: str) -> None:
         """A page shows this resource: follow all that it says, for ``limits.LOOK_KEPT`` from now on."""
@@ -256,32 +267,23 @@ class ResourceWatch:
         path = self._paths.get(facts.name) if facts is not None else None
         if path is not None and facts is not None:
             path.looked = self._clock()
-            self._follow(facts.name, path)
+            self._follow(path)
 
     def alarms(self) -> list[Tree]:
         """The alarms that stand, for the state."""
-        standing: list[Tree] = []
-        for key, facts in self.facts.items():
-            level = facts.level
-            since = self._stands_since(key, facts)
-            if level in _BAD:
-                standing.append({
-                    "id": key,
-                    "module": facts.peer or "",
-                    "resource": key,
-                    "level": level,
-                    "text": str((facts.health or {}).get("message", "")),
-                    "at": round(since, 1),
-                })  # fmt: skip
-        return standing
-
-    def _stands_since(self, key: str, facts: ResourceFacts) -> float:
-        """Since when a resource has its level: as it says itself, or else since it was heard with it."""
-        before = self._since.get(key)
-        if before is None or before[0] != facts.level:
-            lasted = facts.quality(LEVEL_FOR) or 0.0
-            before = self._since[key] = facts.level, self._now() - max(0.0, lasted)
-        return before[1]
+        return [
+            {
+                "id": facts.key,
+                "module": facts.peer or "",
+                "resource": facts.key,
+                "level": facts.level,
+                "text": str((facts.health or {}).get("message", "")),
+                "at": round(path.since[peer], 1),
+            }
+            for path in self._paths.values()
+            for peer, facts in path.heard.items()
+            if facts.descriptor and facts.level in ("WARN", "ERROR", "STALE")
+        ]
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -292,67 +294,43 @@ class ResourceWatch:
             for name, topic in self._hub.graph.topics.items()
             if name.endswith(ending) and topic.publishers and _TEXT in topic.types
         }
-        for path in self._paths.keys() - present.keys():
-            self._forget(path)
-        for path, topic in present.items():
-            if path not in self._paths and len(self._paths) < limits.RESOURCES_MAX:
-                self._paths[path] = _Path()
-            self._keep_publishers(path, topic)
-        self._follow_all()
+        for name in self._paths.keys() - present.keys():
+            gone = self._paths.pop(name)
+            gone.unsubscribe(gone.subscriptions)
+        for name, topic in present.items():
+            if name in self._paths or len(self._paths) < limits.RESOURCES_MAX:
+                path = self._paths.setdefault(name, _Path(name))
+                publishers = frozenset(topic.publishers)
+                if path.publishers and publishers - path.publishers:
+                    # A source that is back sends the same latched messages, which a subscription has had: begin anew.
+                    path.unsubscribe(path.subscriptions)
+                path.publishers = publishers
+                peers = {proxied_peer(node) for node in publishers}
+                path.heard = {peer: facts for peer, facts in path.heard.items() if peer in peers}
+                self._follow(path)
 
-    def _keep_publishers(self, path: str, topic: GraphTopic) -> None:
-        there, publishers = self._paths.get(path), frozenset(topic.publishers)
-        if there is None or there.publishers == publishers:
-            return
-        if there.publishers and publishers - there.publishers:
-            # A source that is back sends the same latched messages, which a subscription has had: begin anew.
-            _unsubscribe(there)
-        there.publishers = publishers
-        peers = {proxied_peer(node) for node in publishers}
-        for key, facts in [*self._heard.items()]:
-            if facts.name == path and facts.peer not in peers:
-                del self._heard[key]
-                self._since.pop(key, None)
-
-    def _follow_all(self) -> None:
-        for name, path in self._paths.items():
-            self._follow(name, path)
-
-    def _follow(self, name: str, path: _Path) -> None:
+    def _follow(self, path: _Path) -> None:
         looked = self._clock() - path.looked < limits.LOOK_KEPT
         most = (_LOOKED_AT if looked else _SHOWN) if self._wanted else _ALWAYS
         wanted = {topic: type_ for topic, (type_, when) in _TOPICS.items() if when <= most}
-        _unsubscribe(path, path.subscriptions.keys() - wanted.keys())
+        path.unsubscribe(path.subscriptions.keys() - wanted.keys())
         for topic in wanted.keys() - path.subscriptions.keys():
             path.subscriptions[topic] = None
-            take = functools.partial(self._take, name, topic)
+            take = functools.partial(self._take, path, topic)
             with contextlib.suppress(RmpaError):
-                path.subscriptions[topic] = self._hub.topics.subscribe(f"{name}/{topic}", wanted[topic], take)
+                path.subscriptions[topic] = self._hub.topics.subscribe(f"{path.name}/{topic}", wanted[topic], take)
 
-    def _forget(self, name: str) -> None:
-        _unsubscribe(self._paths.pop(name))
-        for key in [key for key, facts in self._heard.items() if facts.name == name]:
-            del self._heard[key]
-            self._since.pop(key, None)
-
-    def _take(self, name: str, topic: str, message: ReceivedMessage) -> None:
+    def _take(self, path: _Path, topic: str, message: ReceivedMessage) -> None:
         peer = proxied_peer(message.source)
-        key = f"{peer}:{name}" if peer else name
+        before = path.heard.get(peer) or ResourceFacts(name=path.name, peer=peer)
         try:
-            values = self._values.of(message)
-            facts = self._heard.get(key) or ResourceFacts(name=name, peer=peer)
-            if topic == DESCRIPTOR:
-                self._heard[key] = msgspec.structs.replace(facts, **_described(values["data"]))
-            else:  # latched ones may come before the descriptor
-                self._heard[key] = msgspec.structs.replace(facts, **_said(facts, topic, values))
+            values = self._values.of(message)  # latched ones may come before the descriptor
+            said = _described(values["data"]) if topic == DESCRIPTOR else _said(before, topic, values)
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name
-
-
-def _unsubscribe(path: _Path, topics: Iterable[str] | None = None) -> None:
-    for topic in [*(path.subscriptions if topics is None else topics)]:
-        if (subscription := path.subscriptions.pop(topic)) is not None:
-            subscription.close()
+        path.heard[peer] = after = msgspec.structs.replace(before, **said)
+        if after.level != before.level:
+            path.since[peer] = self._now() - max(0.0, after.quality(LEVEL_FOR) or 0.0)
 
 
 def _described(text: str) -> dict[str, Any]:
@@ -370,7 +348,7 @@ def _said(facts: ResourceFacts, topic: str, values: Any) -> dict[str, Any]:
         return {topic: str(values["data"])}
     if topic == "decision":
         decision = msgspec.json.decode(values["data"] or "{}")
-        is_shown = isinstance(decision, dict) and _depth(decision, limits.DECISION_DEPTH) <= limits.DECISION_DEPTH
+        is_shown = isinstance(decision, dict) and _depth(decision, 32) <= 32
         return {"decision": decision if is_shown else facts.decision}
     if topic == "responses":
         return {"clients": tuple(map(_status, values["status"]))}

@@ -206,7 +206,7 @@ class StateBuilder:
             rates = []  # another link
         elif span > 0:
             fresh = [(counts[way] - before[way]) / span for way in (1, 2)]
-            share = 1 - math.exp(-span / limits.RATE_SMOOTHING)
+            share = 1 - math.exp(-span)  # a time constant of 1 s
             rates = [old + share * (new - old) for old, new in zip(rates or fresh, fresh, strict=True)]
         self._links[name] = counts, rates
         return rates
@@ -225,7 +225,7 @@ class StateBuilder:
             key: {
                 "rate": -sum(rate for rate, _, _ in busiest),
                 "bandwidth": sum(bandwidth for _, bandwidth, _ in busiest),
-                "topics": [*sorted([*dict.fromkeys(name for _, _, name in sorted(busiest))][: limits.FLOW_TOPICS])],
+                "topics": [*sorted([*dict.fromkeys(name for _, _, name in sorted(busiest))][:8])],
             }
             for key, busiest in parts.items()
         }

@@ -236,7 +236,7 @@ def token_from(path: Path) -> tuple[str, bool]:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         except FileExistsError:
             return _read(path), False
-        token = secrets.token_urlsafe(limits.WEB_TOKEN_BYTES)
+        token = secrets.token_urlsafe(32)  # 256 bits cannot be guessed
         with os.fdopen(fd, "w", encoding="ascii") as file:
             file.write(f"{token}\n")
     except OSError as error:

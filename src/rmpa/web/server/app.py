@@ -169,12 +169,12 @@ class WebServer:
             access_log_class=self._access_logger(),
             access_log=_AIOHTTP,
             logger=_AIOHTTP,
-            shutdown_timeout=limits.WEB_SHUTDOWN_TIMEOUT,
+            shutdown_timeout=2.0,
             keepalive_timeout=limits.WEB_IDLE_TIMEOUT,
             max_line_size=limits.WEB_LINE_MAX,
             max_field_size=limits.WEB_FIELD_MAX,
             max_headers=limits.WEB_HEADERS_MAX,
-            lingering_time=limits.WEB_LINGER,
+            lingering_time=1.0,  # for the rest of a refused body, so that the client sees the refusal and no reset
         )
         await runner.setup()
         assert runner.server is not None, "setup() makes it"  # noqa: S101 - for the type checker
@@ -185,7 +185,7 @@ class WebServer:
                     self._table.make,
                     host,
                     port,
-                    backlog=limits.WEB_BACKLOG,
+                    backlog=128,
                     reuse_address=True,
                     ssl=self._tls,
                     ssl_handshake_timeout=limits.WEB_REQUEST_TIMEOUT if self._tls is not None else None,
@@ -205,7 +205,7 @@ class WebServer:
         return port
 
     async def close(self) -> None:
-        """End: responses under way have ``limits.WEB_SHUTDOWN_TIMEOUT``, then every connection is closed."""
+        """End: responses under way have 2 s, then every connection is closed."""
         for server in self._servers:
             server.close()
         if self._gateways is not None:
