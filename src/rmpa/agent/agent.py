@@ -218,7 +218,7 @@ class Agent:
             bridge=self.bridge,
             services=self.services,
             twins=twins,
-            endpoint=lambda: self.network.endpoint,
+            endpoint=lambda: (at.identity, at.mesh, at.discovery) if (at := self.network.endpoint) else None,
             counters=counters,
             notes=self._notes,
             realtime=realtime,

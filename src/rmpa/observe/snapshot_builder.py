@@ -10,7 +10,7 @@ import os
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import psutil
@@ -50,14 +50,6 @@ if TYPE_CHECKING:
     from rmpa.trust.permissions import TrustStatus
 
 
-class EndpointView(Protocol):
-    """What the snapshot needs of the agent's place in the network (``agent.network.NetworkEndpoint``)."""
-
-    identity: Identity
-    mesh: Mesh
-    discovery: Discovery
-
-
 @dataclass(frozen=True, slots=True)
 class AgentParts:
     """What an agent is observed by.
@@ -67,7 +59,7 @@ class AgentParts:
         bridge: Its bridge.
         services: The bridge's part for services.
         twins: The bridge's part for peers of this module's kind.
-        endpoint: Its place in the network now; ``None`` while it has none.
+        endpoint: Its identity, mesh and discovery now; ``None`` while it has no place in the network.
         counters: The counters of parts that are not named here.
         notes: What else the user should know, each ready to read.
         realtime: The outcomes of ``--realtime``, ready to read; those that were refused begin with ``no``.
@@ -78,7 +70,7 @@ class AgentParts:
     bridge: Bridge
     services: Services
     twins: TwinWatch
-    endpoint: Callable[[], EndpointView | None]
+    endpoint: Callable[[], tuple[Identity, Mesh, Discovery] | None]
     counters: Counters
     notes: Callable[[], Iterable[str]]
     realtime: tuple[str, ...]
@@ -136,8 +128,9 @@ class SnapshotBuilder:
         several = [parts.bridge.counters, parts.core.counters, DESCRIPTORS.counters, parts.counters]
         notes: list[str] = []
         if endpoint is not None:
-            several += [endpoint.mesh.counters, endpoint.discovery.counters]
-            notes += [*endpoint.discovery.notes(), *endpoint.mesh.notes()]
+            _, mesh, discovery = endpoint
+            several += [mesh.counters, discovery.counters]
+            notes += [*discovery.notes(), *mesh.notes()]
         for each in several:  # counters of one name add up: core and proxies have the same servers
             counters.update(each.as_dict())
         yield_to_data()
@@ -148,7 +141,7 @@ class SnapshotBuilder:
             topics, topics_left = self.topics.used(most)
         if most is not None and services is None:
             services, services_left = self._services_used(most)
-        known = self._peers(endpoint) if endpoint is not None and peers else ()
+        known = self._peers(*endpoint) if endpoint is not None and peers else ()
         return Snapshot(
             agent=self.agent(),
             taken=time.time(),
@@ -184,7 +177,7 @@ class SnapshotBuilder:
     def agent(self) -> AgentInfo:
         """The agent itself."""
         endpoint, bridge, core = self._parts.endpoint(), self._parts.bridge, self._parts.core
-        identity = endpoint.identity if endpoint is not None else None
+        identity, _, discovery = endpoint or (None, None, None)
         proxies = sum(len(session.proxies) for session in bridge.sessions)
         now, rss = time.monotonic(), None
         with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
@@ -204,7 +197,7 @@ class SnapshotBuilder:
             cpu=self._cpu,
             rss=rss,
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
-            interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
+            interfaces=tuple(i.name for i in discovery.interfaces) if discovery else (),
             config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
             realtime=self._parts.realtime,
             files=_files(),
@@ -216,14 +209,14 @@ class SnapshotBuilder:
 
     # --- peers --------------------------------------------------------------------------------------------------
 
-    def _peers(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
+    def _peers(self, identity: Identity, mesh: Mesh, discovery: Discovery) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name, and behind them the modules that are not of this mesh."""
         now, imports = time.monotonic(), self._parts.bridge.topics.imports
         links = {session.link.guid: session for session in self._parts.bridge.sessions.linked()}
         yield_to_data()  # a millisecond each with a full roster
-        roster = {view.run.identity.guid: view for view in endpoint.discovery.peers()}
+        roster = {view.run.identity.guid: view for view in discovery.peers()}
         yield_to_data()
-        statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
+        statuses = {status.identity.guid: status for status in mesh.peers()}
         infos = []
         for guid in {*roster, *statuses, *links}:
             yield_to_data()
@@ -240,8 +233,8 @@ class SnapshotBuilder:
             changes = {"state": "relayed", "via": via, "topics_in": counts[origin.instance]}
             relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
         known_guids = {*roster, *statuses, *links}
-        strangers = [one for one in endpoint.discovery.strangers() if one.identity.guid not in known_guids]
-        own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
+        strangers = [one for one in discovery.strangers() if one.identity.guid not in known_guids]
+        own = {str(address) for address in (identity.guid.address, *identity.addresses)}
         infos = [info for info in infos if info.instance not in relayed]
         infos += [*relayed.values(), *(_stranger(one, now) for one in strangers)]
         infos.sort(key=lambda info: (info.state == FOREIGN, info.name, info.guid))
