@@ -26,7 +26,7 @@ from rmpa.runtime.loop import SystemClock, call_at_tick, yield_to_data
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.observe.peer_info import CheckLevel, PeerInfo
@@ -236,16 +236,7 @@ class Health:
             was = (counts if before is None else before).get(name, {})
             yield _sent(name, route, Counter(counts[name]) - Counter(was))
         yield from _troubles(snapshot)
-        for service in snapshot.services:
-            if service.calls:
-                name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
-                name += f"service {service.name}"
-                called = new(name, {"calls": service.calls, "failed": service.failed})
-                # New failures are one warning, because a server may fail calls on purpose.
-                text = f"{called['failed']} of {called['calls']} calls failed: {service.problem}"
-                if not called["failed"]:
-                    text = f"{called['calls']} calls" + (f", {service.active} under way" if service.active else "")
-                yield Check(name, WARN if called["failed"] else OK, text, evidence=service_values(service))
+        yield from _called(snapshot.services, new)
         yield from self._stale(peers, now)
         self._counts = counts
 
@@ -275,6 +266,20 @@ def _troubles(snapshot: Snapshot) -> Iterator[Check]:
     for node in snapshot.unreachable:
         values = _texts({"unreachable for (s)": node.ago})
         yield Check(f"rmpa: node {node.node}", WARN, str(node), evidence=values)
+
+
+def _called(services: Iterable[ServiceInfo], new: Callable[[str, dict[str, int]], Counter[str]]) -> Iterator[Check]:
+    """The services that were called. New failures are one warning: a server may fail calls on purpose."""
+    for service in services:
+        if service.calls:
+            name = (
+                f"rmpa: {service.peer}: service {service.name}" if service.peer else f"rmpa: service {service.name}"
+            )
+            count = new(name, {"calls": service.calls, "failed": service.failed})
+            text = f"{count['calls']} calls" + (f", {service.active} under way" if service.active else "")
+            if count["failed"]:
+                text = f"{count['failed']} of {count['calls']} calls failed: {service.problem}"
+            yield Check(name, WARN if count["failed"] else OK, text, evidence=service_values(service))
 
 
 def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
