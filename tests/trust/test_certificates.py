@@ -30,7 +30,6 @@ from rmpa.trust.certificates import (
 )
 from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.tokens import fingerprint_of
-from tests.fuzz import target_certificate
 from tests.trust.authority import WALL, Authority, new_key
 
 LAB, OTHER = Authority(), Authority()
@@ -265,8 +264,3 @@ def test_anything_at_all_is_refused(data: bytes) -> None:
     _refused(data)
     with pytest.raises(TrustError):
         read_request(data)
-
-
-def test_the_fuzz_target_takes_its_seeds() -> None:
-    for seed in target_certificate.SEEDS:
-        target_certificate.fuzz(seed)
