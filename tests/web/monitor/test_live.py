@@ -1,16 +1,30 @@
-"""Live values: cut, by path, scans and pictures."""
+"""What a page is shown: live values by path and cut, scans and pictures, samples of a plot, and patches of states."""
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web import limits
-from rmpa.web.monitor.live import IMAGE_HEADER, compressed_picture, cut, field_path, number_at, raw_picture, scan
+from rmpa.web.monitor.live import (
+    IMAGE_HEADER,
+    SampleBuffer,
+    compressed_picture,
+    cut,
+    field_path,
+    number_at,
+    raw_picture,
+    scan,
+)
+from rmpa.web.monitor.messages import difference, without_nulls
+from tests.web.monitor.patches import apply
 
 
 def test_a_value_is_cut_and_says_so() -> None:
@@ -130,3 +144,94 @@ def test_a_depth_image_is_shown_from_near_to_far(encoding: str, letter: str, not
 def test_a_depth_image_that_is_too_short_is_refused() -> None:
     with pytest.raises(RemoteProtocolError):
         raw_picture(10, 10, "16UC1", 20, bytes(199))
+
+
+VALUE = st.none() | st.integers(-1000, 1000).map(float)
+
+
+def test_few_samples_stay_as_they_are() -> None:
+    buffer = SampleBuffer(2)
+    buffer.add(1.0, [1.0, None])
+    buffer.add(2.0, [math.nan, math.inf])
+    assert buffer.take() == [[1.0, 2.0], [1.0, None], [None, None]]
+    assert buffer.take() == []
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@given(st.lists(st.tuples(VALUE, VALUE), min_size=40, max_size=150))
+def test_the_buffer_is_bounded_and_keeps_the_extremes(rows: list[tuple[float | None, float | None]]) -> None:
+    buffer = SampleBuffer(2, most=16)
+    for at, row in enumerate(rows):
+        buffer.add(float(at), row)
+        assert len(buffer) <= 33
+    moments, *lines = buffer.take()
+    assert len(moments) <= 16
+    assert moments == sorted(moments, key=lambda moment: moment or 0.0)
+    for number, line in enumerate(lines):
+        given = [value for row in rows if (value := row[number]) is not None]
+        assert _extremes([value for value in line if value is not None]) == _extremes(given)
+
+
+def _extremes(values: list[float]) -> tuple[float, float] | None:
+    return (min(values), max(values)) if values else None
+
+
+SCALARS = st.booleans() | st.integers(-3, 3) | st.sampled_from((0.0, 1.0, 1.5, -2.0)) | st.text(max_size=3)
+KEYS = st.sampled_from(("a", "b", "/odom", "__proto__", ""))
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner | st.none(), max_size=3) | st.dictionaries(KEYS, inner, max_size=4),
+    max_leaves=12,
+)
+STATES = st.dictionaries(KEYS, VALUES, max_size=5)
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])  # the first example of a recursive strategy is slow
+@given(STATES, STATES)
+def test_a_patch_applied_to_the_old_state_gives_the_new_one(old: Any, new: Any) -> None:
+    made = apply(old, difference(old, new))
+    assert json.dumps(made, sort_keys=True) == json.dumps(new, sort_keys=True)  # 1, 1.0 and true are told apart
+
+
+@given(STATES, STATES)
+def test_neither_state_is_changed(old: Any, new: Any) -> None:
+    before = json.dumps([old, new])
+    apply(old, difference(old, new))
+    assert json.dumps([old, new]) == before
+
+
+@given(STATES)
+def test_equal_states_have_an_empty_patch(state: Any) -> None:
+    assert difference(state, json.loads(json.dumps(state))) == {}
+
+
+# RFC 7396, appendix A
+@pytest.mark.parametrize(
+    ("state", "patch", "result"),
+    [
+        ({"a": "b"}, {"a": "c"}, {"a": "c"}),
+        ({"a": "b"}, {"b": "c"}, {"a": "b", "b": "c"}),
+        ({"a": "b"}, {"a": None}, {}),
+        ({"a": "b", "b": "c"}, {"a": None}, {"b": "c"}),
+        ({"a": ["b"]}, {"a": "c"}, {"a": "c"}),
+        ({"a": "c"}, {"a": ["b"]}, {"a": ["b"]}),
+        ({"a": {"b": "c"}}, {"a": {"b": "d", "c": None}}, {"a": {"b": "d"}}),
+        ({"a": [{"b": "c"}]}, {"a": [1]}, {"a": [1]}),
+        (["a", "b"], ["c", "d"], ["c", "d"]),
+        ({"a": "b"}, ["c"], ["c"]),
+        ({"a": "foo"}, None, None),
+        ({"a": "foo"}, "bar", "bar"),
+        ({"e": None}, {"a": 1}, {"e": None, "a": 1}),
+        ([1, 2], {"a": "b", "c": None}, {"a": "b"}),
+        ({}, {"a": {"bb": {"ccc": None}}}, {"a": {"bb": {}}}),
+    ],
+)
+def test_the_examples_of_the_standard(state: Any, patch: Any, result: Any) -> None:
+    assert apply(state, patch) == result
+
+
+def test_what_is_not_known_is_left_out_of_a_state() -> None:
+    assert without_nulls({"a": None, "b": float("nan"), "c": (1, None), "d": {"e": None}}) == {
+        "c": [1, None],
+        "d": {},
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import hashlib
 import math
 import time
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import NodeRules, ParamValue
+    from rmpa.web.hub.node_link import ParamValue
     from rmpa.web.monitor.resources import ResourceWatch
 
 
@@ -174,38 +175,40 @@ class Answers:
 
     @question("set_param", needs="control")
     async def _set_param(self, args: Args) -> Any:
-        name, peer, value = _name(args, "name"), _text(args, "peer"), args.get("value")
-        if value is None:
+        if args.get("value") is None:
             raise ConfigError("value", "a parameter cannot be null", "delete it instead")
+        return await self._change(args, args["value"])
+
+    @question("delete_param", needs="control")
+    async def _delete_param(self, args: Args) -> Any:
+        if _name(args, "name") == "/":
+            raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
+        return await self._change(args, None)
+
+    async def _change(self, args: Args, value: ParamValue) -> Any:
+        """Set a parameter, or delete it where ``value`` is ``None``; returns all of them."""
+        name, peer, rules = _name(args, "name"), _text(args, "peer"), self._hub.link.rules
         if peer:
 
             def change(params: PeerParams) -> None:
-                _check_of_peer(params, self._hub.link.rules, name, value)
-                present = params.get(name) if name in params.names() else None
-                params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
+                # The peer judges what this module may do, and knows nothing of rmpa web. Where it hides some of its
+                # parameters from this module, a page changes none of them: what a namespace holds is not known.
+                if rules.permissions is not None:
+                    rules.check_param_change(name, functools.partial(_value_at, params.get("/")), value)
+                if value is None:
+                    params.delete(name)
+                else:
+                    present = params.get(name) if name in params.names() else None
+                    params.set(name, cast("XmlRpcValue", _as_before(name, present, value)))
 
             await self._of_peer(peer, change)
+        elif value is None:
+            await _in_time(self._hub.params.delete(name))
         else:
             await self._own_params()
             kept = _as_before(name, self._hub.params.value(name), value)
             parameters_in(name, cast("XmlRpcValue", kept))
             await _in_time(self._hub.params.set(name, cast("ParamValue", kept)))
-        return await self._params(args)
-
-    @question("delete_param", needs="control")
-    async def _delete_param(self, args: Args) -> Any:
-        name, peer = _name(args, "name"), _text(args, "peer")
-        if name == "/":
-            raise ConfigError("name", "the root holds every parameter", "name the one that you mean")
-        if peer:
-
-            def delete(params: PeerParams) -> None:
-                _check_of_peer(params, self._hub.link.rules, name)
-                params.delete(name)
-
-            await self._of_peer(peer, delete)
-        else:
-            await _in_time(self._hub.params.delete(name))
         return await self._params(args)
 
     # --- services and resources -------------------------------------------------------------------------------
@@ -295,28 +298,10 @@ async def _in_time(done: Awaitable[Any]) -> None:
         raise UnreachableError("parameters of the core", "its API", "is it busy? ask again") from None
 
 
-def _check_of_peer(params: PeerParams, rules: NodeRules, name: str, after: ParamValue = None) -> None:
-    """Check a change of a peer's parameters as ``NodeRules`` does, against all that the peer has.
-
-    The peer judges what this module may do, and knows nothing of ``rmpa web``. Where it hides some of its parameters
-    from this module, a page changes none of them: what a namespace holds is not known.
-
-    Raises:
-        RmpaError: The rules deny it, or the peer does not tell its parameters.
-    """
-    if rules.permissions is None:
-        return
-    tree = params.get("/")
-
-    def value_of(name: str) -> ParamValue:
-        value: object = tree
-        for part in filter(None, name.split("/")):
-            if not isinstance(value, Mapping) or part not in value:
-                return None
-            value = value[part]
-        return cast("ParamValue", value)
-
-    rules.check_param_change(name, value_of, after)
+def _value_at(tree: Any, name: str) -> ParamValue:
+    for part in filter(None, name.split("/")):
+        tree = tree.get(part) if isinstance(tree, Mapping) else None
+    return cast("ParamValue", tree)
 
 
 def _as_before(name: str, present: object, value: object) -> object:

@@ -1,8 +1,10 @@
-"""The state of the pages, made of recorded snapshots of the demo."""
+"""The state of the pages, made of recorded snapshots of the demo; the figures and words of its document."""
 
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -10,8 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.core.limits import KIB
 from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo, UnreachableInfo
 from rmpa.web import limits
+from rmpa.web.monitor import messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.state import StateBuilder, details, module_state
@@ -333,3 +337,27 @@ def test_nodes_beyond_the_limit_are_counted(monkeypatch: pytest.MonkeyPatch) -> 
     state = build(RECORDED[0])
     assert len(state["nodes"]) == 2
     assert state["hidden"]["nodes"] > 0
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "design" / "monitor-protocol.md").read_text(encoding="utf-8")
+
+
+def test_the_page_says_the_bounds_of_the_code() -> None:
+    rows = re.findall(r"\| ([\d,.]+)( KiB| s)? \| `([A-Z_]+)` \|", PAGE)
+    assert len(rows) > 10
+    for figure, unit, name in rows:
+        assert getattr(limits, name) == float(figure.replace(",", "")) * (KIB if unit == " KiB" else 1), name
+
+
+def test_each_state_is_of_a_new_snapshot() -> None:
+    assert limits.WEB_SNAPSHOT_AGE < limits.STATE_PERIOD
+
+
+def test_the_page_has_each_question_and_message() -> None:
+    for what in questions.QUESTIONS:
+        assert f"`{what}`" in PAGE
+    for right in session.RIGHTS:
+        assert f"`{right}`" in PAGE
+    for op in session.OPS:
+        assert f"`{op}`" in PAGE
+    assert f"`{messages.SUBPROTOCOL}`" in PAGE
