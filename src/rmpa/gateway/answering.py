@@ -4,21 +4,55 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rmpa.core.errors import PeerRefused, RmpaError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Coroutine
 
     from rmpa.gateway.zenoh.config import ArrivedQuery
 
     Respond = Callable[[ArrivedQuery], Awaitable[tuple[bytes, bytes]]]
 
+_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 
-class Answering:
+class OwnedTasks:
+    """OwnedTasks that end together; the failure of one is logged."""
+
+    def __init__(self) -> None:
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    def __len__(self) -> int:
+        """Those that run now."""
+        return len(self._tasks)
+
+    def spawn(self, work: Coroutine[Any, Any, _T], name: str = "") -> asyncio.Task[_T]:
+        """Run a coroutine in the background."""
+        task = asyncio.get_running_loop().create_task(work, name=name or None)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def cancel(self) -> None:
+        """End them all."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def close(self) -> None:
+        """End them all, and wait for it."""
+        self.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("! a task of the gateway ended with an error", exc_info=error)
+
+
+class Answering(OwnedTasks):
     """Answers queries in tasks, a bounded number at once; an error is the reply, and the end of the gateway too.
 
     Args:
@@ -31,11 +65,7 @@ class Answering:
         self._what: Final = what
         self._ends: Final = ends
         self._most: Final = most
-        self._tasks: set[asyncio.Task[None]] = set()
-
-    def __len__(self) -> int:
-        """The queries that are answered now, or wait."""
-        return len(self._tasks)
+        super().__init__()
 
     def take(self, query: ArrivedQuery, respond: Respond) -> bool:
         """Answer a query by what ``respond`` returns for it: the payload, and its attachment (empty for none).
@@ -43,23 +73,11 @@ class Answering:
         Returns:
             Whether there was room.
         """
-        if len(self._tasks) >= self._most:
-            query.reply_error(f"{len(self._tasks)} calls of {self._what} wait already; try again later")
+        if len(self) >= self._most:
+            query.reply_error(f"{len(self)} calls of {self._what} wait already; try again later")
             return False
-        task = asyncio.get_running_loop().create_task(self._answer(query, respond), name=f"answer for {self._what}")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self.spawn(self._answer(query, respond), f"answer for {self._what}")
         return True
-
-    def cancel(self) -> None:
-        """End what is under way, with an error."""
-        for task in self._tasks:
-            task.cancel()
-
-    async def close(self) -> None:
-        """Do so, and wait for it."""
-        self.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _answer(self, query: ArrivedQuery, respond: Respond) -> None:
         try:

@@ -15,6 +15,7 @@ from rmpa.bridge.proxies import PeerProxies
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import peer_name_problem
+from rmpa.gateway.answering import OwnedTasks
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceEndpoint
@@ -301,7 +302,7 @@ class ProxiedService(ProxiedSource):
     ) -> None:
         super().__init__(source, site)
         self._serve = serve
-        self._calls: set[asyncio.Task[None]] = set()
+        self._calls = OwnedTasks()
         timeout = site.agent.bridge.context.services.timeout(source.name)
         self._endpoint = ServiceEndpoint(
             source.name,
@@ -319,9 +320,7 @@ class ProxiedService(ProxiedSource):
             self._register()
 
     def _called(self, call: ServiceCall) -> None:
-        task = asyncio.get_running_loop().create_task(self._answer(call), name=f"call {self.source.name}")
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
+        task = self._calls.spawn(self._answer(call), f"call {self.source.name}")
         call.on_gone = lambda: task.cancel() and None
 
     async def _answer(self, call: ServiceCall) -> None:
@@ -338,8 +337,7 @@ class ProxiedService(ProxiedSource):
 
     def _withdraw(self) -> None:
         self._endpoint.withdraw(f"service [{self.source.name}] of {self.source.site} has gone")
-        for task in self._calls:
-            task.cancel()
+        self._calls.cancel()
 
     def _attach(self, node: SlaveNode) -> None:
         node.add_service(self._endpoint)

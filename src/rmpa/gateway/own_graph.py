@@ -132,16 +132,8 @@ class MeshSources:
             if origin is None or shown is None or is_outside(origin):
                 continue
             if self._may_cross(topic, local.type, origin.node):
-                yield MeshSource(
-                    SourceKind.TOPIC,
-                    origin.name,
-                    origin.instance,
-                    origin.node,
-                    shown[1].topic,
-                    local.type,
-                    topic,
-                    proxy,
-                )
+                module = origin.name, origin.instance, origin.node, shown[1].topic
+                yield MeshSource(SourceKind.TOPIC, *module, local.type, topic, proxy)
 
     def _service(self, service: str) -> Iterator[MeshSource]:
         for node in self._agent.core.state().services.get(service, {}) if is_crossing_name(service) else ():

@@ -92,21 +92,6 @@ async def test_a_tap_gets_every_message_and_is_the_only_demand(settings: Callabl
         assert "/rmpa/gateway" not in mesh.agents[1].core.subscribers("/chatter")
 
 
-async def test_a_tap_gets_the_latched_message(settings: Callable[..., Settings]) -> None:
-    async with joined([settings("a")], [settings("g")]) as mesh, node("talker", mesh.agents[0]) as talker:
-        (graph,) = mesh.graphs
-        seen = Seen(graph)
-        publisher = await talker.advertise("/map", "std_msgs/String", latch=True)
-        publisher.publish(publisher.make({"data": "the map"}))
-        await until(lambda: seen.of("/map"))
-        first = Tapped(graph, seen.of("/map")[0])
-        await until(lambda: first.bodies)
-        assert first.descriptions[0].latching
-        second = Tapped(graph, seen.of("/map")[0])
-        await until(lambda: second.bodies)
-        assert [text(body) for body in first.bodies + second.bodies] == ["the map"] * 2
-
-
 async def test_a_tap_follows_a_node_that_restarts(settings: Callable[..., Settings]) -> None:
     async with joined([settings("a")], [settings("g")]) as mesh:
         (graph,) = mesh.graphs
@@ -151,18 +136,6 @@ async def test_a_module_s_service_is_described_and_called(settings: Callable[...
             await graph.call(source, b"gone", 1.0)
 
 
-async def test_a_server_s_error_is_the_call_s(settings: Callable[..., Settings]) -> None:
-    async with joined([settings("a")], [settings("g")]) as mesh, serving(mesh.agents[0]) as server:
-        (graph,) = mesh.graphs
-        seen = Seen(graph)
-        await until(lambda: seen.of("/add"))
-        server.node.remove_service("/add")
-        server.keeps = True
-        with pytest.raises(PeerRefused) as caught:
-            await graph.call(seen.of("/add")[0], b"1", 5.0)
-        assert "/add" in caught.value.reason
-
-
 async def test_a_foreign_topic_appears_at_each_module_under_its_site(settings: Callable[..., Settings]) -> None:
     async with (
         joined([settings("a")], [settings("g")]) as mesh,
@@ -195,19 +168,6 @@ async def test_a_foreign_topic_appears_at_each_module_under_its_site(settings: C
         await until(lambda: not a.core.publishers("/scan"))
         assert not g.core.publishers("/scan")
         await until(lambda: "/rmpa/warehouse/arm/talker" not in g.core.state().nodes)
-
-
-async def test_a_latched_foreign_message_reaches_late_subscribers(settings: Callable[..., Settings]) -> None:
-    async with joined([settings("a")], [settings("g")]) as mesh, node("hearer", mesh.agents[0]) as hearer:
-        (graph,) = mesh.graphs
-        shown = graph.show_topic(foreign_topic("/map"), Wanted())
-        shown.describe(type(STRING)(STRING.type, STRING.md5sum, STRING.definition, latching=True))
-        shown.publish(string("the map"))
-        await until(lambda: mesh.agents[0].core.publishers("/map"))
-        sink = Sink()
-        await hearer.subscribe("/map", "std_msgs/String", sink)
-        await until(lambda: sink.count(1))
-        assert sink.heard == ["the map"]
 
 
 async def test_a_foreign_service_is_called_by_a_node_of_a_module(settings: Callable[..., Settings]) -> None:

@@ -70,30 +70,6 @@ async def test_a_standby_shows_what_the_leader_has_but_as_no_source_of_its_own(
         await until(lambda: not uri(a) and not uri(g2) and not provider(g2))
 
 
-async def test_another_gateway_takes_over_while_a_node_listens(settings: Callable[..., Settings]) -> None:
-    async with (
-        joined([settings("a")], [settings("g1"), settings("g2")]) as mesh,
-        node("hearer", mesh.agents[0]) as hearer,
-    ):
-        first, second = mesh.graphs
-        (a, _, g2) = mesh.agents
-        one_wanted, other_wanted, sink = Wanted(), Wanted(), Sink()
-        one = first.show_topic(foreign_topic(), one_wanted)
-        one.describe(STRING)
-        await until(lambda: uri(a) and uri(g2))
-        await hearer.subscribe("/scan", "std_msgs/String", sink)
-        await until(lambda: one_wanted.now)
-        one.publish(string("by the first"))
-        await until(lambda: sink.count(1))
-        other = second.show_topic(foreign_topic(), other_wanted)
-        other.describe(STRING)
-        one.close()
-        await until(lambda: other_wanted.now)
-        assert list(a.core.publishers("/scan")) == [PROXY]
-        assert list(g2.core.publishers("/scan")) == [PROXY]
-        await until(lambda: other.publish(string("by the second")) == 0 and sink.heard[-1] == "by the second")
-
-
 async def test_two_gateways_that_both_have_a_source_show_it_once(settings: Callable[..., Settings]) -> None:
     async with (
         joined([settings("a")], [settings("g1"), settings("g2")]) as mesh,
@@ -130,30 +106,3 @@ async def test_a_module_s_own_service_goes_before_one_of_another_site(settings: 
             connection.close()
         await until(lambda: provider(b) == "/rmpa/warehouse/arm/adder")
         assert shown.problem == ""
-
-
-async def test_the_snapshot_and_why_tell_of_the_gateway(settings: Callable[..., Settings]) -> None:
-    async with (
-        joined([settings("a")], [settings("g")]) as mesh,
-        node("hearer", mesh.agents[0]) as hearer,
-    ):
-        (graph,) = mesh.graphs
-        (a, _) = mesh.agents
-        wanted, sink = Wanted(), Sink()
-        shown = graph.show_topic(foreign_topic(), wanted)
-        shown.describe(STRING)
-        await until(lambda: uri(a))
-        await hearer.subscribe("/scan", "std_msgs/String", sink)
-        await until(lambda: wanted.now)
-        snapshot = a.operations.snapshot({})
-        (topic,) = [one for one in snapshot.topics if one.name == "/scan"]
-        (route,) = topic.routes
-        assert (route.peer, route.node, route.state) == ("g", PROXY, "open")
-        (site,) = [peer for peer in snapshot.peers if peer.name == "warehouse"]
-        assert (site.state, site.via, site.topics_in) == ("relayed", "g", 1)
-        shown.publish(string("one"))
-        await until(lambda: sink.count(1))
-        (found,) = await a.why.answer({"name": "/scan"})
-        assert (found.peer, found.node) == ("warehouse", PROXY)
-        assert found.failed is None, found
-        assert any("g passes on" in stage.text for stage in found.stages)

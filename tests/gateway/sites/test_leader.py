@@ -19,15 +19,6 @@ def leads(leader: Leader) -> bool:
     return leader.leads
 
 
-def test_a_gateway_alone_leads_after_its_patience() -> None:
-    alone = Leader(gateway(1), PATIENCE, 0.0)
-    alone.handle_timer(0.9)
-    assert not leads(alone)
-    alone.handle_timer(1.0)
-    assert leads(alone)
-    assert alone.next_timer() is None
-
-
 def test_the_lowest_rank_leads_and_of_equal_ones_the_lowest_instance() -> None:
     for own, other in ((gateway(2), gateway(1)), (gateway(1, 5), gateway(1, 4))):
         leader = Leader(own, PATIENCE, 0.0)
@@ -46,15 +37,6 @@ def test_the_next_one_takes_over_after_its_patience() -> None:
     assert not leads(leader)
     leader.handle_timer(4.0)
     assert leads(leader)
-
-
-def test_a_token_that_is_lost_for_a_moment_makes_no_second_leader() -> None:
-    leader = Leader(gateway(2), PATIENCE, 0.0)
-    leader.seen(gateway(1), 0.5)
-    leader.gone(gateway(1), 3.0)
-    leader.seen(gateway(1), 3.5)
-    leader.handle_timer(4.5)
-    assert not leads(leader)
 
 
 def test_other_sites_and_its_own_token_do_not_count() -> None:

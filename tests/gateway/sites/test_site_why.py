@@ -87,6 +87,11 @@ def levels(diagnosis: Diagnosis) -> dict[str, str]:
     return {stage.name: stage.level.value for stage in diagnosis.stages}
 
 
+def failed(way: Diagnosis) -> Check:
+    assert way.failed is not None
+    return way.failed
+
+
 async def test_the_way_of_a_topic_is_told_from_both_gateways() -> None:
     async with site_bed() as bed:
         yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
@@ -118,17 +123,13 @@ async def test_rules_of_both_sites_are_named() -> None:
             yard.site.graph.add(name, TEXT)
         await until(lambda: hall.site.shows("/told"))
         (kept,) = await hall.why("/home/diary", "yard")
-        assert kept.failed is not None
-        assert (kept.failed.name, "gateway.rule 1 (none: /home/**)" in kept.failed.text) == ("rule there", True)
+        assert (failed(kept).name, "gateway.rule 1 (none: /home/**)" in failed(kept).text) == ("rule there", True)
         (noise,) = await hall.why("/noise")
-        assert noise.failed is not None
-        assert (noise.failed.name, "gateway.rule 1 (out: /noise)" in noise.failed.text) == ("rule here", True)
+        assert (failed(noise).name, "gateway.rule 1 (out: /noise)" in failed(noise).text) == ("rule here", True)
         (own,) = await yard.why("/home/diary", asker="arm")
-        assert own.failed is not None
-        assert own.failed.name == "rule here"
+        assert failed(own).name == "rule here"
         (none,) = await hall.why("/none", "yard", "arm")
-        assert none.failed is not None
-        assert none.failed.text == "no node of arm at yard has /none, as the gateway there sees it"
+        assert failed(none).text == "no node of arm at yard has /none, as the gateway there sees it"
         info = await hall.report(INFO, site="yard")
         (site,) = info.sites
         problems = {source.name: source.problem for source in site.sources}
@@ -185,16 +186,13 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
         assert report.sites[1].state == "unreachable"
         assert report.sites[1].since_ago is not None
         (way,) = await hall.why("/chatter", "yard")
-        assert way.failed is not None
-        assert way.failed.text.startswith("site yard is unreachable since")
+        assert failed(way).text.startswith("site yard is unreachable since")
         (unnamed,) = await hall.why("/chatter")  # the question of a user who does not know whose it was
-        assert unnamed.failed is not None
-        assert unnamed.failed.text.startswith("site yard is unreachable since")
+        assert failed(unnamed).text.startswith("site yard is unreachable since")
         assert await hall.why("/other") == []
         assert await hall.why("/chatter", "joystick") == []  # a peer's name
         (moon,) = await hall.why("/chatter", "moon", "arm")
-        assert moon.failed is not None
-        assert "no gateway of a site moon" in moon.failed.text
+        assert "no gateway of a site moon" in failed(moon).text
         with pytest.raises(RmpaError, match="site yard is unreachable since"):
             await hall.answers.answer(PARAM, {"site": "yard", "module": "arm"})
         with pytest.raises(UnreachableError, match="known are: none"):
@@ -266,8 +264,7 @@ async def test_a_router_that_keeps_a_subscription_back_is_named(monkeypatch: pyt
         assert levels(told)["demand there"] == "warn"
         await hall.site.subscribed("/chatter")
         (told,) = await hall.why("/chatter")
-        assert told.failed is not None
-        assert told.failed.name == "router"
+        assert failed(told).name == "router"
 
 
 async def test_a_topic_for_some_sites_is_told_of_to_each_as_the_rules_are_for_it() -> None:

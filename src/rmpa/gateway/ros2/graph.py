@@ -18,7 +18,7 @@ from rmpa.gateway.ros2.pairs import described_types
 from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.types import Ros2Types
@@ -317,7 +317,6 @@ class Ros2TypeAsker:
         self._ros2 = ros2
         self._types = types
         self._appeared = asyncio.Event()
-        self._learnt: dict[tuple[str, str], Mapping[str, Any]] = {}
         self._asked = 0
         self._asking = 0
 
@@ -350,20 +349,12 @@ class Ros2TypeAsker:
                 endpoint = of if (name, kind) == (of.name, of.kind) else await self._wait(name, kind, of.node)
                 if endpoint is None:
                     raise NoConversion(f"node {of.node.name} has no {name}")
-                found |= await self._fields(endpoint)
+                fields = await self._ask(endpoint)
+                described_types(self._types, endpoint.type, endpoint.type_hash, fields)
+                found |= fields
         finally:
             self._asking -= 1
         return found
-
-    async def _fields(self, endpoint: Ros2Endpoint) -> Mapping[str, Any]:
-        key = endpoint.type, endpoint.type_hash
-        if key not in self._learnt:
-            fields = await self._ask(endpoint)
-            described_types(self._types, endpoint.type, endpoint.type_hash, fields)
-            if len(self._learnt) >= limits.ROS2_TYPES_MAX:
-                del self._learnt[next(iter(self._learnt))]
-            self._learnt[key] = fields
-        return self._learnt[key]
 
     async def _ask(self, endpoint: Ros2Endpoint) -> dict[str, Any]:
         server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)

@@ -295,26 +295,28 @@ class Ros2Answers:
 
     def _sources(self, asker: str) -> Iterator[SiteSourceInfo]:
         """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
-
-        def row(
-            kind: SourceKind, name: str, node: str, type_name: str = "*", here: str = "", problem: str = ""
-        ) -> Iterator[SiteSourceInfo]:
-            if self._rules.tells(asker, kind, here or name):
-                word = kind.name.lower()
-                yield SiteSourceInfo(
-                    kind=word, module="", node=node, name=name, type=type_name, here=here, problem=problem
-                )
-
+        topic, service = SourceKind.TOPIC, SourceKind.SERVICE
+        rows: list[tuple[SourceKind, str, str, str, str, str]] = []
         for each in self._neighbour.topics.imports.values():
-            for publisher in each.publishers.values():
-                problem = each.problem or publisher.topic.problem
-                terms = each.ros1_type, each.decision.name, problem
-                yield from row(SourceKind.TOPIC, each.first.name, publisher.node, *terms)
+            for one in each.publishers.values():
+                problem = each.problem or one.topic.problem
+                rows.append((topic, each.first.name, one.node, each.ros1_type, each.decision.name, problem))
         for name, shown in self._neighbour.services.shown.items():
-            yield from row(SourceKind.SERVICE, name, "", shown.server.type, name)
-        for what, text in self._neighbour.context.problems.items():
+            rows.append((service, name, "", shown.server.type, name, ""))
+        for what, problem in self._neighbour.context.problems.items():
             name, _, node = what.partition(" of ")
-            yield from row(SourceKind.TOPIC, name, node, problem=text)
+            rows.append((topic, name, node, "*", "", problem))
+        for kind, name, node, type_name, here, problem in rows:
+            if self._rules.tells(asker, kind, here or name):
+                yield SiteSourceInfo(
+                    kind=kind.name.lower(),
+                    module="",
+                    node=node,
+                    name=name,
+                    type=type_name,
+                    here=here,
+                    problem=problem,
+                )
 
 
 def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.policy import Needs
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering
+from rmpa.gateway.answering import Answering, OwnedTasks
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment, Ros2Qos, data_key
@@ -25,8 +25,6 @@ from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
-
     from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
     from rmpa.gateway.foreign import ProxiedService
@@ -139,8 +137,8 @@ class ServicePair:
         """Converts responses."""
 
 
-class Ros2Context:
-    """What the parts of the neighbour ROS 2 share; each joins topics, services or actions, both ways.
+class Ros2Context(OwnedTasks):
+    """What the parts of the neighbour ROS 2 share, with its tasks; each part joins topics, services or actions.
 
     Args:
         graph: The gateway's own graph.
@@ -157,6 +155,7 @@ class Ros2Context:
     def __init__(
         self, graph: AgentGraph, session: OpenSession, settings: GatewaySettings, contracts: Contracts
     ) -> None:
+        super().__init__()
         ros2 = settings.ros2
         self.graph: Final = graph
         self.session: Final = session
@@ -175,17 +174,10 @@ class Ros2Context:
         self.asker: Final = Ros2TypeAsker(session, self.nodes, self.ros2, self.types)
         self.problems: dict[str, str] = {}
         """What is wrong, by what it is about."""
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a message type of ROS 2, ``package/msg/Name``."""
         return self.mapping.ros1_type(name, known_types())
-
-    def spawn(self, work: Coroutine[None, None, None]) -> None:
-        """Run a coroutine in the background; it is cancelled when the neighbour closes."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
 
     def say(self, subject: str, text: str) -> None:
         """Log a problem once, and keep it: what it is about, and the text. An empty text: it is solved."""
@@ -196,18 +188,6 @@ class Ros2Context:
                 del self.problems[next(iter(self.problems))]
             self.problems[subject] = text
             _log.warning("ROS 2: %s: %s", subject, text)
-
-    async def close(self) -> None:
-        """End what runs in the background."""
-        tasks = tuple(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("a task of the neighbour ROS 2 ended with an error", exc_info=error)
 
 
 class OfferedService:

@@ -54,6 +54,9 @@ class _Site:
     refused: int = 0
 
 
+_NO_SITE: Final = _Site()
+
+
 class SiteCatalogue:
     """Keeps what other sites have.
 
@@ -88,24 +91,20 @@ class SiteCatalogue:
 
     def gateways(self, site: str) -> list[SiteGateway]:
         """The gateways of another site, the leading one first."""
-        found = self._sites.get(site)
-        return sorted(found.gateways, key=lambda each: each.order) if found is not None else []
+        return sorted(self._sites.get(site, _NO_SITE).gateways, key=lambda each: each.order)
 
     def modules(self, site: str) -> list[SiteModule]:
         """The modules of another site, by name."""
-        found = self._sites.get(site)
-        return sorted(found.modules, key=lambda each: (each.name, each.instance)) if found is not None else []
+        return sorted(self._sites.get(site, _NO_SITE).modules, key=lambda each: (each.name, each.instance))
 
     def sources(self, module: SiteModule) -> list[SiteSource]:
         """The sources of a module, by name and node."""
-        found = self._sites.get(module.site)
-        known = found.modules.get(module, set()) if found is not None else set()
+        known = self._sites.get(module.site, _NO_SITE).modules.get(module, ())
         return sorted(known, key=lambda each: (each.name, each.node, each.kind))
 
     def refused(self, site: str) -> int:
         """Tokens of a site that were left out because there are too many."""
-        found = self._sites.get(site)
-        return found.refused if found is not None else 0
+        return self._sites.get(site, _NO_SITE).refused
 
     def all(self) -> Iterator[SiteModule | SiteSource]:
         """Everything that is there, modules before their sources."""

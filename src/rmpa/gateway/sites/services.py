@@ -26,7 +26,7 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering
+from rmpa.gateway.answering import Answering, OwnedTasks
 from rmpa.gateway.neighbour import SourceKind, ZenohPriority
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key
 from rmpa.ros import limits as ros_limits
@@ -34,7 +34,7 @@ from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.neighbour import ForeignSource, MeshSource, ZenohReply
+    from rmpa.gateway.neighbour import ForeignSource, MeshSource
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
@@ -105,13 +105,6 @@ def asked_type(key: str) -> str:
     return UNKNOWN_TYPE if "*" in chunks[5] else chunks[5].replace("%", "/")
 
 
-def type_problem(service: str, asked: str, has: str) -> str:
-    """Why a call by another type is refused; empty if the types are equal or one of them is unknown."""
-    if UNKNOWN_TYPE in (asked, has) or asked == has:
-        return ""
-    return f"service {service} is of the type {has}, not {asked}"
-
-
 def caller(query: ArrivedQuery) -> tuple[str, str]:
     """The site that asks, and the md5 sum that it takes a service for; empty and zeros for a program that tells none.
 
@@ -150,7 +143,9 @@ class ExportedService:
         try:
             site, md5 = caller(query)
             why = self._part.context.rules.refusal(site, source.module, source.name, Access.CALL)
-            why = why or type_problem(source.name, asked_type(query.key), has)
+            asked = asked_type(query.key)
+            if not why and UNKNOWN_TYPE not in (asked, has) and asked != has:
+                why = f"service {source.name} is of the type {has}, not {asked}"
         except RemoteProtocolError as error:
             md5, why = NO_MD5, str(error)
         if not why and self._part.is_full(size):
@@ -212,29 +207,25 @@ class ImportedService:
         self._here = entry.source.name
         self._description: ServiceDescription | None = None
         self._numbers = itertools.count(1)
-        self._asking: set[asyncio.Task[list[ZenohReply]]] = set()
+        self._asking = OwnedTasks()
         self._problem = ""
         self.calls = self.failed = 0
         self._shown = context.graph.show_service(entry.source, self._serve, self._describe)
 
     def renew(self, source: SiteSource) -> None:
         """It is of another run of its module: calls under way end with an error, and its type is unknown."""
-        self._end_calls()
+        self._asking.cancel()
         self._source, self._description = source, None
 
     def close(self) -> None:
         """Take it back; calls under way end with an error at once."""
-        self._end_calls()
+        self._asking.cancel()
         self._shown.close()
 
     @property
     def problem(self) -> str:
         """Why it cannot be called, or why the last call failed; empty for nothing."""
         return self._shown.problem or self._problem
-
-    def _end_calls(self) -> None:
-        for task in self._asking:
-            task.cancel()
 
     async def _serve(self, request: bytes) -> bytes:
         """Call the service.
@@ -261,7 +252,7 @@ class ImportedService:
         source, loop = self._source, asyncio.get_running_loop()
         attachment = MessageSource(md5, source.node, (self._context.name,)).writer()
         began = loop.time()
-        asking = loop.create_task(
+        asking = self._asking.spawn(
             self._context.session.get(
                 source.key() + parameters,
                 request,
@@ -270,8 +261,6 @@ class ImportedService:
                 priority=ZenohPriority.INTERACTIVE_HIGH,
             )
         )
-        self._asking.add(asking)
-        asking.add_done_callback(self._asking.discard)
         try:
             await asyncio.wait((asking,))
         finally:
