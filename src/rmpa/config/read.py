@@ -20,7 +20,7 @@ from rmpa.config.reference import json_schema
 from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings
-from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown
+from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -485,8 +485,7 @@ def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, 
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     known = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
     if reach and reach not in known:
-        near = did_you_mean(reach, known)
-        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(known)}"
+        remedy = suggestion(reach, known, f"it is one of {', '.join(known)}")
         raise ConfigError("ROS_AUTOMATIC_DISCOVERY_RANGE", f"{reach!r} is not a range", remedy)
     if reach == "OFF":
         found["multicast"] = (False, "ROS_AUTOMATIC_DISCOVERY_RANGE")

@@ -80,6 +80,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     return folded[near[0]] if near else None
 
 
+def suggestion(word: str, known: Iterable[str], otherwise: str) -> str:
+    """The remedy for a word that is not known: the nearest known one, or else another text."""
+    near = did_you_mean(word, known)
+    return f"did you mean {near}?" if near else otherwise
+
+
 def shown(value: object) -> str:
     """A TOML value as errors show it, at most 60 characters long."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)

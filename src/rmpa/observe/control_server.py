@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.messages import with_text
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError, StartError
 from rmpa.observe import limits
@@ -235,8 +235,7 @@ class ControlServer:
     async def _answer(self, request: ControlRequest) -> ControlReply:
         handler = self._handlers.get(request.op)
         if handler is None:
-            near = did_you_mean(request.op, self._handlers)
-            remedy = f"did you mean {near}?" if near else f"there are {', '.join(sorted(self._handlers))}"
+            remedy = suggestion(request.op, self._handlers, f"there are {', '.join(sorted(self._handlers))}")
             return ControlReply(ok=False, error=f"no op {request.op!r}", remedy=remedy)
         try:
             async with asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT):

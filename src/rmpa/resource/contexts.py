@@ -13,7 +13,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.declare import Context, parse_rule, split_reference
@@ -123,8 +123,7 @@ class Contexts(RuntimePart):
             PeerRefused: The function of the context failed; the present context stays.
         """
         if name and name not in self._known:
-            near = did_you_mean(name, self._known)
-            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(self._known) or 'none'}"
+            remedy = suggestion(name, self._known, f"it is one of {', '.join(self._known) or 'none'}")
             raise ConfigError(f"resource {self._runtime.resource.name}", f"no context {name[:80]!r}", remedy)
         async with self._lock:
             before, self.chosen = self.chosen, name

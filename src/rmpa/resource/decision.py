@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.resource.quality import Scale
 
@@ -114,8 +114,7 @@ class Decider:
         """
         found = self.profiles.get(name)
         if found is None:
-            near = did_you_mean(name, self.profiles)
-            remedy = f"did you mean {near}?" if near else f"it has {', '.join(self.profiles)}"
+            remedy = suggestion(name, self.profiles, f"it has {', '.join(self.profiles)}")
             raise ConfigError(f"profile {name}", f"{self._resource} has no such profile", remedy)
         return found
 

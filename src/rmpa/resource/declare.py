@@ -16,7 +16,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.rules import CONTRACT_RULES, TERMS
-from rmpa.config.values import BadValue, did_you_mean
+from rmpa.config.values import BadValue, did_you_mean, suggestion
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
@@ -419,8 +419,7 @@ def read_enum(kind: type[Any], text: str, where: str, problem: str = "is not kno
 
 def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], listed: str = "it is one of ") -> None:
     names = list(known)
-    near = did_you_mean(text, names)
-    raise ConfigError(where, problem, f"did you mean {near}?" if near else f"{listed}{', '.join(names)}")
+    raise ConfigError(where, problem, suggestion(text, names, f"{listed}{', '.join(names)}"))
 
 
 # Rules that select a context by fields of topics and by the resource's parameters.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 
@@ -75,8 +75,9 @@ def quantity(text: str | float, to: str, where: str) -> float:
         return value
     dimension, wanted = _DIMENSION_OF.get(unit), _DIMENSION_OF.get(to)
     if dimension is None:
-        near = did_you_mean(unit, list(_DIMENSIONS[wanted] if wanted is not None else _DIMENSION_OF))
-        remedy = f"did you mean {near}?" if near else f"say it in {to}"
+        remedy = suggestion(
+            unit, list(_DIMENSIONS[wanted] if wanted is not None else _DIMENSION_OF), f"say it in {to}"
+        )
         raise ConfigError(where, f"{unit!r} is not a unit known here", remedy)
     if wanted != dimension:
         meant = f"a {wanted}" if wanted is not None else "of its own"
@@ -244,8 +245,7 @@ def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str
     """
     found = attributes.get(name)
     if found is None:
-        near = did_you_mean(name, list(attributes))
-        remedy = f"did you mean {near}?" if near else f"it has {', '.join(attributes) or 'none'}"
+        remedy = suggestion(name, list(attributes), f"it has {', '.join(attributes) or 'none'}")
         raise ConfigError(f"requirement of {name}", f"{resource} has no such attribute", remedy)
     return found
 

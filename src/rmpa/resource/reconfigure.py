@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.resource.declare import Parameter
@@ -79,9 +79,8 @@ class ChoiceParameter(Parameter):
         for one, (name, _) in self.names.items():
             if value == one or value.lower() == name.lower():
                 return one
-        near = did_you_mean(value, names)
         problem = f"there is no {self.name} {value[:80]!r}"
-        raise ConfigError(self.name, problem, f"did you mean {near}?" if near else listed)
+        raise ConfigError(self.name, problem, suggestion(value, names, listed))
 
 
 def entries(resource: Resource) -> dict[str, Parameter]:
@@ -196,8 +195,7 @@ def checked(name: str, value: ParameterValue, known: Mapping[str, Parameter]) ->
     """
     parameter = known.get(name)
     if parameter is None:
-        near = did_you_mean(name, known)
-        remedy = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
+        remedy = suggestion(name, known, f"there are {', '.join(known)}")
         raise ConfigError(f"parameter {name[:80]}", "there is none of this name", remedy)
     number = parameter.type in ("int", "double") and not parameter.choices
     if number and isinstance(value, int | float) and not isinstance(value, bool):

@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.config.values import did_you_mean
+from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource.declare import (
@@ -92,8 +92,7 @@ class Resource:
         if not name or not is_legal_name(name) or "/" in name or name.startswith("~"):
             raise ConfigError("resource", f"{name!r} is not a ROS base name", "letters, digits and _, a letter first")
         if role not in set(Role):
-            near = did_you_mean(role, list(Role))
-            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(Role)}"
+            remedy = suggestion(role, list(Role), f"it is one of {', '.join(Role)}")
             raise ConfigError(f"resource {name}", f"there is no role {role!r}", remedy)
         self.name = name
         self.role = Role(role)
@@ -337,8 +336,7 @@ class Resource:
         where = self._new("context", name, self.contexts)
         for profile in profiles:
             if profile not in self.profiles:
-                near = did_you_mean(profile, self.profiles)
-                remedy = f"did you mean {near}?" if near else "declare the profile before the context"
+                remedy = suggestion(profile, self.profiles, "declare the profile before the context")
                 raise ConfigError(where, f"there is no profile {profile}", remedy)
         for key, request in (requires or {}).items():
             request.bound(find_attribute(self.attributes, key, self.name))
@@ -450,8 +448,7 @@ class Resource:
         """
         known = ("configure", "activate", "deactivate", "finalize")
         if event not in known:
-            near = did_you_mean(event, known)
-            remedy = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
+            remedy = suggestion(event, known, f"there are {', '.join(known)}")
             raise ConfigError(f"resource {self.name}", f"no change {event!r}", remedy)
         if event in self.hooks:
             raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
