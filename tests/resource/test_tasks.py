@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from rmpa.resource.resource import Resource
 from rmpa.resource.tasks import Schedule, TaskReport, Tasks, restart_delay, stuck_after
+from tests.resource.rig import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
 
 def test_times_are_absolute_whatever_the_work_takes() -> None:
@@ -85,13 +86,23 @@ def test_when_a_run_is_stuck() -> None:
 class Bench(Tasks):
     """A resource whose tasks run, without a node."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
         self.resource = Resource("r", role="sensing")
         self.reported: list[str] = []
         self.deactivated: list[str] = []
         self.change = asyncio.Event()
         runtime: Any = SimpleNamespace(resource=self.resource, node=SimpleNamespace(name="/r"))
         super().__init__(runtime, self.deactivated.append)
+
+    def begin(self, function: Callable[..., None], **options: Any) -> None:
+        """Run a function as the only task, in a thread of its own or as a coroutine."""
+
+        async def coroutine(*args: object) -> None:
+            await asyncio.to_thread(function, *args)
+
+        self.resource.task(name="t", **options)(function if self.kind == "thread" else coroutine)
+        self.activate()
 
     def report(self, problem: str) -> str:
         self.reported.append(problem)
@@ -110,9 +121,9 @@ class Bench(Tasks):
         return self.reported[self.kinds.index(kind)]
 
 
-@pytest.fixture
-async def bench() -> AsyncIterator[Bench]:
-    one = Bench()
+@pytest.fixture(params=["thread", "coroutine"])
+async def bench(request: pytest.FixtureRequest) -> AsyncIterator[Bench]:
+    one = Bench(request.param)
     yield one
     await one.deactivate()
 
@@ -134,20 +145,12 @@ class Counter:
         assert await asyncio.to_thread(self.done.wait, 30)
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) -> None:
+async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench) -> None:
     count = Counter(30)
 
-    def plain() -> None:
-        count()
-
-    async def coroutine() -> None:
-        count()
-
-    bench.resource.task(rate=100)(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(count, rate=100)
     await count.wait()
-    report = next(iter(bench._runners.values())).report
+    report = bench._runners["t"].report
     assert report.runs + report.missed >= 29
     # No lateness adds up: the 29 periods took no less than they should, however late each was.
     assert count.times[29] - count.times[0] > 0.2
@@ -158,22 +161,12 @@ async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) ->
     assert bench.reported == []
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_task_follows_its_rate_parameter(bench: Bench, kind: str) -> None:
+async def test_task_follows_its_rate_parameter(bench: Bench) -> None:
     rate = bench.resource.parameter("hz", 0.01, low=0.01, high=500, unit="Hz")
     count = Counter(21)
 
-    def plain() -> None:
-        count()
-
-    async def coroutine() -> None:
-        count()
-
-    bench.resource.task(rate=rate)(plain if kind == "thread" else coroutine)
-    bench.activate()
-    async with asyncio.timeout(30):
-        while not count.times:
-            await asyncio.sleep(0.01)
+    bench.begin(count, rate=rate)
+    await until(lambda: count.times)
     # It would sleep for a hundred seconds.
     rate.value = 50
     bench.parameter_changed(rate)
@@ -188,8 +181,7 @@ async def test_task_follows_its_rate_parameter(bench: Bench, kind: str) -> None:
     assert bench.reported == []
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_failing_task_is_restarted(bench: Bench, kind: str) -> None:
+async def test_failing_task_is_restarted(bench: Bench) -> None:
     count = Counter(4)
 
     def fail_twice() -> None:
@@ -197,34 +189,24 @@ async def test_failing_task_is_restarted(bench: Bench, kind: str) -> None:
         if len(count.times) <= 2:
             raise ValueError("no echo")
 
-    async def coroutine() -> None:
-        fail_twice()
-
-    bench.resource.task(rate=200)(fail_twice if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(fail_twice, rate=200)
     assert (await bench.problem("failed")).endswith("failed: ValueError: no echo")
     await count.wait()
     assert bench.kinds == ["failed", "failed"]
     assert count.times[2] - count.times[1] > 0.15, "the second pause is longer"
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_can_end_at_its_first_failure(bench: Bench, kind: str) -> None:
+async def test_a_task_can_end_at_its_first_failure(bench: Bench) -> None:
     def plain() -> None:
         raise ValueError("no echo")
 
-    async def coroutine() -> None:
-        plain()
-
-    bench.resource.task(rate=200, name="t", on_failure="deactivate")(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(plain, rate=200, on_failure="deactivate")
     await bench.problem("stopped")
     assert bench.problems() == ([], ["task t stopped: ValueError: no echo"])
     assert bench.deactivated == ["task t: ValueError: no echo"]
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_stuck_task_is_replaced(bench: Bench, kind: str) -> None:
+async def test_stuck_task_is_replaced(bench: Bench) -> None:
     count = Counter(3)
     free = threading.Event()
 
@@ -233,21 +215,13 @@ async def test_stuck_task_is_replaced(bench: Bench, kind: str) -> None:
         if len(count.times) == 1:
             free.wait(60)
 
-    async def coroutine() -> None:
-        count()
-        if len(count.times) == 1:
-            await asyncio.sleep(60)
-
-    bench.resource.task(rate=100, stuck_after=0.3)(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(plain, rate=100, stuck_after=0.3)
     assert "a run has not ended for" in await bench.problem("stuck")
     (trouble,) = bench.problems()[1]
     assert "stuck: a run has not ended for" in trouble
     await count.wait()
     free.set()
-    async with asyncio.timeout(30):
-        while bench.problems()[1]:
-            await asyncio.sleep(0.01)
+    await until(lambda: not bench.problems()[1])
 
 
 async def test_repeatedly_stuck_task_backs_off(bench: Bench) -> None:
@@ -257,8 +231,7 @@ async def test_repeatedly_stuck_task_backs_off(bench: Bench) -> None:
         count()
         free.wait(60)
 
-    bench.resource.task(rate=100, stuck_after=0.05)(plain)
-    bench.activate()
+    bench.begin(plain, rate=100, stuck_after=0.05)
     await count.wait()
     free.set()
     pauses = [after - before for before, after in itertools.pairwise(count.times)]
@@ -266,8 +239,7 @@ async def test_repeatedly_stuck_task_backs_off(bench: Bench) -> None:
     assert pauses[3] > 0.85
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_overruns_are_reported_once(bench: Bench, kind: str) -> None:
+async def test_overruns_are_reported_once(bench: Bench) -> None:
     slow = threading.Event()
     slow.set()
     count = Counter(4)
@@ -277,13 +249,7 @@ async def test_overruns_are_reported_once(bench: Bench, kind: str) -> None:
             time.sleep(0.03)
         count()
 
-    async def coroutine() -> None:
-        if slow.is_set():
-            await asyncio.sleep(0.03)
-        count()
-
-    bench.resource.task(rate=100, name="t")(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(plain, rate=100)
     await count.wait()
     bench.window_ended({})
     assert bench.reported == [], "one window may be the machine's business"
@@ -309,16 +275,14 @@ async def test_the_same_failure_has_one_traceback(bench: Bench, caplog: pytest.L
         count()
         raise ValueError("no echo" if len(count.times) < 4 else "no battery")
 
-    bench.resource.task(rate=200)(plain)
-    bench.activate()
+    bench.begin(plain, rate=200)
     await count.wait()
     await bench.deactivate()
     traced = [record.exc_info[1] for record in caplog.records if record.exc_info]
     assert [str(error) for error in traced] == ["no echo", "no battery"]
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: str) -> None:
+async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench) -> None:
     item = bench.resource.input("orders", "std_msgs/String")
     got: list[str] = []
     gate, first, last = threading.Event(), threading.Event(), threading.Event()
@@ -331,11 +295,7 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: s
         if message == "m14":
             last.set()
 
-    async def coroutine(message: str) -> None:
-        await asyncio.to_thread(plain, message)
-
-    bench.resource.task(on=item, name="t")(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(plain, on=item)
 
     def give(number: int) -> None:
         message: Any = SimpleNamespace(message=f"m{number}", stamp_ns=time.time_ns())
@@ -352,28 +312,17 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: s
     assert bench._runners["t"].report.dropped == 4
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_no_task_runs_while_paused(bench: Bench, kind: str) -> None:
+async def test_no_task_runs_while_paused(bench: Bench) -> None:
     count = Counter(20)
     within: list[int] = []
-    lock = threading.Lock()
 
     def plain() -> None:
-        with lock:
-            within.append(1)
-        time.sleep(0.003)
-        count()
-        with lock:
-            within.pop()
-
-    async def coroutine() -> None:
         within.append(1)
-        await asyncio.sleep(0.003)
+        time.sleep(0.003)
         count()
         within.pop()
 
-    bench.resource.task(rate=200)(plain if kind == "thread" else coroutine)
-    bench.activate()
+    bench.begin(plain, rate=200)
     async with asyncio.timeout(30):
         while len(count.times) < 20:
             await bench.pause()
@@ -385,21 +334,17 @@ async def test_no_task_runs_while_paused(bench: Bench, kind: str) -> None:
             await asyncio.sleep(0.01)
 
 
-@pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_system_exit_in_a_task_is_a_failure(bench: Bench, kind: str) -> None:
+async def test_system_exit_in_a_task_is_a_failure(bench: Bench) -> None:
     count = Counter(2)
 
     def plain() -> None:
         count()
+        if bench.kind == "coroutine":
+            raise asyncio.CancelledError  # what it waited for was cancelled, not it
         raise SystemExit(3)
 
-    async def coroutine() -> None:
-        count()
-        raise asyncio.CancelledError  # what it waited for was cancelled, not it
-
-    bench.resource.task(rate=100)(plain if kind == "thread" else coroutine)
-    bench.activate()
-    assert ("SystemExit" if kind == "thread" else "CancelledError") in await bench.problem("failed")
+    bench.begin(plain, rate=100)
+    assert ("SystemExit" if bench.kind == "thread" else "CancelledError") in await bench.problem("failed")
     await count.wait()
 
 
@@ -413,8 +358,7 @@ async def test_a_stuck_run_holds_up_no_profile_for_ever(bench: Bench) -> None:
             entered.set()
             release.wait(30)
 
-    bench.resource.task(rate=100, stuck_after="300 ms")(stuck_once)
-    bench.activate()
+    bench.begin(stuck_once, rate=100, stuck_after="300 ms")
     await bench.problem("stuck")
     await count.wait()
     begin = time.monotonic()
