@@ -1,6 +1,7 @@
-"""Frames: golden bytes, whole, byte by byte, malformed, any."""
-
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -8,14 +9,22 @@ from hypothesis import strategies as st
 
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.identity import Guid
 from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
 from rmpa.mesh import limits
+from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import (
     PAYLOAD_MAX,
     WHOLE,
     Frame,
     FrameKind,
+    Hello,
+    Lane,
+    Refusal,
+    Refuse,
     check_header,
+    judge,
+    judge_welcome,
     pack_data_header,
     pack_fragment_header,
     parse_pong,
@@ -23,6 +32,14 @@ from rmpa.mesh.frames import (
     pong,
     unpack_header,
 )
+from tests.mesh.worlds import ACCEPTOR, HIGH, LOW, AnyRoute, Side, Time, deliver, exchange, pair, pass_time
+
+if TYPE_CHECKING:
+    from rmpa.core.identity import Identity
+
+
+# Frames: golden bytes, whole, byte by byte, malformed, any.
+
 
 GOLDEN = [
     (
@@ -168,3 +185,354 @@ def test_any_frame_survives(
     else:
         frame = Frame(kind, payload[: PAYLOAD_MAX[kind]], route, sequence, stamp)
     assert Frame.parse(frame.serialize()) == (frame, 24 + len(frame.payload))
+
+
+# Hello, welcome, refuse: golden bytes, malformed, and every reason to refuse.
+
+
+HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2))
+
+
+WIRE = bytes.fromhex(
+    "524d5041 03 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 0462617365"
+)
+
+
+def test_golden_bytes_of_the_handshake() -> None:
+    assert HELLO.serialize() == WIRE
+    assert Hello.parse(WIRE) == HELLO
+    assert Hello.parse(WIRE + b"later") == HELLO
+    assert Hello.parse(memoryview(WIRE)) == HELLO
+    assert Refuse(2, "no").serialize() == b"\x00\x02no"
+    assert Refuse.parse(b"\x00\x02no") == Refuse(2, "no")
+    assert str(Refuse.parse(b"\x01\x00?")) == "code 256: ?"
+
+
+def problem(wire: bytes) -> Refuse:
+    """The answer to a hello that cannot be read."""
+    refuse = Hello.parse(wire)
+    assert isinstance(refuse, Refuse)
+    return refuse
+
+
+@pytest.mark.parametrize("cut", range(len(WIRE)))
+def test_every_shorter_hello_is_malformed(cut: int) -> None:
+    assert problem(WIRE[:cut]).code == Refusal.MALFORMED
+
+
+def test_other_version_is_distinguished_from_garbage() -> None:
+    refuse = problem(b"RMPA\x04\x01\x00\x00")
+    assert refuse.code == Refusal.VERSION
+    assert "same release" in refuse.text
+
+
+@pytest.mark.parametrize("name", [b"\xff\xff", b"a/b", b"a b", b"", b"a" * 65])
+def test_names_that_are_not(name: bytes) -> None:
+    assert problem(WIRE[:44] + bytes([len(name)]) + name).code == Refusal.MALFORMED
+
+
+def test_a_lease_of_nothing_a_domain_of_none_and_a_refusal_of_nothing() -> None:
+    assert problem(WIRE[:32] + bytes(4) + WIRE[36:]).code == Refusal.MALFORMED
+    assert "no domain 1056" in problem(replace(HELLO, domain=1056).serialize()).text
+    with pytest.raises(RemoteProtocolError):
+        Refuse.parse(b"\x00")
+
+
+def hello_of(identity: Identity, expected: Guid | None = None) -> Hello:
+    return Hello.of(identity, lease=1.0, expected=expected)
+
+
+GHOST = replace(LOW, instance=b"g" * 16)
+
+
+REFUSED: list[tuple[Hello, Identity | None, Refusal, str]] = [
+    (hello_of(replace(LOW, domain=3)), None, Refusal.DOMAIN, "--domain"),
+    (hello_of(HIGH), None, Refusal.MYSELF, "its own port"),
+    (hello_of(replace(HIGH, instance=b"x" * 16)), None, Refusal.DUPLICATE, "--port"),
+    (hello_of(LOW), GHOST, Refusal.DUPLICATE, "--port"),
+    (hello_of(LOW, Guid.of("10.0.0.9", 9)), None, Refusal.WRONG_PEER, "changed hands"),
+    (replace(hello_of(LOW), lane=3), None, Refusal.LANE, "same release"),
+    (replace(hello_of(LOW), lane=0), None, Refusal.LANE, "same release"),
+    (replace(hello_of(LOW), lane=2), None, Refusal.NO_EXPRESS, "belongs to an express one"),
+    (replace(hello_of(LOW), lane=2), GHOST, Refusal.NO_EXPRESS, "belongs to an express one"),
+    (replace(hello_of(replace(LOW, domain=3)), lane=2), None, Refusal.DOMAIN, "--domain"),
+]
+
+
+@pytest.mark.parametrize(("hello", "linked", "code", "advice"), REFUSED)
+def test_refused(hello: Hello, linked: Identity | None, code: Refusal, advice: str) -> None:
+    verdict = judge(hello, HIGH, linked)
+    assert verdict is not None
+    assert verdict.code == code
+    assert advice in verdict.text
+
+
+@pytest.mark.parametrize("dialled", [False, True])
+@pytest.mark.parametrize("alive", [False, True])
+def test_bulk_lane_is_accepted_beside_its_express_lane(dialled: bool, alive: bool) -> None:
+    for one, other in ((LOW, HIGH), (HIGH, LOW)):
+        bulk = replace(hello_of(one), lane=Lane.BULK)
+        assert judge(bulk, other, one, dialled=dialled, alive=alive) is None
+        assert judge(bulk, other, one, dialled=dialled, alive=alive, full=True) is None
+        ghost = judge(bulk, other, replace(one, instance=b"g" * 16), dialled=dialled, alive=alive)
+        assert ghost is not None
+        assert ghost.code == Refusal.NO_EXPRESS
+
+
+def test_a_full_mesh_refuses_strangers_alone() -> None:
+    verdict = judge(hello_of(LOW), HIGH, full=True)
+    assert verdict is not None
+    assert verdict.code == Refusal.FULL
+    assert "docs/sites.md" in verdict.text
+    assert judge(hello_of(LOW), HIGH, LOW, full=True) is None
+
+
+def test_welcome_cases() -> None:
+    assert judge(hello_of(LOW, HIGH.guid), HIGH) is None
+    older = Guid.of(HIGH.guid.address, HIGH.guid.port, 0)
+    assert judge(hello_of(LOW, older), HIGH) is None, "a restarted peer is welcome under its old number"
+    assert judge(hello_of(LOW), HIGH, GHOST, alive=False) is None, "the ghost of a new instance"
+    assert judge(hello_of(LOW), HIGH, LOW, dialled=True) is None, "the lower GUID's call replaces ours"
+    verdict = judge(hello_of(HIGH), LOW, HIGH, dialled=True)
+    assert verdict is not None
+    assert verdict.code == Refusal.ALREADY_LINKED
+
+
+def test_the_answer_is_judged_too() -> None:
+    good = hello_of(HIGH, LOW.guid)
+    assert judge_welcome(good, LOW, HIGH.guid) is None
+    assert judge_welcome(good, LOW, None) is None
+    cases = [
+        (replace(good, expected=None), Refusal.MALFORMED),
+        (replace(good, domain=1), Refusal.DOMAIN),
+        (replace(good, guid=Guid.of("10.0.0.3", 1)), Refusal.WRONG_PEER),
+        (replace(good, instance=LOW.instance), Refusal.MYSELF),
+    ]
+    for welcome, code in cases:
+        verdict = judge_welcome(welcome, LOW, HIGH.guid)
+        assert verdict is not None
+        assert verdict.code == code
+
+
+@pytest.mark.parametrize("place", ["0.0.0.0:0", "0.1.2.3:40001", "224.0.0.1:40001", "240.0.0.1:1", "10.0.0.1:0"])
+def test_unreachable_guid_is_malformed(place: str) -> None:
+    """Discovery gossips the GUIDs of its links; one that no beacon may carry stopped all its beacons."""
+    refuse = problem(replace(HELLO, guid=Guid.parse(place)).serialize())
+    assert refuse.code == Refusal.MALFORMED
+    assert "no peer can be reached" in refuse.text
+
+
+@given(
+    guid=st.builds(
+        Guid.of, st.ip_addresses(v=4, network="64.0.0.0/2"), st.integers(1, 0xFFFF), st.integers(0, 0xFFFF)
+    ),
+    instance=st.binary(min_size=16, max_size=16),
+    name=st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,63}", fullmatch=True),
+    domain=st.integers(0, 232),
+    lease=st.integers(1, 2**32 - 1),
+    expected=st.integers(1, 2**64 - 1),
+    lane=st.integers(0, 255),
+)
+def test_any_hello_survives(
+    guid: Guid, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int
+) -> None:
+    hello = Hello(guid, instance, name, domain, lease, Guid(expected), lane)
+    assert Hello.parse(hello.serialize()) == hello
+
+
+# Messages in parts, marks between them, and how a bulk lane's machine differs.
+
+
+def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> list[bytes]:
+    """The frames of one message, cut at these sizes and one more for the rest."""
+    pieces = []
+    for size in sizes:
+        pieces.append(payload[:size])
+        payload = payload[size:]
+    pieces.append(payload)
+    frames = []
+    for number, piece in enumerate(pieces):
+        flags = FIRST * (number == 0) | LAST * (number == len(pieces) - 1)
+        frames.append(Frame(FrameKind.DATA, piece, route, sequence, 99, flags).serialize())
+    return frames
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 24, 25, 4096, 1 << 20])
+def test_fragments_of_several_routes_interleave(chunk: int) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    one, two = bytes(range(256)) * 4, b"two" * 300
+    first, second = fragments(1, 5, one, [100, 900]), fragments(2, 6, two, [1, 898])
+    small = pack_data_header(5, 3, 1, 99) + b"small"
+    wire = b"".join([first[0], second[0], small, second[1], first[1], first[2], small, second[2]])
+    deliver(wire, acceptor, time.now, chunk)
+    assert acceptor.messages() == [(1, 5, 99, one), (2, 6, 99, two)]
+    assert [flags for route, _, _, flags, _ in acceptor.parts if route == 1] == [FIRST, 0, LAST]
+    assert acceptor.data == [(3, 1, 99, b"small")] * 2
+
+
+@pytest.mark.parametrize("flags", [FIRST, 0, LAST, WHOLE])
+@pytest.mark.parametrize("chunk", [1000, 65_536, 131_073])
+def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    payload = bytes(range(251)) * 1000
+    assert core_limits.CUT_THROUGH_BYTES < len(payload) <= limits.DATA_PAYLOAD_MAX
+    wire = Frame(FrameKind.DATA, payload, 7, 1, 99, flags).serialize()
+    half = len(wire) // 2
+    consumed, wanted = acceptor.receive(memoryview(wire[:half]), time.now)
+    assert (consumed, wanted) == (half, 0), "nothing is kept, nothing is waited for"
+    assert sum(len(part) for *_, part in acceptor.parts) == half - 24
+    deliver(wire[half:] + Frame(FrameKind.CONTROL, b"{}").serialize(), acceptor, time.now, chunk)
+    assert b"".join(part for *_, part in acceptor.parts) == payload
+    marks = [mark for _, _, _, mark, _ in acceptor.parts]
+    assert marks[0] == flags & FIRST
+    assert marks[-1] == flags & LAST
+    assert not any(marks[1:-1])
+    assert {part[:3] for part in acceptor.parts} == {(7, 1, 99)}
+    assert acceptor.last() == ("control", b"{}"), "the next frame begins behind it"
+
+
+def test_short_frame_is_delivered_whole() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    payload = bytes(core_limits.CUT_THROUGH_BYTES)
+    deliver(pack_data_header(len(payload), 7, 1, 99) + payload, acceptor, time.now, 50_000)
+    assert acceptor.data == [(7, 1, 99, payload)]
+    assert acceptor.parts == []
+
+
+def test_header_alone_delivers_nothing() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    for size in (100, limits.DATA_PAYLOAD_MAX):
+        assert acceptor.receive(memoryview(pack_data_header(size, 7, 1, 99)), time.now) == (0, 24 + size)
+    assert not acceptor.parts
+    assert not acceptor.data
+
+
+def test_an_abort_is_handed_on_as_a_part_without_bytes() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    frames = fragments(7, 1, bytes(900), [300, 300])
+    abort = Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
+    deliver(frames[0] + frames[1] + abort, acceptor, time.now, 11)
+    assert [(flags, len(part)) for _, _, _, flags, part in acceptor.parts] == [
+        (FIRST, 300),
+        (0, 300),
+        (LAST | ABORT, 0),
+    ]
+    assert acceptor.messages() == []
+
+
+@pytest.mark.parametrize("flags", [ABORT, FIRST | ABORT, WHOLE | ABORT])
+def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    with pytest.raises(RemoteProtocolError, match="aborts"):
+        acceptor.receive(memoryview(Frame(FrameKind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
+    assert acceptor.state is ConnectionState.CLOSED
+    assert acceptor.parts == []
+
+
+@pytest.mark.parametrize("size", [limits.DATA_PAYLOAD_MAX + 1, 0xFFFFFFFF])
+@pytest.mark.parametrize("flags", [0, FIRST, LAST, WHOLE, LAST | ABORT])
+def test_too_long_frame_is_refused_by_its_header(size: int, flags: int) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    header = size.to_bytes(4, "big") + bytes([FrameKind.DATA, flags]) + bytes(18)
+    with pytest.raises(LimitExceeded):
+        acceptor.receive(memoryview(header), time.now)
+
+
+def test_no_fragment_before_the_handshake_is_over() -> None:
+    time = Time()
+    acceptor = Side(ACCEPTOR, HIGH, time)
+    with pytest.raises(RemoteProtocolError, match="data frame while handshaking"):
+        acceptor.receive(memoryview(Frame(FrameKind.DATA, b"x", flags=FIRST).serialize()), time.now)
+
+
+def test_closing_from_within_a_part_stops_the_reading() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    got: list[int] = []
+
+    def on_part(_route: int, _sequence: int, _stamp: int, _flags: int, part: memoryview) -> None:
+        got.append(len(part))
+        acceptor.lost("closed by its user")
+
+    acceptor.routes = AnyRoute(lambda *_: acceptor.data.append((0, 0, 0, b"")), on_part)
+    wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000) + pack_data_header(1, 1, 2, 0) + b"x"
+    acceptor.receive(memoryview(wire[:150_000]), time.now)
+    acceptor.receive(memoryview(wire[150_000:]), time.now)
+    assert got == [150_000 - 24]
+    assert acceptor.data == []
+
+
+def test_rest_of_a_begun_frame_is_dropped_while_closing() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    wire = pack_data_header(200_000, 1, 1, 0) + bytes(200_000)
+    acceptor.receive(memoryview(wire[:150_000]), time.now)
+    acceptor.close("done", time.now)
+    acceptor.receive(memoryview(wire[150_000:]), time.now)
+    assert len(acceptor.parts) == 1
+
+
+def test_half_read_frame_renews_the_lease_only_with_bytes() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    acceptor.receive(memoryview(pack_data_header(200_000, 1, 1, 0) + bytes(1000)), time.now)
+    for _ in range(5):
+        time.now += 0.9
+        acceptor.receive(memoryview(bytes(1000)), time.now)
+        acceptor.handle_timer(time.now)
+    assert not acceptor.seen("closed")
+    pass_time(acceptor, time, 1.0)
+    assert acceptor.last()[0] == "closed"
+
+
+@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
+@pytest.mark.parametrize("chunk", [1, 24, 1 << 20])
+def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    said: list[object] = []
+    for link in (dialler, acceptor):
+        link.routes = AnyRoute(lambda _r, sequence, _t, _v: said.append(sequence))
+    mark = Frame(kind, route=7, sequence=0xFFFFFFFF).serialize()
+    wire = pack_data_header(1, 7, 1, 0) + b"x" + mark + pack_data_header(1, 7, 2, 0) + b"x"
+    for link in (dialler, acceptor):
+        said.clear()
+        link.events = said  # type: ignore[assignment]
+        deliver(wire, link, time.now, chunk)
+        assert said == [1, ("mark", kind, 7, 0xFFFFFFFF), 2]
+        assert not link.output, "who answers a fence is the driver's business"
+
+
+@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
+def test_a_mark_has_no_bytes(kind: FrameKind) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    with pytest.raises(LimitExceeded, match=kind.name.lower()):
+        acceptor.receive(memoryview(bytes([0, 0, 0, 1, kind, 3]) + bytes(18)), time.now)
+
+
+def test_bulk_lane_has_its_own_lease() -> None:
+    time = Time()
+    dialler, acceptor = pair(time, lane=Lane.BULK)
+    hello, welcome = acceptor.remote, dialler.remote
+    assert hello is not None
+    assert welcome is not None
+    assert hello.lane == welcome.lane == acceptor.lane == Lane.BULK
+    assert hello.lease == welcome.lease == limits.BULK_LEASE
+    pings = 0
+    begin = time.now
+    while time.now < begin + 100.0:
+        time.now = min(t for s in (dialler, acceptor) if (t := s.next_timer()) is not None)
+        for mine in (dialler, acceptor):
+            mine.handle_timer(time.now)
+            pings += bool(mine.output)
+        exchange(dialler, acceptor, time)
+    assert dialler.state is acceptor.state is ConnectionState.UP
+    assert pings <= 100 * 2.1, "a bulk lane's keepalives are seldom"

@@ -45,6 +45,14 @@ def exports() -> Exports:
     return Exports(Policy(PolicySettings(deny=("/secret",))))
 
 
+@pytest.fixture
+def offering(exports: Exports) -> Exports:
+    """/cmd is offered to peer 1."""
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    return exports
+
+
 def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None:
     graph(
         exports,
@@ -85,31 +93,27 @@ def test_a_changed_type_is_offered_again_and_a_changed_address_is_not(exports: E
     ]
 
 
-def test_one_connection_on_demand_serves_all_subscribers(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.link_up(2)
-    assert exports.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
-    assert exports.opened(2, OpenRoute(9, "/cmd", "/joy")) == []
-    assert exports.described(CMD, ABOUT) == [
+def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> None:
+    offering.link_up(2)
+    assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
+    assert offering.opened(2, OpenRoute(9, "/cmd", "/joy")) == []
+    assert offering.described(CMD, ABOUT) == [
         Send(1, RouteOpened(7, ABOUT)),
         AddRoute(CMD, 1, 7, Contract()),
         Send(2, RouteOpened(9, ABOUT)),
         AddRoute(CMD, 2, 9, Contract()),
     ]
-    assert exports.flowing(CMD) == (1, 2)
-    assert exports.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7)]
-    assert exports.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
-    assert exports.flowing(CMD) == ()
+    assert offering.flowing(CMD) == (1, 2)
+    assert offering.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7)]
+    assert offering.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
+    assert offering.flowing(CMD) == ()
 
 
-def test_a_late_peer_gets_the_known_description_at_once(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.link_up(2)
-    exports.opened(1, OpenRoute(1, "/cmd", "/joy"))
-    exports.described(CMD, ABOUT)
-    assert exports.opened(2, OpenRoute(1, "/cmd", "/joy")) == [
+def test_a_late_peer_gets_the_known_description_at_once(offering: Exports) -> None:
+    offering.link_up(2)
+    offering.opened(1, OpenRoute(1, "/cmd", "/joy"))
+    offering.described(CMD, ABOUT)
+    assert offering.opened(2, OpenRoute(1, "/cmd", "/joy")) == [
         Send(2, RouteOpened(1, ABOUT)),
         AddRoute(CMD, 2, 1, Contract()),
     ]
@@ -125,64 +129,54 @@ def test_what_is_not_offered_is_not_opened(exports: Exports, topic: str) -> None
     assert "policy" in action.message.reason
 
 
-def test_a_lost_publisher_closes_every_route_and_forgets_them(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    exports.described(CMD, ABOUT)
-    assert exports.lost(CMD, "it hung up") == [
+def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports) -> None:
+    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    offering.described(CMD, ABOUT)
+    assert offering.lost(CMD, "it hung up") == [
         RemoveRoute(CMD, 1, 7),
         Send(1, RouteClosed(7, "it hung up")),
     ]
-    assert exports.lost(CMD, "it hung up") == []
-    assert exports.closed(1, CloseRoute(7)) == []
-    assert exports.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
+    assert offering.lost(CMD, "it hung up") == []
+    assert offering.closed(1, CloseRoute(7)) == []
+    assert offering.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
 
 
-def test_a_restarted_node_is_left_at_its_old_address(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    exports.described(CMD, ABOUT)
-    assert graph(exports, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
+def test_a_restarted_node_is_left_at_its_old_address(offering: Exports) -> None:
+    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    offering.described(CMD, ABOUT)
+    assert graph(offering, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
         RemoveRoute(CMD, 1, 7),
         Send(1, RouteClosed(7, "the node has restarted")),
         Disconnect(CMD),
     ]
 
 
-def test_a_link_that_falls_takes_its_routes_along(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.link_up(2)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    exports.opened(2, OpenRoute(7, "/cmd", "/joy"))
-    exports.described(CMD, ABOUT)
-    assert exports.link_down(1) == [RemoveRoute(CMD, 1, 7)]
-    assert exports.link_down(2) == [RemoveRoute(CMD, 2, 7), Disconnect(CMD)]
-    assert exports.link_down(2) == []
+def test_a_link_that_falls_takes_its_routes_along(offering: Exports) -> None:
+    offering.link_up(2)
+    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    offering.opened(2, OpenRoute(7, "/cmd", "/joy"))
+    offering.described(CMD, ABOUT)
+    assert offering.link_down(1) == [RemoveRoute(CMD, 1, 7)]
+    assert offering.link_down(2) == [RemoveRoute(CMD, 2, 7), Disconnect(CMD)]
+    assert offering.link_down(2) == []
 
 
-def test_a_route_opened_twice_is_ignored_and_said(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
-    [action] = exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+def test_a_route_opened_twice_is_ignored_and_said(offering: Exports) -> None:
+    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    [action] = offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
     assert isinstance(action, Warn)
 
 
-def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports) -> None:
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(offering: Exports) -> None:
+    offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
     for route in (8, 9):
-        [action] = exports.opened(1, OpenRoute(route, "/cmd", "/joy"))
+        [action] = offering.opened(1, OpenRoute(route, "/cmd", "/joy"))
         assert isinstance(action, Send)
         assert isinstance(action.message, RouteClosed)
         assert action.message.route == route
-    assert exports.described(CMD, ABOUT) == [Send(1, RouteOpened(7, ABOUT)), AddRoute(CMD, 1, 7, Contract())]
-    exports.closed(1, CloseRoute(7))
-    assert exports.opened(1, OpenRoute(10, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
+    assert offering.described(CMD, ABOUT) == [Send(1, RouteOpened(7, ABOUT)), AddRoute(CMD, 1, 7, Contract())]
+    offering.closed(1, CloseRoute(7))
+    assert offering.opened(1, OpenRoute(10, "/cmd", "/joy")) == [Connect(CMD, JOY.uri)]
 
 
 def bounded(topics: int) -> Exports:
@@ -291,13 +285,11 @@ def sends(actions: list[Any]) -> list[object]:
 
 
 @pytest.fixture
-def flowing(exports: Exports) -> Exports:
+def flowing(offering: Exports) -> Exports:
     """/cmd flows reliably to peer 1, by epoch 1."""
-    graph(exports, {CMD: JOY})
-    exports.link_up(1)
-    exports.opened(1, SURE)
-    exports.described(CMD, ABOUT)
-    return exports
+    offering.opened(1, SURE)
+    offering.described(CMD, ABOUT)
+    return offering
 
 
 def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:

@@ -1,20 +1,29 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 from typing import TYPE_CHECKING, Self
 
 import pytest
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
-from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
-from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, server_header
+from rmpa.ros.node import service_client as module
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed, probe
+from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.tcpros import ServiceDescription, encode_header, error_header, server_header
+from rmpa.runtime import limits
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
+from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+
 MD5 = "6a2e34150c00229791cc89ff309fff21"
+
+
 ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)
 
 
@@ -201,3 +210,156 @@ async def test_nobody_there() -> None:
         uri = server.uri
     with pytest.raises(UnreachableError, match="Connect call failed"):
         await ServiceConnection.open(uri, "/add", "/c")
+
+
+GET = ServiceDescription("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0")
+
+
+HEADER = server_header("/talker", GET)
+
+
+SERVICE = "/talker/get_loggers"
+
+
+class Program:
+    """A program at a TCP port that is no part of rmpa."""
+
+    def __init__(self) -> None:
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self.links: list[RawSubscriber] = []
+
+    async def accept(self) -> RawSubscriber:
+        """The next connection."""
+        async with asyncio.timeout(DEADLINE):
+            sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
+        sock.setblocking(False)
+        self.links.append(RawSubscriber(sock))
+        return self.links[-1]
+
+    async def asked(self, *answers: bytes, node: str = "/talker", close: bool = False) -> str:
+        """The result of a probe of this program, which sends these bytes behind the header that it gets."""
+        asking = asyncio.create_task(probe("127.0.0.1", self.port, SERVICE, timeout=DEADLINE, node=node))
+        link = await self.accept()
+        fields = await link.header()
+        assert fields == {"probe": "1", "service": SERVICE, "md5sum": "*", "callerid": "/rmpa"}
+        for answer in answers:
+            await link.send(answer)
+            await asyncio.sleep(0)
+        if close:
+            link.close()
+        return await asking
+
+    def close(self) -> None:
+        """Close the port and all connections."""
+        self._socket.close()
+        for link in self.links:
+            link.close()
+
+
+@pytest.fixture
+async def program() -> AsyncIterator[Program]:
+    made = Program()
+    yield made
+    made.close()
+
+
+async def test_an_answer_of_the_expected_node_is_a_success(program: Program) -> None:
+    answer = encode_header(HEADER)
+    assert await program.asked(answer) == ""
+    assert await program.asked(answer, node="") == "", "any node will do"
+    assert await program.asked(*(answer[at : at + 1] for at in range(len(answer)))) == ""
+    without_name = {key: value for key, value in HEADER.items() if key != "callerid"}
+    assert await program.asked(encode_header(without_name)) == ""
+    for link in program.links:
+        assert await link.ended(), "the probe leaves nothing behind, and sends nothing more"
+
+
+async def test_another_node_at_that_port_is_a_failure(program: Program) -> None:
+    answer = encode_header({**HEADER, "callerid": "/camera\n"})
+    assert await program.asked(answer) == "another node listens there: /camera�"
+
+
+async def test_an_error_counts_only_if_it_names_the_node(program: Program) -> None:
+    of_rospy = "[{}] is not a provider of  [/talker/get_loggers]"
+    of_roscpp = "received a tcpros connection for a nonexistent service [/talker/get_loggers]."
+    assert await program.asked(encode_header(error_header(of_rospy.format("/talker")))) == ""
+    assert await program.asked(encode_header({**error_header(of_roscpp), "callerid": "/talker"})) == ""
+    for text in (of_rospy.format("/talker2"), of_roscpp):
+        problem = await program.asked(encode_header(error_header(text)))
+        assert problem == f"a ROS node listens there, but not the expected one: {text}"
+    assert "not the expected one" in await program.asked(encode_header(error_header(of_roscpp)), node="")
+
+
+async def test_what_is_no_ros_node_is_a_failure(program: Program) -> None:
+    no_node = "the program that listens there is no ROS node"
+    assert await program.asked(b"HTTP/1.1 400 Bad Request\r\n\r\n") == no_node
+    assert await program.asked(b"\x05\0\0\0\x01\0\0\0x") == no_node
+    assert "closed the connection without an answer" in await program.asked(b"\x05\0", close=True)
+
+
+async def test_silence_ends_with_the_timeout(program: Program) -> None:
+    assert await probe("127.0.0.1", program.port, SERVICE, timeout=0.1) == "connected, but no answer within 0.1 s"
+    assert await (await program.accept()).header(), "its header was sent all the same"
+
+
+async def test_a_port_where_nothing_listens(program: Program) -> None:
+    program.close()
+    assert await probe("127.0.0.1", program.port, SERVICE, timeout=DEADLINE) == "connection refused"
+    assert await probe("127.0.0.1", program.port, "", timeout=DEADLINE) == "connection refused"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (OSError(errno.EHOSTUNREACH, "x"), "no route to host"),
+        (OSError(errno.ENETUNREACH, "x"), "network is unreachable"),
+        (OSError("odd"), "odd"),
+    ],
+)
+async def test_reasons_are_those_of_the_network(monkeypatch: pytest.MonkeyPatch, error: OSError, reason: str) -> None:
+    async def fail(*_: object) -> socket.socket:
+        raise error
+
+    monkeypatch.setattr(module, "connect", fail)
+    assert await probe("192.0.2.1", 1, SERVICE, timeout=DEADLINE) == reason
+
+
+async def test_a_host_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def hang(*_: object) -> socket.socket:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    monkeypatch.setattr(module, "connect", hang)
+    assert await probe("192.0.2.1", 1, SERVICE, timeout=0.05) == "no answer within 0.05 s"
+
+
+async def test_a_name_that_does_not_resolve_is_a_reason() -> None:
+    assert "does not resolve here" in await probe("no-such-host.invalid", 1, SERVICE, timeout=DEADLINE)
+
+
+async def test_without_a_service_a_connection_is_enough(program: Program) -> None:
+    assert await probe("127.0.0.1", program.port, "", timeout=DEADLINE) == ""
+    assert await (await program.accept()).ended()
+
+
+async def test_a_node_of_ours_answers() -> None:
+    node = SlaveNode("/ours", "127.0.0.1", "http://127.0.0.1:11311/")
+    await node.start()
+    try:
+        endpoint = ServiceEndpoint("/ours/get_loggers", "/ours", lambda _: None, description=GET)
+        node.add_service(endpoint)
+        port = int(node.service_uri.rpartition(":")[2])
+        assert await probe("127.0.0.1", port, "/ours/get_loggers", timeout=DEADLINE, node="/ours") == ""
+        assert "listens there: /ours" in await probe(
+            "127.0.0.1", port, "/ours/get_loggers", timeout=DEADLINE, node="/talker"
+        )
+    finally:
+        await node.close()
+
+
+async def test_the_last_file_descriptors_are_not_taken(program: Program) -> None:
+    with descriptors_left(limits.DESCRIPTORS_RESERVED):
+        problem = await probe("127.0.0.1", program.port, SERVICE, timeout=DEADLINE)
+    assert problem == "no file descriptor is left for the attempt; `rmpa doctor` says what to do"

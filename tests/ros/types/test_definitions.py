@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 
 from rmpa.core.errors import LimitExceeded
 from rmpa.ros import limits
@@ -17,7 +23,13 @@ from rmpa.ros.types.definitions import (
     md5sum,
     parse_definition,
 )
-from tests.ros.types.genmsg_cases import MESSAGES
+from rmpa.ros.types.installed import ServiceType, action_message, actions_of, known_services
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.typestore import Ros1Store
+from tests.ros.types.genmsg_cases import MESSAGES, SERVICES
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
 def test_a_text_is_read() -> None:
@@ -136,3 +148,135 @@ def test_any_text_is_a_definition_or_an_error(text: str) -> None:
 def test_unknown_type_has_a_remedy() -> None:
     with pytest.raises(DefinitionError, match="its definition is learnt from a publisher"):
         known_specifications("my_msgs/Unknown")
+
+
+@pytest.mark.parametrize(
+    ("name", "md5sum"),
+    [
+        ("std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e"),
+        ("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522"),
+        ("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16"),
+        ("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0"),
+        ("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea"),
+        ("rospy_tutorials/AddTwoInts", "6a2e34150c00229791cc89ff309fff21"),
+        ("nav_msgs/GetMap", "6cdd0a18e0aff5b0a3ca2326a89b54ff"),
+        ("nav_msgs/GetPlan", "421c8ea4d21c6c9db7054b4bbdf1e024"),
+        ("sensor_msgs/SetCameraInfo", "bef1df590ed75ed1f393692395e15482"),
+        ("dynamic_reconfigure/Reconfigure", "bb125d226a21982a4a98760418dc2672"),
+    ],
+)
+def test_the_sums_of_services_that_ros_knows(name: str, md5sum: str) -> None:
+    assert ServiceType(name).md5sum == md5sum
+
+
+@pytest.mark.parametrize(("text", "answer"), SERVICES.items())
+def test_a_text_is_split_as_by_genmsg(text: str, answer: tuple[str, str, str]) -> None:
+    if not answer[0]:
+        with pytest.raises(DefinitionError):
+            ServiceType("my_msgs/Case", text)
+        return
+    kind = ServiceType("my_msgs/Case", text)
+    assert (kind.md5sum, kind.request.definition, kind.response.definition) == answer
+
+
+@pytest.mark.parametrize("name", known_services())
+def test_every_type_makes_requests_and_responses(name: str) -> None:
+    kind = ServiceType(name)
+    assert kind.describe().request_type == f"{name}Request"
+    for half in (kind.request, kind.response):
+        message = half.make()
+        assert half.to_plain(half.deserialize(half.serialize(message))) == half.to_plain(message)
+
+
+def test_a_request_in_bytes() -> None:
+    add = ServiceType("rospy_tutorials/AddTwoInts")
+    raw = add.request.serialize(add.request.make([20, 22]))
+    assert raw == b"\x14" + bytes(7) + b"\x16" + bytes(7)
+    assert add.response.to_plain(add.response.deserialize(b"\x2a" + bytes(7))) == {"sum": 42}
+    empty = ServiceType("std_srvs/Empty")
+    assert empty.request.serialize(empty.request.make()) == b""
+    assert empty.response.to_plain(empty.response.deserialize(b"")) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("int64\n---\n", "'int64' is neither a field nor a constant"),
+        ("Thing a\n---\n", "message type p/Thing: is not known here, and p/TRequest embeds it"),
+    ],
+)
+def test_what_is_refused_of_a_service(text: str, problem: str) -> None:
+    with pytest.raises(DefinitionError, match=problem):
+        ServiceType("p/T", text)
+
+
+def test_a_type_that_does_not_come_with_us_is_refused() -> None:
+    with pytest.raises(DefinitionError, match="service type my_pkg/Do: is not a service that comes with rmpa"):
+        ServiceType("my_pkg/Do")
+
+
+GENACTION: Final = Path("/usr/lib/actionlib_msgs/genaction.py")
+
+
+ACTION_TEXT: Final = "# how far\nfloat64 metres\nuint8 FAST=1\n---\nbool done\n---\nfloat64 left  # m"
+
+
+def test_which_action_a_message_may_be_of() -> None:
+    assert list(actions_of("DoActionGoal")) == [("Do", "ActionGoal"), ("DoAction", "Goal")]
+    assert list(actions_of("DoAction")) == [("Do", "Action")]
+    assert list(actions_of("Goal")) == []
+    assert list(actions_of("Pose")) == []
+
+
+def test_a_file_without_three_parts_is_no_action() -> None:
+    assert action_message("Do", "Goal", "int8 a\n---\nint8 b") is None
+    assert action_message("Do", "ActionGoal", "---\n---\n---\n") is None
+
+
+@pytest.mark.skipif(not GENACTION.exists(), reason="ROS 1 is not installed (no genaction.py of actionlib_msgs)")
+@pytest.mark.parametrize("text", [ACTION_TEXT, "---\n---\n", "int8 a\n--- \nint8 b\n----\nint8 c\n"])
+def test_the_texts_are_those_of_genaction(tmp_path: Path, text: str) -> None:
+    (tmp_path / "Do.action").write_text(text)
+    subprocess.run([sys.executable, GENACTION, "Do.action", "-o", tmp_path], cwd=tmp_path, check=True)
+    made = sorted(tmp_path.glob("*.msg"))
+    assert len(made) == 7
+    for path in made:
+        (_, part), *_ = actions_of(path.stem)
+        assert action_message("Do", part, text) == path.read_text(), part
+
+
+NAMES = (
+    "diagnostic_msgs/DiagnosticArray", "nav_msgs/OccupancyGrid", "nav_msgs/Odometry", "sensor_msgs/CameraInfo",
+    "sensor_msgs/Joy", "sensor_msgs/PointCloud2", "std_msgs/Empty",
+    "trajectory_msgs/JointTrajectory",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rosbags_own() -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bytes_are_those_of_rosbags_own_store(name: str, rosbags_own: Typestore) -> None:
+    kind, inner = MessageType(name), name.replace("/", "/msg/")
+    values = {"header": {"seq": 7, "stamp": {"secs": 3, "nsecs": 4}, "frame_id": "map"}}
+    message = kind.make(values if any(field.name == "header" for field in kind.fields) else None)
+    raw = kind.serialize(message)
+    assert raw == bytes(rosbags_own.serialize_ros1(message, inner))
+    assert repr(kind.deserialize(raw)) == repr(rosbags_own.deserialize_ros1(raw, inner))
+
+
+def test_it_is_ros_1_alone() -> None:
+    store = Ros1Store(Stores.ROS1_NOETIC)
+    empty = store.types["std_msgs/msg/String"](data="")
+    with pytest.raises(NotImplementedError, match="ROS 1 alone"):
+        store.serialize_cdr(empty, "std_msgs/msg/String")
+    with pytest.raises(KeyError):
+        store.get_msgdef("nobody_msgs/msg/Nothing")
+
+
+def test_what_one_store_learns_another_does_not_know() -> None:
+    one, other = Ros1Store(Stores.EMPTY), Ros1Store(Stores.EMPTY)
+    one.types["x/msg/Y"] = object  # type: ignore[assignment] # any will do
+    assert "x/msg/Y" not in other.types

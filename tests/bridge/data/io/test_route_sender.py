@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 from hypothesis import given, settings
@@ -19,15 +19,16 @@ from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, running
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 SMALL = b"s" * 8
 LARGE = b"L" * (mesh_limits.EXPRESS_MESSAGE_MAX + 1)
 ROW = mesh_limits.EXPRESS_AGAIN_MESSAGES
 RELIABLE = Contract(reliability=Reliability.RELIABLE)
+_Sender = TypeVar("_Sender", bound=RouteSender)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def clock() -> Iterator[Clock]:
     with running(Clock()) as made:
         yield made
@@ -39,6 +40,12 @@ def best_effort(link: Link, contract: Contract | None = None, *, large: bool = F
 
 def reliable(link: Link, contract: Contract = RELIABLE, *, large: bool = False) -> ReliableRouteSender:
     return ReliableRouteSender(link, 7, contract, 5, large=large)
+
+
+def fresh(make: Callable[..., _Sender], *terms: Contract, large: bool = False) -> tuple[Link, _Sender]:
+    """A sender with a link of its own."""
+    link = Link()
+    return link, make(link, *terms, large=large)
 
 
 def answer(link: Link, sender: RouteSender) -> None:
@@ -54,10 +61,8 @@ def on_bulk(link: Link, sender: RouteSender) -> None:
 # --- best effort ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("clock")
 def test_small_messages_are_sent_at_once() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     for n in range(5):
         assert sender.message(100 + n, memoryview(SMALL + bytes([n]))) == 0
     assert link.sent == [("express", n + 1, SMALL + bytes([n])) for n in range(5)]
@@ -66,10 +71,8 @@ def test_small_messages_are_sent_at_once() -> None:
     assert sender.lane == "express"
 
 
-@pytest.mark.usefixtures("clock")
 def test_messages_behind_a_fence_keep_their_order() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     sender.message(0, b"1")
     buffer = bytearray(LARGE)
     sender.message(0, memoryview(buffer))
@@ -89,8 +92,7 @@ def test_messages_behind_a_fence_keep_their_order() -> None:
 
 
 def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW - 1):
@@ -110,8 +112,7 @@ def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
 
 
 def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
@@ -127,11 +128,9 @@ def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None
     assert link.numbers == list(range(1, len(link.sent) + 1))
 
 
-@pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(("history", "kept"), [(History.KEEP_LAST, 3), (History.KEEP_ALL, 10)])
 def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(depth=3, history=history), large=True)
+    link, sender = fresh(best_effort, Contract(depth=3, history=history), large=True)
     drops = [sender.message(0, bytes([n])) for n in range(10)]
     assert drops == [0] * kept + [1] * (10 - kept)
     answer(link, sender)
@@ -141,8 +140,7 @@ def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
 
 def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "LANE_QUEUE_BYTES", 1000)
-    link = Link()
-    sender = best_effort(link, large=True)
+    link, sender = fresh(best_effort, large=True)
     assert sender.message(0, bytes(400)) == 0
     assert sender.message(0, bytes(400)) == 0
     assert sender.message(0, bytes(300)) == 1
@@ -157,13 +155,11 @@ def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -
     assert sender.message(0, bytes(1000)) == 0, "the count of bytes began anew"
 
 
-@pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(
     ("priority", "lane"), [(Priority.HIGH, "express"), (Priority.NORMAL, None), (Priority.LOW, "bulk")]
 )
 def test_the_priority_outweighs_the_size(priority: Priority, lane: str | None) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(priority=priority))
+    link, sender = fresh(best_effort, Contract(priority=priority))
     assert bool(link.fences) is (priority is Priority.LOW), "a low one changes its lane before its first message"
     if link.fences:
         answer(link, sender)
@@ -174,20 +170,16 @@ def test_the_priority_outweighs_the_size(priority: Priority, lane: str | None) -
     assert link.lanes == ([lane] * 2 if lane else ["express", "bulk"])
 
 
-@pytest.mark.usefixtures("clock")
 def test_large_source_changes_its_lane_first() -> None:
-    link = Link()
-    sender = best_effort(link, large=True)
+    link, sender = fresh(best_effort, large=True)
     assert list(link.fences) == [("express", 1)]
     answer(link, sender)
     sender.message(0, LARGE)
     assert link.lanes == ["bulk"]
 
 
-@pytest.mark.usefixtures("clock")
 def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
-    link = Link()
-    sender = best_effort(link, large=True)
+    link, sender = fresh(best_effort, large=True)
     sender.message(0, SMALL)
     sender.lane_lost()
     assert not link.sent, "the fence is on the other lane"
@@ -197,8 +189,7 @@ def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
 
 def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     """What waits for the lane's next connection would come late; the fence behind it would never be answered."""
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     on_bulk(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
@@ -213,10 +204,8 @@ def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.BULK_STALE_AGE, False), "they hold on"
 
 
-@pytest.mark.usefixtures("clock")
 def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     on_bulk(link, sender)
     link.log.clear()
     sender.lane_lost()
@@ -225,7 +214,6 @@ def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     assert link.log == [("bulk", "message", 7, 2)]
 
 
-@pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(
     ("contract", "depth", "ages", "strict"),
     [
@@ -255,18 +243,14 @@ def test_both_lanes_get_the_bounds(
     assert link.bulk.terms == {7: (depth, ages[1], strict)}
 
 
-@pytest.mark.usefixtures("clock")
 def test_drops_of_a_lane_are_returned() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     link.drops.extend([3, 0, 2])
     assert [sender.message(0, SMALL) for _ in range(3)] == [3, 0, 2]
 
 
-@pytest.mark.usefixtures("clock")
 def test_sequences_wrap() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     sender.sequence = (1 << 32) - 2
     for _ in range(3):
         sender.message(0, SMALL)
@@ -280,10 +264,8 @@ def test_sequences_wrap() -> None:
 BIG = 300_000
 
 
-@pytest.mark.usefixtures("clock")
 def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
-    link = Link()
-    sender = best_effort(link)
+    link, sender = fresh(best_effort)
     assert not sender.begin(11, BIG), "the first one is what changes the lane: it is wanted whole"
     sender.message(11, bytes(BIG))
     assert not sender.begin(12, BIG), "and so is what comes before the fence is answered"
@@ -304,7 +286,6 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
     assert link.sent[-1][2][-1:] == b"z"
 
 
-@pytest.mark.usefixtures("clock")
 def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
     link, flow = Link(), ExportFlow()
     flow.add(1, link, 7, Contract(priority=Priority.HIGH), 0)
@@ -313,7 +294,6 @@ def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
     assert link.lanes == ["express"]
 
 
-@pytest.mark.usefixtures("clock")
 def test_aborted_message_uses_its_number() -> None:
     link, flow = Link(), ExportFlow()
     flow.large = True
@@ -332,8 +312,7 @@ def test_aborted_message_uses_its_number() -> None:
 
 
 def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=10.0))
+    link, sender = fresh(best_effort, Contract(max_rate=10.0))
     for n in range(10):
         sender.message(n, bytes([n]))
         clock.advance(0.008)
@@ -346,8 +325,7 @@ def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
 
 
 def test_newer_message_replaces_the_waiting_one(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=10.0))
+    link, sender = fresh(best_effort, Contract(max_rate=10.0))
     sender.message(0, b"a")
     clock.advance(0.05)
     sender.message(0, b"b")
@@ -358,8 +336,7 @@ def test_newer_message_replaces_the_waiting_one(clock: Clock) -> None:
 
 
 def test_a_pause_costs_the_next_one_nothing(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=10.0))
+    link, sender = fresh(best_effort, Contract(max_rate=10.0))
     for n in range(5):
         sender.message(0, bytes([n]))
         clock.advance(1.0)
@@ -368,8 +345,7 @@ def test_a_pause_costs_the_next_one_nothing(clock: Clock) -> None:
 
 @pytest.mark.parametrize("hertz", [30.01, 29.99, 30.0])
 def test_nearly_equal_rate_loses_only_the_surplus(clock: Clock, hertz: float) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=30.0))
+    link, sender = fresh(best_effort, Contract(max_rate=30.0))
     for _ in range(9_000):
         sender.message(0, SMALL)
         clock.advance(1 / hertz)
@@ -403,8 +379,7 @@ def test_rate_is_kept_and_the_newest_is_sent(rate: float, gaps: list[float]) -> 
 
 
 def test_downsampled_large_messages_are_sent_whole(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=10.0))
+    link, sender = fresh(best_effort, Contract(max_rate=10.0))
     for n in range(4):
         assert not sender.begin(n, BIG)
         sender.message(n, bytes(BIG))
@@ -415,8 +390,7 @@ def test_downsampled_large_messages_are_sent_whole(clock: Clock) -> None:
 
 
 def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
-    link = Link()
-    sender = best_effort(link, Contract(max_rate=10.0))
+    link, sender = fresh(best_effort, Contract(max_rate=10.0))
     sender.message(0, b"a")
     sender.message(0, b"b")
     sender.close()
@@ -438,8 +412,7 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 
 def test_acknowledgements_move_the_window(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
-    link = Link()
-    sender = reliable(link)
+    link, sender = fresh(reliable)
     for n in range(10):
         assert sender.message(n, bytes([n])) == 0
     assert link.numbers == [1, 2, 3, 4]
@@ -453,11 +426,9 @@ def test_acknowledgements_move_the_window(clock: Clock, monkeypatch: pytest.Monk
     assert clock.due == [], "TCP repeats; no timer of ours does"
 
 
-@pytest.mark.usefixtures("clock")
 def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 2)
-    link = Link()
-    sender = reliable(link, Contract(reliability=Reliability.RELIABLE, depth=5))
+    link, sender = fresh(reliable, Contract(reliability=Reliability.RELIABLE, depth=5))
     lost = [sender.message(0, bytes([n])) for n in range(9)]
     # 1 and 2 are under way: to drop them frees no place that is known to be lost.
     assert sum(lost) == 2
@@ -467,10 +438,8 @@ def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.Monke
     assert link.numbers == [1, 2, 5, 6, 7, 8, 9]
 
 
-@pytest.mark.usefixtures("clock")
 def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
-    link = Link()
-    sender = reliable(link)
+    link, sender = fresh(reliable)
     sender.message(0, SMALL)
     sender.begin(0, BIG)
     sender.message(0, bytes(BIG))
@@ -483,10 +452,8 @@ def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
     assert sender.sender.in_flight == 2
 
 
-@pytest.mark.usefixtures("clock")
 def test_lost_bulk_lane_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = Link()
-    sender = reliable(link)
+    link, sender = fresh(reliable)
     sender.message(0, LARGE)
     answer(link, sender)
     for n in range(4):
@@ -506,10 +473,8 @@ def test_lost_bulk_lane_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sender.sender.idle
 
 
-@pytest.mark.usefixtures("clock")
 def test_bulk_lost_during_an_express_fence_replays_nothing() -> None:
-    link = Link()
-    sender = reliable(link)
+    link, sender = fresh(reliable)
     sender.message(0, SMALL)
     sender.message(0, LARGE)
     sender.lane_lost()
@@ -519,8 +484,7 @@ def test_bulk_lost_during_an_express_fence_replays_nothing() -> None:
 
 
 def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
-    link = Link()
-    sender = reliable(link)
+    link, sender = fresh(reliable)
     sender.message(0, LARGE)
     answer(link, sender)
     clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
@@ -535,10 +499,8 @@ def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     ]
 
 
-@pytest.mark.usefixtures("clock")
 def test_an_old_acknowledgement_does_no_harm() -> None:
-    link = Link()
-    sender = reliable(link, large=True)
+    link, sender = fresh(reliable, large=True)
     answer(link, sender)
     for _ in range(5):
         sender.message(0, SMALL)
@@ -548,20 +510,16 @@ def test_an_old_acknowledgement_does_no_harm() -> None:
     assert link.numbers == [1, 2, 3, 4, 5, 5]
 
 
-@pytest.mark.usefixtures("clock")
 def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
-    link = Link()
-    sender = reliable(link)
+    _, sender = fresh(reliable)
     sender.message(0, SMALL)
     with pytest.raises(RemoteProtocolError):
         sender.acknowledged(2)
 
 
-@pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
 def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
-    old, new = Link(), Link()
-    sender = reliable(old)
+    new, (old, sender) = Link(), fresh(reliable)
     for n in range(3):
         sender.message(0, bytes([n]))
     sender.suspend()
@@ -580,7 +538,6 @@ def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
     assert 9 in new.bulk.terms
 
 
-@pytest.mark.usefixtures("clock")
 def test_large_topic_changes_its_lane_on_a_new_link() -> None:
     old, new = Link(), Link()
     sender = reliable(old, large=True)
@@ -597,11 +554,9 @@ def test_large_topic_changes_its_lane_on_a_new_link() -> None:
     assert new.sent == [("bulk", 1, LARGE)]
 
 
-@pytest.mark.usefixtures("clock")
 def test_later_acknowledgement_outweighs_the_position() -> None:
     """Of two links that come up at once, the message of the one that is given up comes last."""
-    old, new = Link(), Link()
-    sender = reliable(old)
+    new, (_, sender) = Link(), fresh(reliable)
     for _ in range(3):
         sender.message(0, SMALL)
     sender.acknowledged(2)
@@ -610,10 +565,8 @@ def test_later_acknowledgement_outweighs_the_position() -> None:
     assert new.numbers == [3]
 
 
-@pytest.mark.usefixtures("clock")
 def test_a_peer_cannot_go_on_where_it_never_was() -> None:
-    old, new = Link(), Link()
-    sender = reliable(old)
+    new, (_, sender) = Link(), fresh(reliable)
     sender.message(0, SMALL)
     sender.suspend()
     with pytest.raises(RemoteProtocolError):
