@@ -24,7 +24,7 @@ from rmpa.runtime.tls import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from rmpa.gateway.neighbour import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
@@ -73,11 +73,12 @@ class BoundedQueue(Generic[_T]):
         self.dropped = 0
         """Items that found no room."""
 
-    def _push(self, items: Iterable[tuple[_T, int]], *, besides: int = 0) -> list[_T]:
-        """Queue items; return those that were dropped. ``besides``: items that count, and wait elsewhere."""
-        for item in items:
-            self._items.append(item)
-            self._bytes += item[1]
+    def _push(self, item: _T, size: int, besides: int = 0) -> Sequence[_T]:
+        """Queue an item; return those that were dropped. ``besides``: items that count, and wait elsewhere."""
+        self._items.append((item, size))
+        self._bytes += size
+        if len(self._items) + besides <= self._messages and self._bytes <= self._limit:
+            return ()
         dropped = []
         while len(self._items) > 1 and (len(self._items) + besides > self._messages or self._bytes > self._limit):
             old, size = self._items.popleft()
@@ -136,8 +137,7 @@ class ArrivalQueue(BoundedQueue[_T]):
         with self._arrivals.lock:
             if self._closed:
                 return
-            dropped = self._push(((item, size),))
-            if dropped:
+            if dropped := self._push(item, size):
                 self._arrivals.refused["zenoh.arrival.dropped"] += len(dropped)
                 self._give_back(dropped)
             if not self._scheduled:
@@ -150,7 +150,7 @@ class ArrivalQueue(BoundedQueue[_T]):
             self._give_back(self._clear())
             self._arrivals.wake()
 
-    def _give_back(self, items: list[_T]) -> None:
+    def _give_back(self, items: Sequence[_T]) -> None:
         if self._discard is not None:
             self._arrivals.discarded.extend((self._discard, item) for item in items)
 
@@ -335,9 +335,11 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
             if self._closed:
                 self.dropped += len(messages)
                 return len(messages)
-            dropped = self._push(((message, len(message[0])) for message in messages), besides=self._taken)
+            before = self.dropped
+            for message in messages:
+                self._push(message, len(message[0]), self._taken)
             self._schedule()
-        return len(dropped)
+            return self.dropped - before
 
     def declared(self, handle: Any) -> None:
         """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
