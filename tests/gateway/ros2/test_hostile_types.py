@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2 import transcoder
-from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
+from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.graph import Ros2Graph
 from rmpa.gateway.ros2.mapping import TypeMapping
 from rmpa.gateway.ros2.pairs import Ros2Pairs
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 HEAD = b"\0\1\0\0"
-INT32, STRING, NESTED, FIXED = 6, 17, 1, 48
+INT32, NESTED = 6, 1
 
 
 def laughs(levels: int) -> dict[str, list[tuple[str, int, int, int, str]]]:
@@ -67,25 +67,6 @@ def test_a_definition_of_ros_1_likewise(levels: int) -> None:
     with pytest.raises(RmpaError):
         pairs.outgoing(MessageType.learn("eve/L0", bomb1(levels)))
     assert time.process_time() - begin < 5
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [
-        [("x", FIXED + INT32, 2**62, 0, "")],
-        [("x", FIXED + INT32, 0, 0, "")],
-        [],
-        [("x", FIXED + NESTED, 1, 0, "eve/msg/A")],
-        [("__import__('os').system('true')", INT32, 0, 0, "")],
-        [("x\n    import os", INT32, 0, 0, "")],
-    ],
-    ids=["giant array", "no elements", "no fields", "itself", "code", "line"],
-)
-def test_described_fields_that_are_code_endless_or_nothing_are_refused(
-    fields: list[tuple[str, int, int, int, str]],
-) -> None:
-    with pytest.raises(RemoteProtocolError):
-        parse_type_response(respond({"eve/msg/A": fields}))
 
 
 def test_descriptions_are_bounded_in_types_and_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,10 +191,3 @@ def test_a_mapping_file_is_data_and_its_errors_name_it(tmp_path: Path) -> None:
         with contextlib.suppress(RmpaError):
             TypeMapping().read(file)
         assert not (tmp_path / "owned").exists()
-
-
-def test_hostile_bytes_are_a_conversion_error_for_every_pair() -> None:
-    string = Conversion(MessageType("std_msgs/String"), "std_msgs/msg/String", Ros2Types("jazzy"))
-    for raw in (b"", b"\0", HEAD, HEAD + b"\xff" * 4, b"\xff" * 100, HEAD + struct.pack("<I", 2**32 - 1) + b"a" * 10):
-        with pytest.raises(ConversionError):
-            string.to_ros1(raw)

@@ -59,11 +59,15 @@ def test_another_version_of_a_known_type_is_converted_by_its_own_fields() -> Non
     assert conversion.to_ros1(raw) == string.serialize(string.make({"data": "hi"}))
 
 
-HOSTILE = {
+HOSTILE: dict[str, dict[str, list[tuple[str, int, int, int, str]]]] = {
     "code in a field": {WHEELS: [("x = __import__('os')", 6, 0, 0, "")]},
     "code in a type": {"base_msgs/msg/Whe\nels": [("x", 6, 0, 0, "")]},
     "code in a nested type": {WHEELS: [("x", 1, 0, 0, "a/msg/B)]; exit(")]},
+    "a line of code": {WHEELS: [("x\n    import os", 6, 0, 0, "")]},
+    "no elements": {WHEELS: [("x", 48 + 6, 0, 0, "")]},
+    "no fields": {WHEELS: []},
     "itself": {WHEELS: [("x", 1, 0, 0, WHEELS)]},
+    "itself in an array": {WHEELS: [("x", 49, 1, 0, WHEELS)]},
     "each other": {WHEELS: [("x", 1, 0, 0, "a/msg/B")], "a/msg/B": [("y", 145, 0, 0, WHEELS)]},
     "a large array": {WHEELS: [("x", 48 + 6, limits.ROS2_ARRAY_MAX + 1, 0, "")]},
     "large arrays in arrays": {

@@ -112,35 +112,14 @@ DEFAULT_DEPTH: Final = 10
 """Messages that *keep last* keeps by default."""
 
 
-class Ros2Reliability(IntEnum):
-    """Whether a message that is lost on the way is sent again."""
-
-    RELIABLE = 1
-    BEST_EFFORT = 2
-
-
-class Ros2Durability(IntEnum):
-    """Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched."""
-
-    TRANSIENT_LOCAL = 1
-    VOLATILE = 2
-
-
-class Ros2History(IntEnum):
-    """How many messages an endpoint keeps."""
-
-    KEEP_LAST = 1
-    KEEP_ALL = 2
-
-
-class Ros2Liveliness(IntEnum):
-    """How a publisher shows that it is alive."""
-
-    AUTOMATIC = 1
-    MANUAL_BY_NODE = 2
-    MANUAL_BY_TOPIC = 3
-
-
+Ros2Reliability = IntEnum("Ros2Reliability", "RELIABLE BEST_EFFORT")
+"""Whether a message that is lost on the way is sent again."""
+Ros2Durability = IntEnum("Ros2Durability", "TRANSIENT_LOCAL VOLATILE")
+"""Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched."""
+Ros2History = IntEnum("Ros2History", "KEEP_LAST KEEP_ALL")
+"""How many messages an endpoint keeps."""
+Ros2Liveliness = IntEnum("Ros2Liveliness", "AUTOMATIC MANUAL_BY_NODE MANUAL_BY_TOPIC")
+"""How a publisher shows that it is alive."""
 _Kind = TypeVar("_Kind", bound=IntEnum)
 
 
@@ -175,16 +154,14 @@ class Ros2Qos:
 
     def serialize(self) -> str:
         """The text in a liveliness token."""
-        default = Ros2Qos()
-        kinds = (
-            ("" if value is usual else str(int(value)))
-            for value, usual in (
-                (self.reliability, default.reliability),
-                (self.durability, default.durability),
-                (self.history, default.history),
-                (self.liveliness, default.liveliness),
-            )
+        usual = Ros2Qos()
+        pairs = (
+            (self.reliability, usual.reliability),
+            (self.durability, usual.durability),
+            (self.history, usual.history),
+            (self.liveliness, usual.liveliness),
         )
+        kinds = ("" if value is default else str(int(value)) for value, default in pairs)
         reliability, durability, history, liveliness = kinds
         times = f"{_duration(self.deadline)}:{_duration(self.lifespan)}:{liveliness},{_duration(self.lease)}"
         return f"{reliability}:{durability}:{history},{self.depth}:{times}"
