@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import re
 import signal
@@ -20,6 +19,7 @@ from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
@@ -338,6 +338,8 @@ class Enough(Exception):  # noqa: N818 - not an error
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
     """Run a coroutine to its end; Ctrl-C and SIGTERM cancel it, and its own clean-up runs."""
+    import asyncio  # it takes 35 ms, which verbs that ask only the agent do without
+
     from rmpa.runtime.accept import raise_file_limit
 
     async def run() -> None:
@@ -384,6 +386,8 @@ async def watch_topic(
         take: Called for each message; what it raises is raised here, but ``Enough``.
         tick: Called when there is the subscription, each second, and at the end.
     """
+    import asyncio
+
     ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def on_message(received: Received) -> None:

@@ -6,7 +6,6 @@ Colours are click's: it drops them where standard output is no terminal, and eve
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -70,6 +69,8 @@ def print_text(*text: Text) -> None:
         if isinstance(item, str):
             click.echo(item if isinstance(item, Painted) else printable(item))
         elif isinstance(item, Table):
+            import shutil
+
             width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
             click.echo("\n".join(_table_lines(item, width)))
         else:

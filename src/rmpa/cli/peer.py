@@ -18,7 +18,6 @@ from rmpa.core.counters import SampleSummary
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.operations import INFO, REPORT
 from rmpa.observe.peer_info import FOREIGN, SitesReport
 from rmpa.observe.snapshot import PingReply
 
@@ -297,6 +296,8 @@ def site_list(name: str | None, options: Options) -> int:
       rmpa site list --name store-gateway
       rmpa site list --json | jq -r '.[].sites[].name'
     """
+    from rmpa.observe.operations import REPORT
+
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
         if not reports:
@@ -350,6 +351,8 @@ def site_info(site: str, name: str | None, options: Options) -> int:
       rmpa site info warehouse
       rmpa site info warehouse --json | jq '.sites[0].sources[] | select(.here == "")'
     """
+    from rmpa.observe.operations import INFO
+
     with _connect(options, name) as client:
         report = _ask(client, INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)

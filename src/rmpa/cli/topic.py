@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import time
 from collections import deque
@@ -337,6 +336,8 @@ class _Figures:
 
     async def show(self, *, as_json: bool) -> None:
         """Print a line of figures if a message came since the last one; the first call prints a heading."""
+        import asyncio
+
         shown, self._shown = self._shown, self.messages
         if shown == self.messages or shown is None:
             if not as_json:

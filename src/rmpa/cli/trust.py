@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import os
 import socket
@@ -433,6 +432,8 @@ def _renew_files(module: Module) -> int:
         authority = module.authority()
         authority.renew_own()
         return int(authority.membership.certificate.expires)
+    import asyncio
+
     from rmpa.trust.joining import renew_at_authority
 
     membership, known = module.membership(), module.store.load_authority()

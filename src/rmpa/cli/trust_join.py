@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import re
@@ -261,6 +260,8 @@ def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
 
 
 def _join_by_token(module: Module, text: str) -> MemberFiles:
+    import asyncio
+
     from rmpa.trust.joining import join_mesh
     from rmpa.trust.store import AuthorityPlace
     from rmpa.trust.tokens import Token, TokenError
