@@ -135,6 +135,18 @@ async def test_a_client_beyond_the_bound_is_told_so_and_requests_are_served() ->
             await socket.close()
 
 
+async def test_a_websocket_stays_whatever_else_connects(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "WEB_CONNECTIONS_MAX", 2)
+    async with running() as (server, _), aiohttp.ClientSession() as session, connect(session, server) as client:
+        silent = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(3)]
+        async with asyncio.timeout(DEADLINE):
+            assert await silent[0][0].read() == b"", "the idlest was not closed"
+            await client.send_str('{"op": "call_service", "service": "/rosapi/get_time"}')
+            assert json.loads((await client.receive()).data)["result"]
+        for _, writer in silent:
+            writer.close()
+
+
 async def test_a_failed_handshake_is_counted_and_its_connection_keeps_its_limits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -289,7 +289,8 @@ class ConnectionTable:
         """Take a connection in; return whether there is room."""
         self.accepted += 1
         if len(self.open) >= limits.WEB_CONNECTIONS_MAX:
-            idle = next((each for each in self.open if each.phase is not ConnectionPhase.ANSWERING), connection)
+            at_work = ConnectionPhase.ANSWERING, ConnectionPhase.UPGRADED
+            idle = next((each for each in self.open if each.phase not in at_work), connection)
             idle.refuse("connections", f"{limits.WEB_CONNECTIONS_MAX} connections are open; the idlest is closed")
             if idle is connection:
                 return False
