@@ -16,6 +16,7 @@ from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode, frame_header
 from rmpa.web.gateways.gateways import Gateways
+from rmpa.web.hub.node_link import EVERYTHING, NodeRules
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
@@ -32,11 +33,14 @@ ONE = b"\x03\0\0\0one"
 
 
 @asynccontextmanager
-async def running(token: str = "", **policy: Any) -> AsyncIterator[tuple[WebServer, Any]]:
+async def running(
+    token: str = "", rules: NodeRules = EVERYTHING, **policy: Any
+) -> AsyncIterator[tuple[WebServer, Any]]:
+    """A server that may control where it has a token, and its core."""
     async with local_core() as core:
         agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
         watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
-        hub = make_hub(watch, 8480)
+        hub = make_hub(watch, 8480, rules)
         settings = Settings(web=WebSettings(control=bool(token)))
         rights = WebSetup(settings, TokenAccess(token), CertificateFiles()).rights
         gateways = Gateways(hub, "test", rights)

@@ -22,20 +22,16 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.master.parameters import Parameters
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.gateways.gateways import Gateways
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.monitor import LogFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import MessageValues, ResourceWatch
-from rmpa.web.server.access import AccessPolicy, own_names
-from rmpa.web.server.agent_watch import AgentWatch
-from rmpa.web.server.app import WebServer
-from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub
+from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.ros.node.peers import DEADLINE, until
 from tests.web.hub.client import FakeClient, local_core, node, running_hub
-from tests.web.snapshots import FULL as SNAPSHOT
+from tests.web.server.test_gateways import running
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -167,22 +163,12 @@ def test_a_server_is_made_anew_for_other_rights_rules_or_another_token_alone() -
 @asynccontextmanager
 async def connected() -> AsyncIterator[tuple[Any, Any]]:
     """A rosbridge client of a ruled server, and the core."""
-    async with local_core() as core:
-        agent = msgspec.structs.replace(SNAPSHOT.agent, core_uri=core.uri)
-        watch = AgentWatch(lambda: msgspec.structs.replace(SNAPSHOT, agent=agent))
-        hub = make_hub(watch, 8480, RULED)
-        gateways = Gateways(hub, "test", setup().rights)
-        policy = AccessPolicy(0, own_names(("base",)), TOKEN.token)
-        server = WebServer(watch, policy, "127.0.0.1", gateways)
-        try:
-            async with hub, aiohttp.ClientSession() as session:
-                await server.start()
-                url = f"ws://127.0.0.1:{server.port}/rosbridge?token={TOKEN.token}"
-                async with session.ws_connect(url) as client:
-                    yield client, core
-                await gateways.close()
-        finally:
-            await server.close()
+    async with (
+        running(TOKEN.token, RULED) as (server, core),
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"ws://127.0.0.1:{server.port}/rosbridge?token={TOKEN.token}") as client,
+    ):
+        yield client, core
 
 
 async def asked(socket: Any, **request: object) -> dict[str, Any]:

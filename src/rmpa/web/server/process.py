@@ -273,12 +273,8 @@ class WebSetup:
     def serves_as(self, other: WebSetup) -> bool:
         """Whether a server made of the other one would let clients do the same under the same token."""
         mine, theirs = self.settings, other.settings
-        return (mine.web, mine.trust, self.trusted, self.access.token) == (
-            theirs.web,
-            theirs.trust,
-            other.trusted,
-            other.access.token,
-        )
+        same = (mine.web, mine.trust) == (theirs.web, theirs.trust)
+        return same and (self.trusted, self.access.token) == (other.trusted, other.access.token)
 
 
 def access_of(web: WebSettings, module: str, environ: Mapping[str, str], state: str = "") -> TokenAccess:
