@@ -12,7 +12,6 @@ from tests.simulation.direct_scenario import DirectScenario
 from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.large_scenario import PARTS, USUAL_PARTS, Figures, LargeScenario
 from tests.simulation.mesh_scenario import MeshScenario
-from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import Scenario
 
@@ -21,8 +20,8 @@ def main() -> int:
     """Print the trace and its hash; 1 if the peers do not agree, or a message was lost unseen."""
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable and direct")
-    kinds = ["rosters", "mesh", "lanes", "reliable", "direct", "rests", "large"]
+    parser.add_argument("--peers", type=int, default=2, help="not with --kind direct")
+    kinds = ["rosters", "mesh", "lanes", "direct", "rests", "large"]
     parser.add_argument("--kind", choices=kinds, default="rosters")
     parser.add_argument("--loss", type=float, default=0.01, help="large: share of datagrams that are lost")
     parser.add_argument(
@@ -34,11 +33,9 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.kind == "large":
         return _play_large(arguments)
-    scenario: Scenario | ReliableScenario | DirectScenario
+    scenario: Scenario | DirectScenario
     if arguments.kind == "direct":
         scenario = DirectScenario(arguments.seed, keep=True)
-    elif arguments.kind == "reliable":
-        scenario = ReliableScenario(arguments.seed, keep=True)
     else:
         make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario, "rests": RestsScenario}[
             arguments.kind

@@ -1,7 +1,6 @@
 """A network that exists only in memory: seeded, so that one seed always gives one and the same run.
 
-Datagrams are lost, doubled, delayed and thereby reordered; byte streams keep their order, are cut into other
-pieces than they were sent in, stall while the network is parted, and break when an end dies.
+Datagrams are lost, doubled, delayed and thereby reordered; ``sockets`` has the byte streams.
 """
 
 from __future__ import annotations
@@ -19,11 +18,7 @@ if TYPE_CHECKING:
 
 Address = tuple[str, int]
 OnDatagram = Callable[[bytes, Address, bool], None]
-OnAccept = Callable[["End"], None]
-OnDialled = Callable[["End | None"], None]
 
-_RETRY: Final = 0.2
-"""Seconds between two attempts of a stalled stream to go on, like TCP's retransmissions."""
 _KEPT_LINES: Final = 400
 
 
@@ -100,10 +95,8 @@ class Network:
     sides: dict[str, int] = field(default_factory=dict)
     """Host to side of a partition; empty while the network is whole."""
     sockets: dict[Address, OnDatagram] = field(default_factory=dict)
-    listeners: dict[Address, OnAccept] = field(default_factory=dict)
-    streams: list[Stream] = field(default_factory=list)
     tcp: dict[Address, SimListener] = field(default_factory=dict)
-    """Listening sockets by address; ``listeners`` and ``streams`` are a simpler kind, without sockets."""
+    """Listening sockets by address."""
     connections: dict[int, SimSocket] = field(default_factory=dict)
     """Every open end of a connection, by its descriptor."""
     walled: set[str] = field(default_factory=set)
@@ -146,125 +139,7 @@ class Network:
             self.datagrams += 1
             receive(data, source, multicast)
 
-    def dial(self, host: str, to: Address, on_done: OnDialled) -> None:
-        """Connect a byte stream; ``on_done(None)`` if no process listens there, no call while hosts are parted."""
-
-        def arrive() -> None:
-            if to[0] in self.walled or not self.reaches(host, to[0]):
-                return
-            accept = self.listeners.get(to)
-            if accept is None:
-                self.world.after(self.delay(), lambda: on_done(None))
-                return
-            stream = Stream(self, host, to[0])
-            self.streams.append(stream)
-            accept(stream.callee)
-            self.world.after(self.delay(), lambda: on_done(stream.caller))
-
-        self.world.after(self.delay(), arrive)
-
     def kill(self, host: str) -> None:
-        """A process dies: its kernel resets its streams."""
-        for stream in [s for s in self.streams if host in {s.caller.host, s.callee.host}]:
-            for end in (stream.caller, stream.callee):
-                if end.host == host:
-                    end.close(reset=True)
+        """A process dies: its kernel resets its connections."""
         for sock in [sock for sock in self.connections.values() if sock.host == host]:
             sock.kill()
-
-
-class Stream:
-    """A connected pair of ends."""
-
-    def __init__(self, network: Network, caller: str, callee: str) -> None:
-        self.caller = End(network, self, caller)
-        self.callee = End(network, self, callee)
-        self.caller.other, self.callee.other = self.callee, self.caller
-
-
-class End:
-    """One end of a byte stream.
-
-    Set ``on_bytes`` and ``on_close`` (called with whether it was a reset) before anything arrives.
-    """
-
-    other: End
-
-    def __init__(self, network: Network, stream: Stream, host: str) -> None:
-        self.host = host
-        self.closed = False
-        self.on_bytes: Callable[[bytes], None] = lambda _: None
-        self.on_close: Callable[[bool], None] = lambda _: None
-        self._network = network
-        self._stream = stream
-        self._packets: deque[tuple[float, bytes | bool]] = deque()
-        self._pumping = False
-        self._early: list[bytes | bool] = []
-        self.ready = False
-
-    def send(self, data: bytes) -> None:
-        """Send bytes; they arrive in order, in other pieces."""
-        rng = self._network.world.rng
-        while data and not self.closed:
-            size = len(data) if rng.random() < 0.7 else rng.randint(1, len(data))
-            self._push(data[:size])
-            data = data[size:]
-
-    def close(self, *, reset: bool = False) -> None:
-        """Close this end; the other one notices after the bytes in flight (if reset: at once, and they are lost)."""
-        if self.closed:
-            return
-        self.closed = True
-        if reset:
-            self._packets.clear()
-        self._push(reset)
-
-    def begin(self) -> None:
-        """The callbacks are set: deliver what came meanwhile."""
-        self.ready = True
-        early, self._early = self._early, []
-        for item in early:
-            self.arrive(item)
-
-    def arrive(self, item: bytes | bool) -> None:
-        """Deliver one piece, or the end."""
-        if self.closed:
-            return
-        if not self.ready:
-            self._early.append(item)
-        elif isinstance(item, bytes):
-            self.on_bytes(item)
-        else:
-            self.closed = True
-            self._forget()
-            self.on_close(item)
-
-    def _push(self, item: bytes | bool) -> None:
-        when = self._network.world.now + self._network.delay()
-        if self._packets:
-            when = max(when, self._packets[-1][0])
-        self._packets.append((when, item))
-        if not self._pumping:
-            self._pumping = True
-            self._network.world.at(when, self._pump)
-
-    def _pump(self) -> None:
-        world = self._network.world
-        while self._packets and self._packets[0][0] <= world.now:
-            if self.other.closed:
-                self._packets.clear()
-                break
-            if not self._network.reaches(self.host, self.other.host):
-                world.after(_RETRY, self._pump)
-                return
-            _, item = self._packets.popleft()
-            self.other.arrive(item)
-        self._pumping = bool(self._packets)
-        if self._pumping:
-            world.at(self._packets[0][0], self._pump)
-        else:
-            self._forget()
-
-    def _forget(self) -> None:
-        if self.closed and self.other.closed and self._stream in self._network.streams:
-            self._network.streams.remove(self._stream)
