@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class OwnedTasks:
-    """OwnedTasks that end together; the failure of one is logged."""
+    """Tasks that end together; the failure of one is logged."""
 
     def __init__(self) -> None:
         self._tasks: set[asyncio.Task[Any]] = set()

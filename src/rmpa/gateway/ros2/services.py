@@ -231,10 +231,10 @@ class OfferedService:
             _log.debug("%s is not offered to ROS 2: %s", self.source.here, reason)
         return bool(reason)
 
-    async def _describe(self) -> ServiceDescription:
-        """Ask the server for its type until it answers."""
+    async def _describe(self) -> ServiceDescription | None:
+        """Ask the server for its type until it answers; ``None`` once the service is gone."""
         again, longest = _ROS2_DESCRIBE_AGAIN
-        while True:
+        while not self._closed:
             try:
                 return await self._context.graph.describe(self.source)
             except RmpaError as error:
@@ -242,13 +242,14 @@ class OfferedService:
                     self._say(f"the service cannot be asked for its type: {error}")
             await asyncio.sleep(again)
             again = min(again * 2, longest)
+        return None
 
     async def _offer(self) -> None:
         context, name = self._context, self.source.here
         if self._without_use(type_by_name(self.source.name)):
             return  # not even asked for its type: each node has two of these
         description = await self._describe()
-        if self._without_use(description.type):
+        if description is None or self._without_use(description.type):
             return
         try:
             kind = await asyncio.to_thread(find_service_type, description.type, description.md5sum)

@@ -10,6 +10,7 @@ import pytest
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.ros2 import services
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
@@ -95,6 +96,26 @@ async def test_a_service_that_is_gone_is_gone_in_ros2(bed: Ros2TopicBed) -> None
     bed.graph.remove(source)
     assert bed.network.token_keys == []
     assert bed.network.queryables == []
+
+
+async def test_a_service_that_left_before_it_told_its_type_is_not_asked_again(
+    bed: Ros2TopicBed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = 0
+
+    async def describe(_source: object) -> None:
+        nonlocal asked
+        asked += 1
+        raise UnreachableError("server", "/add")
+
+    monkeypatch.setattr(services, "_ROS2_DESCRIBE_AGAIN", (0.001, 0.001))
+    monkeypatch.setattr(bed.graph, "describe", describe)
+    source = bed.graph.server("/add", ADD, add)
+    await eventually(lambda: asked > 2)
+    assert "cannot be asked for its type" in bed.problems["/add"]
+    bed.graph.remove(source)
+    await eventually(lambda: not len(bed.neighbour.context))
+    assert bed.problems == {}
 
 
 async def test_of_two_servers_of_one_name_one_is_called(bed: Ros2TopicBed) -> None:
