@@ -170,7 +170,7 @@ class TopicFacts:
             yield entry.topic, self.incoming(sessions[peer], source, entry), texts
 
     def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
-        """The route of a peer's source; ``source`` has its wire name. ``follow_clocks`` was called before."""
+        """The route of a peer's source; ``source`` has its wire name."""
         topics, contracts = self._bridge.topics.of(session), self._bridge.context.contracts
         flow, publication = topics.flow(source), topics.publication(source)
         about, now = entry.description, self._clock.now()
@@ -180,13 +180,14 @@ class TopicFacts:
             problem = entry.problem
         figures = {}
         if flow is not None:
+            clock = self._peer_clocks.get(session.peer) or PeerClockHistory()
             figures = {
                 "oversized": flow.oversized,
                 "oversized_bytes": flow.oversized_bytes,
                 "late": flow.counts["late"] + flow.counts["stale"],
                 "expired": flow.counts["expired"],
                 "lane": flow.lane,
-                **_quality(flow.quality.summary(self._peer_clocks[session.peer], now, latching=latched)),
+                **_quality(flow.quality.summary(clock, now, latching=latched)),
             }
         return RouteInfo(
             peer=session.link.name,
