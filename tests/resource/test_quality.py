@@ -127,6 +127,8 @@ def test_intervals_are_intersected() -> None:
     one = Requirement("a", {"zoom": Bound(1, 5, weight=2)})
     other = Requirement("b", {"zoom": Bound(3, 9, hard=True), "rate": Bound(low=1)})
     assert merge([one, other]) == ({"zoom": Bound(3, 5, weight=2, hard=True), "rate": Bound(low=1)}, [])
+    touching = Requirement("c", {"zoom": Bound(5, 7)})
+    assert merge([one, touching]) == ({"zoom": Bound(5, 5, weight=2)}, [])
 
 
 def test_an_empty_intersection_is_resolved_by_priority_and_reported() -> None:
