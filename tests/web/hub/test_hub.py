@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.ros.types.definitions import SEPARATOR, known_text, parse_definition
+from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits
@@ -188,17 +188,6 @@ async def test_what_waits_too_long_for_the_core_is_not_sent(core: RosCore, monke
         assert TWO in heard  # the last state counts, however old it is
 
 
-async def test_two_versions_of_a_type_are_kept_apart(core: RosCore) -> None:
-    async with running_hub(core) as hub:
-        for text in ("float64 a", "int32 b"):
-            kind = MessageType("my_msgs/Pair", parse_definition("my_msgs/Pair", text))
-            header = {"type": kind.name, "md5sum": kind.md5sum, "message_definition": kind.definition}
-            hub.types.learn(header)
-            assert hub.types.version(kind.name, kind.md5sum).definition == kind.definition
-        first = MessageType("my_msgs/Pair", parse_definition("my_msgs/Pair", "float64 a"))
-        assert hub.types.version(first.name, first.md5sum).md5sum == first.md5sum
-
-
 async def test_a_publisher_that_has_gone_leaves_no_latched_message(core: RosCore) -> None:
     async with running_hub(core) as hub, node(core, "a") as a:
         publisher = await a.advertise("/map", LATCHED, latch=True)
@@ -250,21 +239,6 @@ async def test_a_subscription_of_another_type_is_told_and_refused_by_the_publish
         publisher.publish(publisher.make(7))
         await until(lambda: heard.payloads == [b"\x07\0\0\0"])
         assert len(heard.others) == 1
-
-
-async def test_what_a_client_publishes_reaches_nodes_and_other_clients(core: RosCore) -> None:
-    async with running_hub(core) as hub, node(core, "echo") as echo:
-        heard: list[bytes] = []
-        await echo.subscribe("/t", callback=lambda message: heard.append(message.raw))
-        await until(lambda: "/t" in hub.graph.topics)
-        two = FakeClient(hub).hear("/t")
-        out = FakeClient(hub).talk("/t")
-        out.publish(ONE)  # at once, before any subscriber is connected
-        await until(lambda: heard == [ONE])
-        assert two.payloads == [ONE]
-        out.publish(TWO)
-        await until(lambda: heard == [ONE, TWO])
-        assert two.payloads == [ONE, TWO]
 
 
 async def test_what_clients_publish_is_numbered_as_rospy_numbers_it(core: RosCore) -> None:

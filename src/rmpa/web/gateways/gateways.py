@@ -88,7 +88,7 @@ class Gateways:
         monitor: Monitor | None = None,
     ) -> None:
         self.counters = Counters()
-        """Clients that were refused or disconnected, by the words of ``figures.REASONS``."""
+        """Clients that were refused or disconnected, by the words of ``REASONS``."""
         self._refusals = RefusalLog(_log, self.counters)
         self.upgraded: Callable[[web.Request, Callable[[], None]], Callable[[], int]] = lambda *_: int
         """Called when the handshake of a WebSocket is done, with what is to be called if a frame of the client is not
@@ -178,7 +178,7 @@ class Gateways:
 
         Args:
             address: The client's.
-            reason: One of ``figures.REASONS``.
+            reason: One of ``REASONS``.
             text: What happened, for the log.
         """
         self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {text}")
