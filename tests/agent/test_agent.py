@@ -16,8 +16,6 @@ import pytest
 from rmpa.agent.agent import Agent
 from rmpa.bridge import limits
 from rmpa.config.peer_rules import PolicySettings
-from rmpa.config.settings import Settings
-from rmpa.config.values import Multicast
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import proxied_node
 from rmpa.observe.control_client import ControlClient
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
+    from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import Snapshot
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
 
@@ -68,23 +67,6 @@ def flows_to(agent: Agent, peers: int) -> bool:
 
 def has_subscribers(publisher: Publisher) -> bool:
     return publisher.subscribers > 0
-
-
-@pytest.fixture
-def settings(tmp_path: Path) -> Callable[..., Settings]:
-    group_port = 20000 + os.getpid() % 20000
-
-    def make(name: str, policy: PolicySettings | None = None, core_port: int = 0) -> Settings:
-        return Settings(
-            name=name,
-            core_port=core_port,
-            interfaces=("lo",),
-            multicast=Multicast(port=group_port),
-            policy=policy or PolicySettings(),
-            runtime_dir=str(tmp_path),
-        )
-
-    return make
 
 
 @asynccontextmanager

@@ -6,14 +6,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rmpa.config.settings import TimeSettings
-from tests.agent.test_agent import node, running, settings, until
+from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]
 
 
 async def test_a_followed_clock_does_not_stay_home(settings: Callable[..., Settings]) -> None:

@@ -20,7 +20,7 @@ from rmpa.observe.peer_info import PeerAgent
 from rmpa.ros.environment import NodeFacts, PeerNodes, RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
-from tests.agent.test_agent import running, settings, until
+from tests.agent.test_agent import running, until
 from tests.ros.node.peers import DEADLINE
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]
 
 ARGS: Final[dict[str, dict[str, Any]]] = {
     "snapshot": {},

@@ -35,7 +35,7 @@ from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import accept as descriptors
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS, Use
-from tests.agent.test_agent import node, running, settings, until
+from tests.agent.test_agent import node, running, until
 from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import FilesInfo, RouteInfo, Snapshot
-
-__all__ = ["settings"]
 
 HARD = 64
 NODES = 40

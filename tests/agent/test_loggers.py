@@ -4,7 +4,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.ros.node.service_client import ServiceConnection
-from tests.agent.test_agent import running, settings
+from tests.agent.test_agent import running
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     import pytest
 
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]  # a fixture, used by its name
 
 
 def strings(*texts: str) -> bytes:

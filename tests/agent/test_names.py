@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.contract import ContractRule
-from tests.agent.test_agent import Sink, node, running, settings, until
+from tests.agent.test_agent import Sink, node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import TopicInfo
-
-__all__ = ["settings"]  # the fixture
 
 PREFIX = (PeerRule("robot", "/{peer}"),)
 

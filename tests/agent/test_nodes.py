@@ -19,15 +19,13 @@ from rmpa.ros.environment import NodeFacts, NodePing, PeerNodes
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.service_client import ServiceConnection
-from tests.agent.test_agent import node, running, settings, until
+from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]
 
 
 async def ask(agent: Agent, kind: Any, what: str, name: str = "", peer: str | None = "b") -> Any:

@@ -24,7 +24,7 @@ from rmpa.core.errors import PeerRefused
 from rmpa.observe import limits as observe_limits
 from rmpa.ros.wire.xmlrpc import serialize_response
 from rmpa.trust.permissions import Permissions
-from tests.agent.test_agent import Sink, node, running, settings, until
+from tests.agent.test_agent import Sink, node, running, until
 from tests.agent.test_services import serving
 from tests.agent.test_services_direct import about, transport
 from tests.agent.test_why import ask, stopped_at
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from rmpa.observe.why.diagnosis import Diagnosis
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-
-__all__ = ["settings"]
 
 
 @pytest.fixture(autouse=True)

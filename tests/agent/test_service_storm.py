@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.agent.service_storm import rage
-from tests.agent.test_agent import settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]
 
 
 @pytest.mark.timeout(120)

@@ -17,7 +17,7 @@ from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.test_agent import running, settings, until
+from tests.agent.test_agent import running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
-
-__all__ = ["settings"]
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 

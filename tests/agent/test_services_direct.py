@@ -18,7 +18,7 @@ from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.test_agent import running, settings, until
+from tests.agent.test_agent import running, until
 from tests.agent.test_services import MD5, Server, come_back, fall_silent, provider, serving
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import ServiceInfo
-
-__all__ = ["settings"]
 
 CLIENT = "/client"
 AGAIN = "direct.service_again"
@@ -255,7 +253,7 @@ async def test_many_services_of_one_peer_are_all_asked_for(pair: tuple[Settings,
         await until(lambda: all(name in b.core.state().services for name in names))
         # They are not served, only registered: each probe finds the node, and that it does not know the service.
         await until(lambda: {transport(b, name) for name in names} == {("relay", "reachable")})
-        assert transport(b) == ("direct", "")
+        await until(lambda: transport(b) == ("direct", ""))
 
 
 async def test_a_node_without_the_service_of_the_expected_name_is_no_server(pair: tuple[Settings, Settings]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.config.peer_rules import PeerRule
-from tests.agent.test_agent import Sink, node, running, settings, until
+from tests.agent.test_agent import Sink, node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
     from rmpa.ros.node.endpoints import Publisher
-
-__all__ = ["settings"]  # the fixture
 
 KIND = "std_msgs/String"
 

@@ -14,7 +14,7 @@ from rmpa.ros.http import rpc as client
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import TopicDescription
-from tests.agent.test_agent import node, running, settings, until
+from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.observe.why.diagnosis import Diagnosis
 
-__all__ = ["settings"]
 NAME = "nosuchhost.invalid"
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 

@@ -12,7 +12,7 @@ from rmpa.bridge.peer_offers import CONFLICT
 from rmpa.config.peer_rules import PeerRule, PolicySettings
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits as observe_limits
-from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
+from tests.agent.test_agent import DEADLINE, node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,7 +52,7 @@ def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("where", ["there", "here"])
-async def test_policy_of_either_side(settings: Callable[..., Settings], where: str) -> None:  # noqa: F811
+async def test_policy_of_either_side(settings: Callable[..., Settings], where: str) -> None:
     deny = PolicySettings(deny=("/secret",))
     a, b = (settings("a", deny), settings("b")) if where == "there" else (settings("a"), settings("b", deny))
     async with running(a, b) as (first, second), node("talker", first) as talker:
@@ -65,7 +65,7 @@ async def test_policy_of_either_side(settings: Callable[..., Settings], where: s
             assert "bridge.deny has '/secret'" in text
 
 
-async def test_built_in_rules_and_other_types(settings: Callable[..., Settings]) -> None:  # noqa: F811
+async def test_built_in_rules_and_other_types(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), node("one", a) as one, node("two", b) as two:
         await one.advertise("/clock", "rosgraph_msgs/Clock")
         stage, text = stopped_at(await ask(b, "/clock", "a"))
@@ -80,7 +80,7 @@ async def test_built_in_rules_and_other_types(settings: Callable[..., Settings])
         assert "std_msgs/Bool" in text
 
 
-async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> None:  # noqa: F811
+async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (_, b):
         (found,) = await ask(b, "/x", "aa")
         assert found.failed is not None
@@ -92,7 +92,7 @@ async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> Non
         assert stopped_at(await ask(lonely, "/x"))[0] == "publisher"
 
 
-async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) -> None:  # noqa: F811
+async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) -> None:
     pc = replace(settings("pc"), peers=(PeerRule("robot", prefix="/robot1"),))
     async with (
         running(settings("robot"), pc) as (robot, base),

@@ -16,8 +16,8 @@ from rmpa.core.errors import StartError
 from rmpa.gateway import limits
 from rmpa.gateway.gateway import Gateway
 from rmpa.observe.control_client import ControlClient
-from tests.agent.conftest import pytest_asyncio_loop_factories
-from tests.agent.test_agent import settings, until
+from tests.agent.conftest import pytest_asyncio_loop_factories, settings
+from tests.agent.test_agent import until
 from tests.gateway.memory_zenoh import MemorySession, MemoryZenoh
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import pytest
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.neighbour import SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.test_agent import Sink, node, settings, until
+from tests.agent.conftest import settings
+from tests.agent.test_agent import Sink, node, until
 from tests.agent.test_services import connect, provider, serving
 from tests.gateway.graph.gateways import (
     STRING,

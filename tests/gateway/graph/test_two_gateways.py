@@ -8,7 +8,8 @@ from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
 from rmpa.gateway.foreign import foreign_origin
 from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.test_agent import Sink, node, settings, until
+from tests.agent.conftest import settings
+from tests.agent.test_agent import Sink, node, until
 from tests.agent.test_services import connect, provider, serving
 from tests.gateway.graph.gateways import (
     STRING,
