@@ -138,19 +138,6 @@ async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
     assert gc.get_freeze_count() == 0
 
 
-async def test_the_snapshot_shows_what_was_granted(settings: Callable[[str], Settings], tmp_path: Path) -> None:
-    agent = Agent(settings("a"), ("SCHED_FIFO, priority 50", "no memory lock: Operation not permitted"))
-    await agent.start()
-    try:
-        snapshot = await asyncio.to_thread(ask, tmp_path)
-    finally:
-        await agent.close()
-    assert snapshot.agent.realtime == ("SCHED_FIFO, priority 50", "no memory lock: Operation not permitted")
-    assert snapshot.notes == (
-        "realtime: no memory lock: Operation not permitted; the agent's log says what would grant it",
-    )
-
-
 def ask(runtime_dir: Path) -> Snapshot:
     with ControlClient(runtime_dir / "a.sock") as client:
         return client.snapshot()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import textwrap
@@ -12,35 +11,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed import namespaces
-from lab.bed.agents import NotifySocket
 from lab.bed.namespaces import Lab
-from lab.bed.processes import CommandFailed, Deadline, Process, eventually, run
+from lab.bed.processes import CommandFailed, Process, eventually, run
+from tests.interop.conftest import Beds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-
-CLIENTS = ["rospy", "roscpp"]
-
-
-@pytest.mark.netns
-def test_hosts_of_a_lab_reach_each_other_until_the_cable_is_cut(lab: Lab) -> None:
-    a, b = lab.hosts("a", "b")
-    run(a.command(["ping", "-c1", "-W2", b.address])) if _has("ping") else _connect(a, b)
-    b.cut()
-    assert "NO-CARRIER" in b.ip("link", "show", "eth0")
-    b.restore()
-    _connect(a, b)
-
-
-@pytest.mark.netns
-def test_router_joins_two_networks(lab: Lab) -> None:
-    a = lab.host("a", 0)
-    b = lab.host("b", 1)
-    router = lab.router(0, 1)
-    lab.route(a, router)
-    lab.route(b, router)
-    _connect(a, b)
 
 
 @pytest.mark.nat
@@ -56,15 +32,6 @@ def test_two_networks_of_the_same_addresses_reach_out_behind_nat_and_are_not_rea
         outer.ip("route", "replace", host.address, "via", nat.cables[1].address)
         with pytest.raises(CommandFailed, match=r"timed out|unreachable|No route"):
             _connect(outer, host, timeout=0.5)
-
-
-@pytest.mark.netns
-def test_shaping_is_set_and_taken_away(lab: Lab) -> None:
-    (a,) = lab.hosts("a")
-    a.shape("10mbit")
-    assert "tbf" in run(a.command(["tc", "qdisc", "show", "dev", "eth0"]))
-    a.unshape()
-    assert "tbf" not in run(a.command(["tc", "qdisc", "show", "dev", "eth0"]))
 
 
 @pytest.mark.netns
@@ -93,38 +60,10 @@ def test_stale_namespaces_are_removed_but_not_ours() -> None:
         mine.ip("link")
 
 
-def test_process_waits_with_a_deadline_and_shows_its_last_lines() -> None:
-    with Process(["sh", "-c", 'echo one; echo \'@ {"event": "up", "n": 3}\'; sleep 100'], name="child") as child:
-        child.wait_for("^one$")
-        assert child.wait_event("up") == {"event": "up", "n": 3}
-        with pytest.raises(Deadline, match=r"child\| one"):
-            child.wait_for("two", timeout=0.05)
-    assert child.returncode == -15
-
-
-def test_process_that_ends_early_fails_the_wait_at_once() -> None:
-    with Process(["sh", "-c", "exit 3"]) as child, pytest.raises(Deadline, match="ended with status 3"):
-        child.wait_for("never")
-
-
 def test_group_of_a_process_ends_with_it() -> None:
     with Process(["sh", "-c", "sleep 1000 & echo $!; trap '' TERM; wait; wait"]) as child:
         grandchild = int(child.wait_for(r"^(\d+)$").group(1))
     eventually(lambda: not _lives(grandchild), what="the grandchild gone")
-
-
-async def test_waits_leave_the_loop_running() -> None:
-    with Process(["sh", "-c", "sleep 0.05; echo late"]) as child:
-        await child.expect("late")
-        assert await child.ended() == 0
-
-
-def test_notify_socket_hears_ready() -> None:
-    notify = NotifySocket()
-    say = f"import socket as s; s.socket(s.AF_UNIX, s.SOCK_DGRAM).sendto(b'READY=1\\nSTATUS=x', {str(notify.path)!r})"
-    with Process(["python3", "-c", f"{say}; import time; time.sleep(60)"]) as child:
-        notify.wait_for("READY=1", child)
-    notify.close()
 
 
 @pytest.mark.parametrize("leak", ["asyncio.get_running_loop().create_task(asyncio.sleep(100))", "made()"])
@@ -178,10 +117,6 @@ def _lives(pid: int) -> bool:
         return False
 
 
-def _has(word: str) -> bool:
-    return shutil.which(word) is not None
-
-
 def _connect(a: namespaces.Host, b: namespaces.Host, timeout: float = 10.0) -> str:
     """Open a TCP connection from one host to the other; return the address that it comes from there."""
     serve = "import socket; s = socket.create_server(('', 7000)); print('ready', flush=True); print(s.accept()[1][0])"
@@ -191,3 +126,20 @@ def _connect(a: namespaces.Host, b: namespaces.Host, timeout: float = 10.0) -> s
         run(a.command(["python3", "-c", dial]))
         server.wait()
         return server.lines[-1]
+
+
+@pytest.mark.netns
+def test_a_bed_serves_another_test_only_as_it_was_at_first(tmp_path: Path) -> None:
+    beds = Beds(tmp_path)
+    try:
+        key, first = beds.take(("a", "b"), {})
+        beds.give_back(key, first)
+        key, again = beds.take(("a", "b"), {})
+        assert again is first
+        first.agents[0].kill()
+        beds.give_back(key, first)
+        key, other = beds.take(("a", "b"), {})
+        assert other is not first
+        beds.give_back(key, other)
+    finally:
+        beds.close()
