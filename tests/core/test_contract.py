@@ -154,58 +154,42 @@ def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("offered", "requested", "agreed"),
+    ("key", "offered", "requested", "agreed"),
     [
-        (Contract(), Contract(), Contract()),
-        (Contract(reliability=Reliability.RELIABLE), Contract(), Contract(reliability=Reliability.RELIABLE)),
-        (Contract(), Contract(reliability=Reliability.RELIABLE), Contract(reliability=Reliability.RELIABLE)),
-        (
-            Contract(),
-            Contract(durability=Durability.TRANSIENT_LOCAL),
-            Contract(durability=Durability.TRANSIENT_LOCAL),
-        ),
-        (Contract(history=History.KEEP_ALL), Contract(), Contract(history=History.KEEP_ALL)),
-        (Contract(depth=5), Contract(depth=9), Contract(depth=9)),
-        (Contract(outage=300.0), Contract(outage=60.0), Contract(outage=300.0)),
-        (Contract(outage=2.0), Contract(), Contract(outage=2.0)),
-        (Contract(), Contract(outage=2.0), Contract(outage=2.0)),
-        (Contract(outage=1.0), Contract(outage=2.0), Contract(outage=2.0)),
-        (Contract(transport=Transport.AUTO), Contract(), Contract()),
-        (Contract(), Contract(transport=Transport.DIRECT), Contract()),
-        (Contract(transport=Transport.AUTO), Contract(transport=Transport.AUTO), Contract(transport=Transport.AUTO)),
-        (
-            Contract(transport=Transport.AUTO),
-            Contract(transport=Transport.DIRECT),
-            Contract(transport=Transport.DIRECT),
-        ),
-        (
-            Contract(transport=Transport.DIRECT),
-            Contract(transport=Transport.AUTO),
-            Contract(transport=Transport.DIRECT),
-        ),
-        (Contract(deadline=1.0), Contract(), Contract(deadline=1.0)),
-        (Contract(deadline=1.0), Contract(deadline=2.0), Contract(deadline=2.0)),
-        (Contract(lifespan=1.0), Contract(lifespan=2.0), Contract(lifespan=1.0)),
-        (Contract(), Contract(lifespan=2.0), Contract(lifespan=2.0)),
-        (Contract(max_rate=5.0), Contract(max_rate=9.0), Contract(max_rate=5.0)),
-        (Contract(priority=Priority.LOW), Contract(), Contract(priority=Priority.LOW)),
-        (Contract(), Contract(priority=Priority.LOW), Contract(priority=Priority.LOW)),
-        (Contract(priority=Priority.LOW), Contract(priority=Priority.HIGH), Contract(priority=Priority.HIGH)),
-        (Contract(priority=Priority.HIGH), Contract(priority=Priority.LOW), Contract(priority=Priority.HIGH)),
-        (
-            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
-            Contract(),
-            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
-        ),
-        (
-            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
-            Contract(liveliness_lease=3.0),
-            Contract(liveliness_lease=3.0),
-        ),
+        ("reliability", Reliability.RELIABLE, None, Reliability.RELIABLE),
+        ("reliability", None, Reliability.RELIABLE, Reliability.RELIABLE),
+        ("durability", None, Durability.TRANSIENT_LOCAL, Durability.TRANSIENT_LOCAL),
+        ("history", History.KEEP_ALL, None, History.KEEP_ALL),
+        ("depth", 5, 9, 9),
+        ("outage", 300.0, 60.0, 300.0),
+        ("outage", 2.0, None, 2.0),
+        ("outage", None, 2.0, 2.0),
+        ("outage", 1.0, 2.0, 2.0),
+        ("transport", Transport.AUTO, None, Transport.RELAY),
+        ("transport", None, Transport.DIRECT, Transport.RELAY),
+        ("transport", Transport.AUTO, Transport.AUTO, Transport.AUTO),
+        ("transport", Transport.AUTO, Transport.DIRECT, Transport.DIRECT),
+        ("transport", Transport.DIRECT, Transport.AUTO, Transport.DIRECT),
+        ("deadline", 1.0, None, 1.0),
+        ("deadline", 1.0, 2.0, 2.0),
+        ("lifespan", 1.0, 2.0, 1.0),
+        ("lifespan", None, 2.0, 2.0),
+        ("max_rate", 5.0, 9.0, 5.0),
+        ("priority", Priority.LOW, None, Priority.LOW),
+        ("priority", None, Priority.LOW, Priority.LOW),
+        ("priority", Priority.LOW, Priority.HIGH, Priority.HIGH),
+        ("priority", Priority.HIGH, Priority.LOW, Priority.HIGH),
     ],
 )
-def test_two_ends_agree(offered: Contract, requested: Contract, agreed: Contract) -> None:
-    assert combine(offered, requested) == agreed
+def test_two_ends_agree(key: str, offered: object, requested: object, agreed: object) -> None:
+    sides = [Contract(**{} if value is None else {key: value}) for value in (offered, requested)]  # type: ignore[arg-type]
+    assert combine(*sides) == Contract(**{key: agreed})  # type: ignore[arg-type]
+
+
+def test_two_ends_agree_on_liveliness_and_its_lease() -> None:
+    manual = Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0)
+    assert combine(manual, Contract()) == manual
+    assert combine(manual, Contract(liveliness_lease=3.0)) == Contract(liveliness_lease=3.0)
 
 
 @given(CONTRACTS, CONTRACTS)
