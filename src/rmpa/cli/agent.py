@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import Check
 
 _log = logging.getLogger("rmpa.up")
+# Of the results of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.
 _COLOURS: Final = {OK: "green", FAIL: "red", CheckLevel.SKIPPED: "cyan"}
-"""Of the results of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow."""
+# What is said of a thing by its kind when no stage fails.
 _WELL: Final = {"service": "it can be called", "module": "it is linked"}
-"""What is said of a thing by its kind when no stage fails."""
 
 
 @agent_verb(flag("--check", help="Change nothing; only say what would come of it."))

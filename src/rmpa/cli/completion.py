@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from rmpa.cli.graph import Graph
 
+# Seconds that the agent or master has for its answer: a person waits with the key pressed.
 ANSWER: Final = 0.3
-"""Seconds that the agent or master has for its answer: a person waits with the key pressed."""
 _BASH: Final = """\
 %(complete_func)s() {
     local IFS=$'\\n' line=${COMP_LINE:0:COMP_POINT} words current number reply

@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("rmpa.gateway")
 _web_log = logging.getLogger("rmpa.web")
+# Settings whose options a gateway has not: its core is its own, and only for its proxies; it has an --insecure.
 _OF_THE_AGENT: Final = ("core_mode", "core_master", "core_keep", "web.enabled", "trust.insecure")
-"""Settings whose options a gateway has not: its core is its own, and only for its proxies; it has an --insecure."""
+# Settings of a gateway that a router has no use for.
 _OF_THE_PROCESS: Final = (
     *("gateway.rank", "gateway.router", "gateway.site"),
     *("gateway.ros2.distribution", "gateway.ros2.mapping"),
 )
-"""Settings of a gateway that a router has no use for."""
 _DEFAULTS: Final = WebSettings()
 
 

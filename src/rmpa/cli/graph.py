@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from rmpa.observe.peer_info import PeerInfo
     from rmpa.ros.node.node import Node, Received
 
+# Seconds between two lines of figures, as rostopic has it.
 TICK: Final = 1.0
-"""Seconds between two lines of figures, as rostopic has it."""
 _Table: TypeAlias = list[tuple[str, list[str]]]
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
 

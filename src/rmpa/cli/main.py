@@ -25,6 +25,9 @@ from rmpa.core.errors import ConfigError, RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+# By the words behind ``rmpa``: the module of ``rmpa.cli``, and the line that the help of the group shows.
+#
+# ``rmpa topic list`` is the function ``topic_list`` of its module.
 VERBS: Final = {
     "up": ("agent", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
     "core": ("gateway", "Run the ROS core alone: a drop-in for roscore."),
@@ -103,10 +106,7 @@ VERBS: Final = {
     "reload": ("agent", "Let the agent read its settings again."),
     "completion": ("completion", "Print the script that completes rmpa's commands in a shell."),
 }
-"""By the words behind ``rmpa``: the module of ``rmpa.cli``, and the line that the help of the group shows.
-
-``rmpa topic list`` is the function ``topic_list`` of its module.
-"""
+# What to use in place of a command that is gone, by its words behind ``rmpa``.
 REMOVED_VERBS: Final = {
     "experiment": "in a clone of the repository: make experiment, or python -m lab experiment (docs/experiments.md)",
     "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
@@ -114,7 +114,7 @@ REMOVED_VERBS: Final = {
     "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
     "trust import": "write [[permission]] tables into rmpa.toml: docs/permissions.md",
 }
-"""What to use in place of a command that is gone, by its words behind ``rmpa``."""
+# Words that are no commands of ``rmpa``, and what a user who writes them wants.
 MEANT: Final = {
     "help": ("--help",),
     "version": ("--version",),
@@ -131,7 +131,6 @@ MEANT: Final = {
     **{word: (f"topic {word}",) for word in ("echo", "pub", "hz", "bw", "delay")},
     **{word: (f"trust {word}",) for word in ("join", "invite")},
 }
-"""Words that are no commands of ``rmpa``, and what a user who writes them wants."""
 _MASTER: Final = """\
 The master: --master, else the core of --agent (or RMPA_AGENT), else ROS_MASTER_URI, else the core of the only
 agent of this machine, else http://localhost:11311."""

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 _PART: Final = re.compile(r"(?P<name>\w+)(?P<indices>(?:\[[0-9]+\])*)", re.ASCII)
 _TIME: Final = {"secs", "nsecs"}
+# Seconds for which a single message stays latched for subscribers to connect, as in ``rostopic pub -1``.
 _ONCE_SECONDS: Final = 3.0
-"""Seconds for which a single message stays latched for subscribers to connect, as in ``rostopic pub -1``."""
 
 
 def pick(plain: Plain, path: list[str]) -> Plain:

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from rmpa.cli.output import Text
 
 _T = TypeVar("_T")
+# A node and its peer; ``None``: this module's own.
 _Line = tuple[str | None, NodeLine]
-"""A node and its peer; ``None``: this module's own."""
 _CALLER_ID: Final = "/rmpa_node"
 _ROSOUT: Final = "/rosout"
+# Modules that one line names.
 _NAMED: Final = 3
-"""Modules that one line names."""
 
 
 def _read_node(text: str) -> GraphName:

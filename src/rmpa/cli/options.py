@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _Function = TypeVar("_Function", bound="Callable[..., Any]")
+# Lines of a long list that a terminal shows.
 LINES: Final = 100
-"""Lines of a long list that a terminal shows."""
 
 
 def verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:

@@ -45,8 +45,8 @@ class Table:
     colours: Sequence[str | None] = ()
 
 
+# Lines and tables; control characters in lines and cells are escaped when they are printed.
 Text: TypeAlias = "str | Table | Iterable[Text]"
-"""Lines and tables; control characters in lines and cells are escaped when they are printed."""
 
 
 def show(value: object, *text: Text, as_json: bool) -> None:

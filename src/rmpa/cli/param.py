@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _CALLER: Final = "/rmpa_param"
+# Seconds for one call of a master: it may bring megabytes of XML, from a busy machine.
 _FOR_ALL: Final = 30.0
-"""Seconds for one call of a master: it may bring megabytes of XML, from a busy machine."""
 _INT_MAX: Final = (1 << 31) - 1
 _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
     ast.Add: operator.add,

@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import RouteInfo, Snapshot, TopicInfo
 
 _T = TypeVar("_T")
+# By the state of a peer or site.
 _COLOURS: Final = {
     **dict.fromkeys(("linked", "relayed", "this site", "joined"), "green"),
     **dict.fromkeys(("linking", "foreign", "no gateway"), "yellow"),
     **dict.fromkeys(("refused", "conflict", "unreachable"), "red"),
 }
-"""By the state of a peer or site."""
+# States that are no problem.
 _USUAL: Final = frozenset({"linked", "relayed"})
-"""States that are no problem."""
+# Columns that are shown without ``-v``: they fit 80 characters.
 _BRIEF: Final = "PEER, STATE, >SINCE, ADDRESS, >RTT"
-"""Columns that are shown without ``-v``: they fit 80 characters."""
 
 
 @agent_verb(

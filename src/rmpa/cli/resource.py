@@ -31,10 +31,11 @@ if TYPE_CHECKING:
     from rmpa.ros.node.node import Node
 
 _TEXT: Final = "std_msgs/String"
+# Seconds for a latched message: the route of another module's topic has to open first.
 _ANSWER: Final = 3.0
-"""Seconds for a latched message: the route of another module's topic has to open first."""
+# Seconds between two searches for new resources.
 _LOOK: Final = 1.0
-"""Seconds between two searches for new resources."""
+# By state, or by level of an alarm.
 _COLOURS: Final = {
     "active": "green",
     "inactive": "yellow",
@@ -45,7 +46,6 @@ _COLOURS: Final = {
     "ERROR": "red",
     "STALE": "magenta",
 }
-"""By state, or by level of an alarm."""
 _SILENT: Final[dict[str, Any]] = {
     "level": "STALE",
     "message": "it has sent no quality while we listened",

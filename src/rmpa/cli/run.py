@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from rmpa.resource.resource import Resource
 
 _log = logging.getLogger("rmpa.run")
+# Seconds that an agent may take to start.
 _STARTS: Final = 20.0
-"""Seconds that an agent may take to start."""
+# Seconds that it may take to end after SIGTERM.
 _ENDS: Final = 10.0
-"""Seconds that it may take to end after SIGTERM."""
+# Seconds that a user's function may go on after its resource has ended.
 _THREADS: Final = 1.0
-"""Seconds that a user's function may go on after its resource has ended."""
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -239,8 +239,8 @@ class ModuleAgent:
 
     def __init__(self, name: str, options: Sequence[str]) -> None:
         self.name = name
+        # The child, if one was started.
         self.process: subprocess.Popen[bytes] | None = None
-        """The child, if one was started."""
         self._uri = _core_of(name)
         self._options = options
 

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import ServiceDescription
 
 _CALLER_ID: Final = "/rmpa_service"
+# Servers that are asked at the same time.
 _AT_ONCE: Final = 16
-"""Servers that are asked at the same time."""
+# Seconds between two questions to the master whether the service is there.
 _LOOK: Final = 0.1
-"""Seconds between two questions to the master whether the service is there."""
 
 
 @dataclass(frozen=True, slots=True)

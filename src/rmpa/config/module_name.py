@@ -26,16 +26,16 @@ from rmpa.core.identity import peer_name_problem
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+# What a gateway's name has behind that of its module.
 GATEWAY_SUFFIX = "_gateway"
-"""What a gateway's name has behind that of its module."""
 
 
 class NameSource(Enum):
     """Why a name was chosen, the strongest reason first."""
 
     OPTION = "the option"
+    # Commands that start an agent leave it out.
     AGENT_VARIABLE = "RMPA_AGENT"
-    """Commands that start an agent leave it out."""
     VARIABLE = "RMPA_NAME"
     FILE = "name in rmpa.toml"
     RUNNING = "the agent that runs here"
@@ -150,13 +150,13 @@ def core_file(environ: Mapping[str, str], port: int, module: str = "", setting: 
 
 # --- the module's name ----------------------------------------------------------------------------------------------
 
+# In the state directory: the name of this machine's module. No folder of a module is named so: it has a dash.
 NAME_FILE: Final = "module-name"
-"""In the state directory: the name of this machine's module. No folder of a module is named so: it has a dash."""
+# In the usual state directory: others in which this user's modules have joined a secured mesh, one a line.
 PLACES_FILE: Final = "state-directories"
-"""In the usual state directory: others in which this user's modules have joined a secured mesh, one a line."""
 _READ_MAX: Final = 64 * 1024
+# The state directory of a systemd unit with ``StateDirectory=rmpa``.
 _SYSTEM: Final = Path("/var/lib/rmpa")
-"""The state directory of a systemd unit with ``StateDirectory=rmpa``."""
 
 
 def kept_name(directory: Path | None) -> str:

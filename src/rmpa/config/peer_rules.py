@@ -88,8 +88,8 @@ SERVICE_RULES: Final = rules_of(keys_of(ServiceRule), _make_service, _SERVICE_EX
 
 # --- [[peer]] -------------------------------------------------------------------------------------------------------
 
+# Names before and after, or namespaces ``/namespace/**``; ``{peer}`` in them is the peer's name.
 Renames = tuple[tuple[str, str], ...]
-"""Names before and after, or namespaces ``/namespace/**``; ``{peer}`` in them is the peer's name."""
 
 
 def _read_prefix(raw: object) -> str:
@@ -207,24 +207,24 @@ class Effect(StrEnum):
 class Access(StrEnum):
     """What another module does with something of this module, or brings to it."""
 
+    # Its topic is shown here.
     PUBLISH = "publish"
-    """Its topic is shown here."""
+    # It gets a topic of this module.
     SUBSCRIBE = "subscribe"
-    """It gets a topic of this module."""
+    # It calls a service of this module.
     CALL = "call"
-    """It calls a service of this module."""
+    # Its service is shown here.
     SERVE = "serve"
-    """Its service is shown here."""
+    # It reads, follows, sets or deletes a parameter of this module.
     PARAM = "param"
-    """It reads, follows, sets or deletes a parameter of this module."""
+    # It ends a node of this module.
     KILL = "kill"
-    """It ends a node of this module."""
 
 
+# The key of a rule about actions of this module, whose client the other module is.
 ACTION_CLIENT: Final = "action"
-"""The key of a rule about actions of this module, whose client the other module is."""
+# The key of a rule about actions of the other module, whose clients are here.
 ACTION_SERVER: Final = "action_serve"
-"""The key of a rule about actions of the other module, whose clients are here."""
 _GROUP_NAME: Final = text_like(
     "[A-Za-z][A-Za-z0-9_]{0,63}",
     "a group's name",
@@ -286,8 +286,8 @@ _NAME_KEYS: Final = {
     ACTION_CLIENT: Setting(_globs_over("topic"), "This module's actions whose client it is."),
     ACTION_SERVER: Setting(_globs_over("topic"), "Its actions whose clients are here."),
 }
+# The keys of a rule that have names of topics, services, parameters, nodes or actions.
 NAME_KEYS: Final = tuple(_NAME_KEYS)
-"""The keys of a rule that have names of topics, services, parameters, nodes or actions."""
 
 
 def _make_permission(values: dict[str, Any]) -> PermissionRule:

@@ -85,6 +85,7 @@ def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
 
 
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
+# By the name of a type in JSON Schema: the type of TOML values, and its name in errors.
 _TYPES: Final[dict[str, tuple[type, str]]] = {
     "string": (str, "a text in quotes"),
     "integer": (int, "a whole number"),
@@ -92,7 +93,6 @@ _TYPES: Final[dict[str, tuple[type, str]]] = {
     "array": (list, "a list"),
     "object": (dict, "a table"),
 }
-"""By the name of a type in JSON Schema: the type of TOML values, and its name in errors."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -217,8 +217,8 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
 
 
 FILE_NAME: Final = "rmpa.toml"
+# Every environment variable of this program.
 VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(setting.env for setting in SETTINGS if setting.env))
-"""Every environment variable of this program."""
 _BY_NAME: Final = {setting.name: setting for setting in SETTINGS}
 
 
@@ -272,8 +272,8 @@ class Given:
         return f"{self.source} {value}" if self.source.startswith("--") else value
 
 
+# The raw values of one source, by the setting's name.
 _Layer = dict[str, Given]
-"""The raw values of one source, by the setting's name."""
 _Table = TypeVar("_Table")
 
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rmpa.config.schema import Setting
     from rmpa.config.values import JsonSchema
 
+# The schema's name in docs/.
 SCHEMA_FILE: Final = "rmpa.schema.json"
-"""The schema's name in docs/."""
 _TYPE_NAMES: Final = {"string": "text", "integer": "whole number", "boolean": "true, false", "object": "table"}
 
 

@@ -53,8 +53,8 @@ from rmpa.core.identity import is_global_name, is_legal_name, matches
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+# The key of a contract's ``liveliness_lease``.
 _LEASE: Final = "liveliness_lease_duration"
-"""The key of a contract's ``liveliness_lease``."""
 _CONTRACT_KEYS: Final = {
     "topics": Setting(
         list_of(TOPIC_GLOB, if_empty="leave topics out, or name some"),
@@ -86,8 +86,8 @@ _CONTRACT_KEYS: Final = {
     "outage": Setting(OUTAGE, "How long a reliable topic is kept when its link is gone."),
     "transport": Setting(TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."),
 }
+# The keys of a ``[[contract]]`` besides the topics and types that it is about.
 TERMS: Final = tuple(_CONTRACT_KEYS)[2:]
-"""The keys of a ``[[contract]]`` besides the topics and types that it is about."""
 
 
 def _make_contract(values: dict[str, Any]) -> ContractRule:
@@ -135,6 +135,7 @@ def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[tuple[Place, st
 
 SIM_TIME: Final = "/use_sim_time"
 CLOCK: Final = "/clock"
+# Parameters that another module never sets or deletes, and why.
 UNTOUCHABLE: Final = {
     "/run_id": "it names the run of this module's core",
     "/roslaunch/**": "it is roslaunch's own",
@@ -142,7 +143,6 @@ UNTOUCHABLE: Final = {
     "/rosversion": "it tells which ROS this core is",
     SIM_TIME: "time is followed by [time] alone",
 }
-"""Parameters that another module never sets or deletes, and why."""
 
 
 def untouchable(key: str) -> str:
@@ -236,17 +236,17 @@ PARAM_RULES: Final = ValueType(_read_params, _FOLLOW.json_schema)
 # The table ``[gateway]`` of ``rmpa.toml``: which other sites and which ROS 2 a gateway joins, and what may cross.
 
 
+# Stands in the place of a site in names and rules, for a ROS 2 graph; no site may have it.
 ROS2: Final = "ros2"
-"""Stands in the place of a site in names and rules, for a ROS 2 graph; no site may have it."""
+# The protocols of Zenoh's endpoints that are accepted.
 PROTOCOLS: Final = ("tls", "tcp", "quic", "udp", "ws")
-"""The protocols of Zenoh's endpoints that are accepted."""
 _ENDPOINT: Final = (
     r"(?P<protocol>[a-z0-9]+)/(?P<host>\[[0-9A-Fa-f:.]+(?:%[A-Za-z0-9]+)?\]|[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,252})|\*)"
     r":(?P<port>[0-9]{1,5})(?P<more>[?#][A-Za-z0-9_=;.:/-]{1,200})?"
 )
 _LOOKS: Final = "one looks like tls/fleet.example:7447"
+# What a rule's ``name`` may have in it, each with an example of what it becomes.
 _PLACEHOLDERS: Final = {"{site}": "site", "{module}": "module", "{name}": "/name"}
-"""What a rule's ``name`` may have in it, each with an example of what it becomes."""
 
 
 def _read_site(raw: object) -> str:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 _T = TypeVar("_T")
+# A key of the file: ``("core", "port")``.
 Key = tuple[str, ...]
-"""A key of the file: ``("core", "port")``."""
+# In place of a default: each rule must have the key.
 NEEDED: Final[Any] = MISSING
-"""In place of a default: each rule must have the key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +224,7 @@ def rules_of(
     return ValueType(read, {"type": "array", "items": schema | ({"required": needed} if needed else {})})
 
 
+# What to use in place of a key, variable or option that is gone.
 REMOVED: Final = {
     "peer.remap": 'write remap_in = { "FROM" = "TO" } for direction = "in", remap_out = { "FROM" = "TO" } for "out"; '
     "it holds for topics of all types",
@@ -261,4 +262,3 @@ REMOVED: Final = {
     ),
     "--yes": "leave it out: nothing is asked",
 }
-"""What to use in place of a key, variable or option that is gone."""

@@ -404,8 +404,9 @@ class Settings:
         return any(word in (Transport.DIRECT, Transport.AUTO) for word in words)
 
 
+# Every setting, in the order of the documentation.
 SETTINGS: Final = tuple(settings_of(Settings))
-"""Every setting, in the order of the documentation."""
+# The tables of ``rmpa.toml``, each with its description; ``gateway.ros2`` is one in another.
 TABLES: Final = {
     "core": "Where the ROS core listens, or which roscore is used instead of it.",
     "mesh": "The links to the peers.",
@@ -426,4 +427,3 @@ TABLES: Final = {
     "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",
 }
-"""The tables of ``rmpa.toml``, each with its description; ``gateway.ros2`` is one in another."""

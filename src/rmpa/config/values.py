@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 _T_co = TypeVar("_T_co", covariant=True)
 _Word = TypeVar("_Word", bound="StrEnum")
+# A key of the file, or an element below it: ``("contract", 1, "topics", 0)``.
 Place = tuple[str | int, ...]
-"""A key of the file, or an element below it: ``("contract", 1, "topics", 0)``."""
+# A JSON Schema (draft 7), or a part of one.
 JsonSchema = dict[str, Any]
-"""A JSON Schema (draft 7), or a part of one."""
+# Stands for the peer's name in a rule.
 PEER: Final = "{peer}"
-"""Stands for the peer's name in a rule."""
+# A name in the place of ``{peer}``, for checks.
 SOME_PEER: Final = "peer"
-"""A name in the place of ``{peer}``, for checks."""
 _BOOLEANS: Final = dict.fromkeys(("1", "true", "yes", "on"), True) | dict.fromkeys(("0", "false", "no", "off"), False)
 
 
@@ -133,6 +133,7 @@ NAME_OR_EMPTY: Final = ValueType(
     {"type": "string", "pattern": "^([A-Za-z][A-Za-z0-9_]*)?$"},
     "NAME",
 )
+# A network interface. It need not exist: interfaces come and go.
 INTERFACE: Final = text_like(
     r"[^\s/]{1,15}",
     "the name of a network interface",
@@ -140,7 +141,6 @@ INTERFACE: Final = text_like(
     "wlan0",
     metavar="NAME",
 )
-"""A network interface. It need not exist: interfaces come and go."""
 
 
 def word_of(words: Iterable[str], what: str, remedy: str, metavar: str = "") -> ValueType[str]:
@@ -224,19 +224,19 @@ BOUND: Final = whole_number(1, limits.BOUND_MAX, "a limit")
 
 # --- durations and rates: numbers in seconds, messages or bytes a second, or texts with a unit ----------------------
 
+# By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1.
 _SECONDS: Final = {"us": 1e6, "µs": 1e6, "ms": 1e3, "s": 1.0, "min": 1 / 60, "h": 1 / 3600}
-"""By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1."""
+# By unit: so many bytes it is.
 _BYTES: Final = {"b": 1, "kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 1024, "mib": 1024**2} | {
     "kbit": 125,
     "mbit": 125e3,
     "gbit": 125e6,
 }
-"""By unit: so many bytes it is."""
 _HUGE: Final = 1 << 63
+# ROS 2's own word for a duration without a bound; it lifts the bound that an earlier rule has set.
 _INFINITE: Final = "infinite"
-"""ROS 2's own word for a duration without a bound; it lifts the bound that an earlier rule has set."""
+# The word for a rate without a bound, likewise.
 _UNLIMITED: Final = "unlimited"
-"""The word for a rate without a bound, likewise."""
 
 
 def _quantity(raw: object, what: str, example: str, endless: str) -> tuple[float, str]:

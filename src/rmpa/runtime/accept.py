@@ -89,21 +89,21 @@ def _refused(port: int, error: OSError) -> StartError:
 
 _log = logging.getLogger(__name__)
 
+# Errors of accept(2) and socket(2) about a lack of descriptors or memory, which may pass.
 OUT_OF_DESCRIPTORS: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
-"""Errors of accept(2) and socket(2) about a lack of descriptors or memory, which may pass."""
 
 
 class Use(enum.Enum):
     """The purpose of a descriptor; the value is the number of reserves that it must leave free."""
 
+    # Listening sockets of the proxies of remote nodes; they must leave room for the connections to those sockets.
     PROXY = 2.0
-    """Listening sockets of the proxies of remote nodes; they must leave room for the connections to those sockets."""
+    # Connections of topics and services, and to the slave APIs of nodes: they must leave the whole reserve.
     DATA = 1.0
-    """Connections of topics and services, and to the slave APIs of nodes: they must leave the whole reserve."""
+    # The ROS core's XML-RPC.
     CORE = 0.5
-    """The ROS core's XML-RPC."""
+    # Links to peers and the control socket: they may take the last descriptor.
     LINK = 0.0
-    """Links to peers and the control socket: they may take the last descriptor."""
 
 
 class Descriptors:
@@ -239,8 +239,8 @@ def raise_file_limit() -> int:
     return soft
 
 
+# The descriptors of this process.
 DESCRIPTORS: Final = Descriptors()
-"""The descriptors of this process."""
 
 
 # Runs a user's function in a thread of its own, where it may hang forever without blocking anything else.
@@ -279,6 +279,7 @@ async def in_thread(function: Callable[[], _T], name: str) -> _T:
     return await result
 
 
+# Errors of accept(2) that concern one waiting connection only; the next one may succeed.
 _GONE: Final = frozenset(
     {
         errno.ECONNABORTED,
@@ -292,7 +293,6 @@ _GONE: Final = frozenset(
         errno.EPROTO,
     }
 )
-"""Errors of accept(2) that concern one waiting connection only; the next one may succeed."""
 
 
 class Acceptor:

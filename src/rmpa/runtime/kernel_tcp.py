@@ -29,6 +29,7 @@ from rmpa.runtime import limits
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+# By their number in ``linux/tcp_states.h``.
 _STATES: Final = {
     1: "ESTABLISHED",
     2: "SYN_SENT",
@@ -39,43 +40,42 @@ _STATES: Final = {
     10: "LISTEN",
     11: "CLOSING",
 }
-"""By their number in ``linux/tcp_states.h``."""
 _LISTEN: Final = 1 << 10
 _CONNECTED: Final = sum(1 << number for number in _STATES) - _LISTEN
 _TCP_PORTS: Final = range(1, 1 << 16)
 _GONE: Final = frozenset({errno.ENOENT, errno.ESTALE})
+# ``EINVAL`` comes from kernels before 4.5, which do not know the message.
 _UNSUPPORTED: Final = frozenset({errno.EOPNOTSUPP, errno.EINVAL})
-"""``EINVAL`` comes from kernels before 4.5, which do not know the message."""
 _libc: Final = ctypes.CDLL(None, use_errno=True)
+# The number of pidfd_getfd(2), the same on all machines, since Linux 5.6; Python has no function for it.
 _PIDFD_GETFD: Final = 438
-"""The number of pidfd_getfd(2), the same on all machines, since Linux 5.6; Python has no function for it."""
+# A socket address of the family AF_UNSPEC, which ends a connection (connect(2)).
 _DISCONNECT: Final = bytes(16)
-"""A socket address of the family AF_UNSPEC, which ends a connection (connect(2))."""
 _YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
+# What gives an agent the right to end connections.
 REMEDY: Final = (
     "run the agent with CAP_NET_ADMIN: `AmbientCapabilities=CAP_NET_ADMIN` in its systemd unit, "
     "`--cap-add NET_ADMIN` for Docker, or `setcap cap_net_admin+ep PYTHON`"
 )
-"""What gives an agent the right to end connections."""
 
 _NETLINK_SOCK_DIAG: Final = 4
+# Message type ``SOCK_DIAG_BY_FAMILY``: a request for sockets, and each of its answers.
 _BY_FAMILY: Final = 20
-"""Message type ``SOCK_DIAG_BY_FAMILY``: a request for sockets, and each of its answers."""
+# Message type ``SOCK_DESTROY``, since Linux 4.5.
 _DESTROY: Final = 21
-"""Message type ``SOCK_DESTROY``, since Linux 4.5."""
 _NOOP, _ERROR, _DONE = 1, 2, 3
 _REQUEST, _ACK, _DUMP = 0x1, 0x4, 0x300
+# Flag ``NLM_F_DUMP_INTR``: the table changed during the dump, which may lack sockets.
 _INTERRUPTED: Final = 0x10
-"""Flag ``NLM_F_DUMP_INTR``: the table changed during the dump, which may lack sockets."""
 _HEADER: Final = struct.Struct("=IHHII")
 _ERRNO: Final = struct.Struct("=i")
+# ``MAX_ERRNO`` of the kernel.
 _ERRNO_MAX: Final = 4095
-"""``MAX_ERRNO`` of the kernel."""
 _QUERY: Final = struct.Struct("=BBBBI")
+# ``struct inet_diag_sockid``: ports and addresses, and in the machine's byte order the interface and the cookie.
 _SOCKET_ID: Final = struct.Struct("!HH16s16s12s")
-"""``struct inet_diag_sockid``: ports and addresses, and in the machine's byte order the interface and the cookie."""
+# ``struct inet_diag_msg``: family, state, the socket's id, its owner and inode; attributes may follow.
 _FOUND: Final = struct.Struct(f"=BBxx{_SOCKET_ID.size}s12xII")
-"""``struct inet_diag_msg``: family, state, the socket's id, its owner and inode; attributes may follow."""
 _ANY_SOCKET: Final = bytes(4) + b"\xff" * 8
 _MAPPED: Final = bytes(10) + b"\xff\xff"
 _ATTRIBUTE: Final = struct.Struct("=HH")

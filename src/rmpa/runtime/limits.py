@@ -10,53 +10,53 @@ from typing import Final
 from rmpa.core.limits import KIB
 
 # --- process ----------------------------------------------------------------------------------------------------
+# File descriptors that an agent asks for: the hard limit, but no more than the kernel's own default (fs.nr_open).
+# Containers have hard limits of 10^9, and some old programs close every number at their start.
 OPEN_FILES: Final = 1_048_576
-"""File descriptors that an agent asks for: the hard limit, but no more than the kernel's own default (fs.nr_open).
-Containers have hard limits of 10^9, and some old programs close every number at their start."""
+# Descriptors that data connections must leave free: half for the core, half for the links and the control socket.
+# 16 peers that reconnect at once take 32.
 DESCRIPTORS_RESERVED: Final = 64
-"""Descriptors that data connections must leave free: half for the core, half for the links and the control socket.
-16 peers that reconnect at once take 32."""
+# The reserve is at most the descriptor limit divided by this: 16 of 64.
 DESCRIPTORS_RESERVED_PART: Final = 4
-"""The reserve is at most the descriptor limit divided by this: 16 of 64."""
+# How long after a refusal for want of a descriptor the user is told of it.
 DESCRIPTORS_TOLD: Final = 10.0
-"""How long after a refusal for want of a descriptor the user is told of it."""
+# Users are warned above this share of the descriptors that are not in the reserve.
 DESCRIPTORS_NEAR: Final = 0.8
-"""Users are warned above this share of the descriptors that are not in the reserve."""
+# The pause after a count of all open descriptors, in multiples of the time that the count took.
 DESCRIPTORS_COUNT_SHARE: Final = 100
-"""The pause after a count of all open descriptors, in multiples of the time that the count took."""
+# Connections that one listening socket accepts in one callback, 15 microseconds each.
 ACCEPTS: Final = 16
-"""Connections that one listening socket accepts in one callback, 15 microseconds each."""
+# Pause before a server without a free descriptor tries again to accept; an attempt costs some 10 microseconds.
 ACCEPT_PAUSE: Final = 0.5
-"""Pause before a server without a free descriptor tries again to accept; an attempt costs some 10 microseconds."""
+# The interpreter's switch interval (``sys.setswitchinterval``). While another thread parses XML, the loop is 3 ms
+# late (p50) with Python's default of 5 ms, and 0.16 ms late with this value.
 THREAD_SWITCH: Final = 1e-4
-"""The interpreter's switch interval (``sys.setswitchinterval``). While another thread parses XML, the loop is 3 ms
-late (p50) with Python's default of 5 ms, and 0.16 ms late with this value."""
+# Objects made and not freed since the last collection of young garbage, from which on another one is due: 1 ms at
+# most, mostly 0.1 ms. Every fifth takes the next generation too; all objects but the frozen ones are scanned after
+# 500,000, if a quarter of them is new (20 ms at 5,000 topics).
 COLLECT_THRESHOLDS: Final = (1000, 5, 100)
-"""Objects made and not freed since the last collection of young garbage, from which on another one is due: 1 ms at
-most, mostly 0.1 ms. Every fifth takes the next generation too; all objects but the frozen ones are scanned after
-500,000, if a quarter of them is new (20 ms at 5,000 topics)."""
 
 # --- the kernel's TCP sockets -----------------------------------------------------------------------------------
+# One part of a dump; the kernel makes parts of at most 32 KiB.
 SOCK_DIAG_BUFFER: Final = 64 * KIB
-"""One part of a dump; the kernel makes parts of at most 32 KiB."""
+# Dumps that are tried one after the other while each is interrupted by a change of the kernel's table.
 SOCK_DIAG_DUMPS: Final = 3
-"""Dumps that are tried one after the other while each is interrupted by a change of the kernel's table."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
+# Delay beyond which a best-effort message (held up by an outage) is dropped if a newer one of its topic follows.
 STALE_AGE: Final = 0.1
-"""Delay beyond which a best-effort message (held up by an outage) is dropped if a newer one of its topic follows."""
+# How long an agent that ends waits for its last bytes to be sent.
 DRAIN_TIMEOUT: Final = 1.0
-"""How long an agent that ends waits for its last bytes to be sent."""
+# Connections that the kernel holds until they are accepted (``net.core.somaxconn`` bounds it): all peers of a
+# restarted agent dial at once. As many as may be without a finished handshake then; a further peer dials again.
 MESH_BACKLOG: Final = 256
-"""Connections that the kernel holds until they are accepted (``net.core.somaxconn`` bounds it): all peers of a
-restarted agent dial at once. As many as may be without a finished handshake then; a further peer dials again."""
+# Attempts to find a port number that is free for both TCP and UDP; the first one nearly always succeeds.
 MESH_PORT_ATTEMPTS: Final = 32
-"""Attempts to find a port number that is free for both TCP and UDP; the first one nearly always succeeds."""
 
 # --- logging ----------------------------------------------------------------------------------------------------
+# Log lines that wait while the reader of the log does not read: some 1 MB. Beyond it the newest lines are lost.
 LOG_WAITING: Final = 10_000
-"""Log lines that wait while the reader of the log does not read: some 1 MB. Beyond it the newest lines are lost."""
+# Log lines are gathered for this long before they are written, so that a burst costs one system call.
 LOG_GATHER: Final = 0.01
-"""Log lines are gathered for this long before they are written, so that a burst costs one system call."""
+# Log lines in one write.
 LOG_BATCH: Final = 1000
-"""Log lines in one write."""

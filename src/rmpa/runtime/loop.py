@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
     from _typeshed import FileDescriptorLike
 
+# Seconds over which the processes of a machine spread; a multiple of the usual periods.
 _ORIGIN_SPAN: Final = 60.0
-"""Seconds over which the processes of a machine spread; a multiple of the usual periods."""
 _origin: Final = random.uniform(0.0, _ORIGIN_SPAN)  # noqa: S311 - spreads load, protects nothing
 
 
@@ -237,10 +237,10 @@ _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _MAX_EVENTS: Final = 64
+# Steps of long work between two yields; a step takes a microsecond or less.
 _ITEMS_PER_YIELD: Final = 64
-"""Steps of long work between two yields; a step takes a microsecond or less."""
+# Items that are sorted without a yield; it takes some 50 microseconds.
 _SORTED_RUN: Final = 256
-"""Items that are sorted without a yield; it takes some 50 microseconds."""
 _T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _NOT_WRITABLE: Final = ~select.EPOLLOUT
@@ -261,8 +261,8 @@ class DirectSelector(selectors.EpollSelector):
         self._poll_direct = self._data.poll
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
+        # Whether a direct reader or writer is running.
         self.in_direct_call = False
-        """Whether a direct reader or writer is running."""
         self.polled_at = self.previous_poll_at = time.monotonic()
 
     def call_directly(self, fd: int, reader: Callable[[], None]) -> None:
@@ -361,8 +361,8 @@ class AgentLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
+        # Handles the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``.
         self.yield_to_data = self._direct_selector.poll_data
-        """Handles the data that has arrived. Code without a reference to the loop calls ``yield_to_data()``."""
         # asyncio takes each ready callback from this queue, and only from it.
         self._ready: deque[asyncio.Handle] = _ReadyQueue(self.yield_to_data)
 

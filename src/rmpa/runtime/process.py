@@ -63,8 +63,8 @@ class LogWriter:
         self._waiting: deque[str] = deque()
         self._wake = threading.Event()
         self._closed = False
+        # The number of lost lines that is not logged yet.
         self.lost = 0
-        """The number of lost lines that is not logged yet."""
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 

@@ -77,8 +77,8 @@ class Stream:
         self._sock: socket.socket | SecureSocket = sock if secure is None else secure
         self._on_bytes = on_bytes
         self._on_close = on_close
+        # The queue of the waiting bytes, with the counts of dropped entries.
         self.outbox = outbox
-        """The queue of the waiting bytes, with the counts of dropped entries."""
         self._frame = frame
         self._keep = keep
         self._buffer = bytearray(_FIRST_BUFFER)
@@ -89,21 +89,21 @@ class Stream:
         self._finishing = False
         self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
+        # The read for which messages are kept.
         self._collection: object = None
-        """The read for which messages are kept."""
+        # Whether the socket is gone.
         self.closed = False
-        """Whether the socket is gone."""
         self._reading_held = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
         self.bytes_in = 0
         self.bytes_out = 0
+        # When bytes were last received (``loop.time()``), even if ``on_bytes`` was not called for them yet.
         self.last_in = self._loop.time()
-        """When bytes were last received (``loop.time()``), even if ``on_bytes`` was not called for them yet."""
+        # When the last silence of more than ``limits.STALE_AGE`` was about to end: the time of the last poll that
+        # found no bytes (``loop.time()``). Bytes that the remote side sent before that time were delayed by the
+        # network; later ones may have waited in this process.
         self.resumed_at = -math.inf
-        """When the last silence of more than ``limits.STALE_AGE`` was about to end: the time of the last poll that
-        found no bytes (``loop.time()``). Bytes that the remote side sent before that time were delayed by the
-        network; later ones may have waited in this process."""
         self._fd = sock.fileno()
         # An agent's loop calls readers of the data path directly; other loops (tools, tests) have no such method.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)

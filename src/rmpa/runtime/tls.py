@@ -34,8 +34,8 @@ def unsent(parts: Sequence[Buffer], sent: int) -> list[Buffer]:
 # One loop and one thread handle reads, one after the other; a read may be handled within another one.
 
 
+# Called in order at the end of the read that is handled now; ``None``: nothing is collected.
 collected: list[Callable[[], None]] | None = None
-"""Called in order at the end of the read that is handled now; ``None``: nothing is collected."""
 
 
 class CollectedSends:
@@ -80,17 +80,17 @@ def after_read(call: Callable[[], None]) -> None:
 # and while it does, ``sendmsg`` takes nothing more. ``pending`` and ``readable`` say what epoll does not see.
 
 
+# What ``SecureSocket.recv_into`` returns for a part of a record: the other side is alive.
 INCOMPLETE: Final = -1
-"""What ``SecureSocket.recv_into`` returns for a part of a record: the other side is alive."""
+# Plain bytes of the largest record (RFC 8446, section 5.1).
 _RECORD: Final = 16 * KIB
-"""Plain bytes of the largest record (RFC 8446, section 5.1)."""
+# Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of
+# the largest size for each connection.
 _WRITE_MAX: Final = 128 * KIB
-"""Plain bytes that are encrypted at once at most, 0.1 ms. Twice as many are no faster, and OpenSSL keeps buffers of
-the largest size for each connection."""
+# Bytes that are read from the socket at once.
 _READ: Final = 128 * KIB
-"""Bytes that are read from the socket at once."""
+# Where every connection reads ciphertext: one loop, one thread, and nothing stays in it.
 _scratch: Final = memoryview(bytearray(_READ))
-"""Where every connection reads ciphertext: one loop, one thread, and nothing stays in it."""
 
 
 class TlsHandshake:
@@ -103,10 +103,10 @@ class TlsHandshake:
 
     def __init__(self, context: ssl.SSLContext, *, server_side: bool) -> None:
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        # The connection's state, for the certificate and the protocol that was chosen.
         self.tls = context.wrap_bio(self._incoming, self._outgoing, server_side=server_side)
-        """The connection's state, for the certificate and the protocol that was chosen."""
+        # Whether this side has finished; a server may still refuse the client's certificate afterwards.
         self.done = False
-        """Whether this side has finished; a server may still refuse the client's certificate afterwards."""
 
     def receive(self, data: Buffer) -> None:
         """Take bytes of the other side; at first none, so that a client begins.
@@ -161,11 +161,11 @@ class SecureSocket:
         self._incoming = incoming
         self._outgoing = outgoing
         self._unsent: memoryview | None = None
+        # Plain bytes that are encrypted at once: one record once the socket was full, as neither the drop policy
+        # nor more urgent messages reach what is encrypted; more again as long as the socket takes all.
         self._most = _WRITE_MAX
-        """Plain bytes that are encrypted at once: one record once the socket was full, as neither the drop policy
-        nor more urgent messages reach what is encrypted; more again as long as the socket takes all."""
+        # Whether there may be bytes for ``recv_into`` that epoll does not know of.
         self.readable = incoming.pending > 0
-        """Whether there may be bytes for ``recv_into`` that epoll does not know of."""
 
     @property
     def pending(self) -> bool:

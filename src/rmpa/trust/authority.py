@@ -76,8 +76,8 @@ class MeshAuthority:
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
             raise StartError(str(store.path(files_of.CA_KEY)), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
+        # The tokens.
         self.book = store.load_tokens()
-        """The tokens."""
 
     @property
     def issued(self) -> tuple[Issued, ...]:

@@ -166,12 +166,13 @@ def _under_signature(form: type[msgspec.Struct], text: str) -> bytes:
     return f"rmpa {_KINDS[form]} 1\0{text}".encode()
 
 
+# What a module's name follows in the SAN.
 URN: Final = "urn:rmpa:"
-"""What a module's name follows in the SAN."""
+# The curve of all keys; browsers, which ``rmpa web`` serves, know it.
 CURVE: Final = ec.SECP256R1()
-"""The curve of all keys; browsers, which ``rmpa web`` serves, know it."""
 _PURPOSES: Final = (ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH)
 _USAGES: Final = tuple(inspect.signature(x509.KeyUsage).parameters)
+# What ``cryptography`` raises about malformed input.
 _UNREADABLE: Final = (
     ValueError,
     TypeError,
@@ -180,7 +181,6 @@ _UNREADABLE: Final = (
     x509.InvalidVersion,
     x509.UnsupportedGeneralNameType,
 )
-"""What ``cryptography`` raises about malformed input."""
 
 
 @dataclass(frozen=True, slots=True)

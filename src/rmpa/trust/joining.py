@@ -71,10 +71,10 @@ class JoinServer:
         self._clock = clock
         self._refusals = RefusalLog(_log, counters)
         self._is_linked = is_linked
+        # What came of each token, by its id.
         self._steps: dict[bytes, JoinStep] = {}
-        """What came of each token, by its id."""
+        # Set, and replaced, at each step.
         self.changed = asyncio.Event()
-        """Set, and replaced, at each step."""
 
     async def serve(self, sock: socket.socket, handshake: TlsHandshake, host: str) -> None:
         """Read one question behind the TLS handshake, and answer it; the caller closes the socket.

@@ -88,18 +88,18 @@ class Membership:
             self._ca_key = certificates.ca_public_key(files.ca)
             self.certificate = certificates.verify(files.certificate, files.ca, None)
         with _named(store, files_of.KEYS):
+            # The list of group keys that holds.
             self.keys = read_document(files.keys, self._ca_key, KeyList)
-            """The list of group keys that holds."""
         with _named(store, files_of.DENY):
+            # The deny list that holds.
             self.deny = read_document(files.deny, self._ca_key, DenyList) if files.deny else DenyList()
-            """The deny list that holds."""
         proves_from, age = self.keys.proves_from, self._age(self.keys, limits.KEY_SPREAD)
         self.ring = KeyRing(self.keys.keys, clock.now(), proves_from=proves_from, age=age)
         self.packets = PacketTrust(self.ring, self.wall)
+        # Called after a newer deny list holds: links that match end at once.
         self.on_denied: list[Callable[[], None]] = []
-        """Called after a newer deny list holds: links that match end at once."""
+        # Writes one file of the store.
         self.save: Callable[[str, bytes], None] = store.write
-        """Writes one file of the store."""
         self._make_contexts()
 
     @classmethod

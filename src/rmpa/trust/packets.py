@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 _NEVER: Final = float("-inf")
+# What the tags of a group key are for, so that no bytes of another use can stand for one.
 _PURPOSE: Final = b"rmpa beacon 1"
-"""What the tags of a group key are for, so that no bytes of another use can stand for one."""
 
 
 class GroupKey(msgspec.Struct, frozen=True):
@@ -86,8 +86,8 @@ class KeyRing:
         found = sorted(keys, key=lambda key: key.number)
         if not found:
             raise ValueError("a key ring has at least one key")
+        # By number, in order.
         self._terms = {found[0].number: _Term(found[0], _NEVER)}
-        """By number, in order."""
         self.take(found[1:-1], now, proves_from=proves_from, age=float("inf"))  # when they were made is not known
         self.take(found[-1:], now, proves_from=proves_from, age=age)
 
@@ -149,24 +149,24 @@ _MASK: Final = (1 << _WINDOW) - 1
 class Verdict(StrEnum):
     """What the trailer says of a packet; the value is the end of the counter's name (``beacon.forged``)."""
 
+    # A member sent it, just now.
     ACCEPTED = "accepted"
-    """A member sent it, just now."""
+    # A module with an older group key sent it: it was away, or revoked. It is told where this one is.
     OLD_KEY = "old_key"
-    """A module with an older group key sent it: it was away, or revoked. It is told where this one is."""
+    # It has no trailer that this version knows.
     UNTAGGED = "untagged"
-    """It has no trailer that this version knows."""
+    # It is signed with a group key that is not known here: of another mesh, or newer than ours.
     UNKNOWN_KEY = "unknown_key"
-    """It is signed with a group key that is not known here: of another mesh, or newer than ours."""
+    # Its tag is wrong.
     FORGED = "forged"
-    """Its tag is wrong."""
+    # Its time is far from ours: it is an old packet, or one of the clocks is off.
     CLOCK = "clock"
-    """Its time is far from ours: it is an old packet, or one of the clocks is off."""
+    # It came before, perhaps by another interface.
     REPEATED = "repeated"
-    """It came before, perhaps by another interface."""
+    # It is older than the last packets of its run.
     REPLAYED = "replayed"
-    """It is older than the last packets of its run."""
+    # Its number is further ahead than its run can have come: a member claims the run of another one.
     LEAP = "leap"
-    """Its number is further ahead than its run can have come: a member claims the run of another one."""
 
 
 class ReplayWindow:
@@ -232,12 +232,12 @@ class ReplayWindow:
 
 
 FORMAT: Final = 1
+# Flag: the sender's clock is set, so its time can be compared.
 CLOCK_SET: Final = 1
-"""Flag: the sender's clock is set, so its time can be compared."""
 _HEAD: Final = struct.Struct(">BBHQI")
 _TAG: Final = limits.TAG_BYTES
+# Bytes that the trailer adds to a packet.
 TRAILER_BYTES: Final = _HEAD.size + _TAG
-"""Bytes that the trailer adds to a packet."""
 _TIME_MASK: Final = 0xFFFFFFFF
 _TIME_HALF: Final = 1 << 31
 

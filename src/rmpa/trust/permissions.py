@@ -27,16 +27,17 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import TrustSettings
 
+# An action's topics that its client publishes (wiki.ros.org/actionlib/DetailedDescription).
 _CLIENT_SENDS: Final = ("goal", "cancel")
-"""An action's topics that its client publishes (wiki.ros.org/actionlib/DetailedDescription)."""
+# An action's topics that its server publishes.
 _SERVER_SENDS: Final = ("status", "feedback", "result")
-"""An action's topics that its server publishes."""
 _ACTION_TOPICS: Final = {
     (ACTION_CLIENT, Access.PUBLISH): _CLIENT_SENDS,
     (ACTION_CLIENT, Access.SUBSCRIBE): _SERVER_SENDS,
     (ACTION_SERVER, Access.PUBLISH): _SERVER_SENDS,
     (ACTION_SERVER, Access.SUBSCRIBE): _CLIENT_SENDS,
 }
+# Each access as a verb, for texts.
 _DONE: Final = {
     Access.PUBLISH: "publish",
     Access.SUBSCRIBE: "subscribe to",
@@ -45,7 +46,6 @@ _DONE: Final = {
     Access.PARAM: "read or set",
     Access.KILL: "end",
 }
-"""Each access as a verb, for texts."""
 
 
 class PermissionDecision(NamedTuple):
@@ -189,10 +189,10 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
 class Document(StrEnum):
     """The signed documents, in the order in which they are sent: a module that was revoked gets no new key."""
 
+    # The deny list.
     DENY = "deny"
-    """The deny list."""
+    # The list of group keys.
     KEYS = "keys"
-    """The list of group keys."""
 
     @property
     def notice(self) -> str:
@@ -200,8 +200,8 @@ class Document(StrEnum):
         return f"trust.{self}"
 
 
+# The notification of what a module has, as ``Have``.
 HAVE: Final = "trust.have"
-"""The notification of what a module has, as ``Have``."""
 
 
 class Have(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -260,24 +260,24 @@ class DocumentSpreading:
 class TrustReason(IntEnum):
     """Why a connection is refused; the numbers continue those of ``mesh.frames.Refusal`` on the wire."""
 
+    # The dialler does not use TLS, and this mesh does.
     PLAIN = 11
-    """The dialler does not use TLS, and this mesh does."""
+    # The acceptor has not joined a secured mesh, and the dialler has.
     UNSECURED = 12
-    """The acceptor has not joined a secured mesh, and the dialler has."""
+    # The group key of its packets is unknown.
     KEY = 13
-    """The group key of its packets is unknown."""
+    # A certificate begins in the future.
     CLOCK = 14
-    """A certificate begins in the future."""
+    # The certificate is of another CA.
     FOREIGN = 15
-    """The certificate is of another CA."""
+    # The certificate's time is over.
     EXPIRED = 16
-    """The certificate's time is over."""
+    # The certificate is on the deny list.
     REVOKED = 17
-    """The certificate is on the deny list."""
+    # The certificate is of another module than the hello says.
     NAME = 18
-    """The certificate is of another module than the hello says."""
+    # The connection does not use TLS 1.3 with this protocol.
     DOWNGRADE = 19
-    """The connection does not use TLS 1.3 with this protocol."""
 
     @property
     def label(self) -> str:
@@ -303,6 +303,7 @@ _REMEDIES: Final = {
 }
 
 
+# Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``.
 NOT_OF_THIS_MESH: Final = {
     TrustReason.PLAIN: "it has joined a secured mesh and this module has not; join it by rmpa trust join TOKEN here, "
     "with a token of rmpa trust invite at the authority of that mesh",
@@ -313,7 +314,6 @@ NOT_OF_THIS_MESH: Final = {
     TrustReason.KEY: "its group key is unknown here; if it has joined another mesh, rmpa trust leave and rmpa trust "
     "join TOKEN there; if it is of this one, rmpa trust renew here",
 }
-"""Why a module is not of this mesh, and what to do; behind a semicolon, as for ``Check.from_message``."""
 
 
 def not_of_this_mesh(reason: TrustReason) -> str:
@@ -477,10 +477,10 @@ class TrustReply(msgspec.Struct, kw_only=True, frozen=True):
 
 
 _LABEL: Final = r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?"
+# A name without a dot, or below a domain that is no one's in the Internet (RFC 6762, RFC 8375, ICANN's internal).
 _LOCAL: Final = re.compile(rf"{_LABEL}|(?:{_LABEL}\.)+(?:local|lan|internal|home\.arpa)")
-"""A name without a dot, or below a domain that is no one's in the Internet (RFC 6762, RFC 8375, ICANN's internal)."""
+# Of carriers, and of VPNs such as Tailscale's (RFC 6598).
 _SHARED: Final = ipaddress.IPv4Network("100.64.0.0/10")
-"""Of carriers, and of VPNs such as Tailscale's (RFC 6598)."""
 
 
 def server_names(name: str) -> tuple[str, ...]:

@@ -39,12 +39,12 @@ CA_KEY: Final = "ca.key"
 TOKENS: Final = "tokens.json"
 ISSUED: Final = "issued.json"
 AUTHORITY: Final = "authority.json"
+# The key of a join by files, until its answer comes.
 REQUEST_KEY: Final = "request.key"
-"""The key of a join by files, until its answer comes."""
+# Files that each member must have.
 _MEMBER: Final = (KEY, CERTIFICATE, CA, KEYS)
-"""Files that each member must have."""
+# Any of these is the sign of a module that has joined.
 _SIGNS: Final = (*_MEMBER, DENY, CA_KEY, TOKENS, ISSUED, AUTHORITY)
-"""Any of these is the sign of a module that has joined."""
 _ALL: Final = (*_SIGNS, REQUEST_KEY)
 _FILE_MAX: Final = limits.DOCUMENT_MAX
 _JOIN: Final = "join again: rmpa trust invite at the authority, rmpa trust join TOKEN here; or rmpa trust leave"
@@ -373,12 +373,12 @@ def _sync_folder(folder: Path) -> None:
 # The ``ssl.SSLContext`` of members, and of modules that join: TLS 1.3 alone, no resumption.
 
 
+# Protocol of a link inside TLS (RFC 7301).
 ALPN_LINK: Final = "rmpa/1"
-"""Protocol of a link inside TLS (RFC 7301)."""
+# Protocol of a join, and of a renewal with a certificate that has ended.
 ALPN_JOIN: Final = "rmpa-join/1"
-"""Protocol of a join, and of a renewal with a certificate that has ended."""
+# X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python has no name for.
 _NO_CHECK_TIME: Final = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python has no name for."""
 
 
 def member_context(certificate: Path, key: Path, ca: bytes, *alpn: str, server_side: bool) -> ssl.SSLContext:

@@ -48,13 +48,13 @@ _TEXT: Final = re.compile(r"[a-z2-7]+")
 _REMEDY: Final = "copy it whole from the output of rmpa trust invite"
 
 
+# Why a token is not taken: the word for the wire, ``--json`` and counters, and what is wrong with the token.
 TOKEN_PROBLEMS: Final = {
     "token": "is unknown here",  # or was withdrawn
     "used": "was used",
     "late": "has ended",
     "name": "is for another module",
 }
-"""Why a token is not taken: the word for the wire, ``--json`` and counters, and what is wrong with the token."""
 
 
 @dataclass(eq=False)
