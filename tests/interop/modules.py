@@ -83,11 +83,16 @@ class Bed:
         with ExitStack() as stack:
             lab = stack.enter_context(Lab())
             self.agents = start_linked(lab.hosts(*names), home, stack, options)
+            self._pids = [agent.pid for agent in self.agents]
             self._at_first = self._state()
             self._stack = stack.pop_all()
 
     def settled(self) -> bool:
         """Whether it is as it was at first; the agents' output so far is forgotten."""
+        if any(agent.process.returncode is not None for agent in self.agents):
+            return False
+        if [agent.pid for agent in self.agents] != self._pids:
+            return False
         try:
             for agent in self.agents:
                 file = agent.home / f"{agent.name}.toml"
@@ -106,12 +111,12 @@ class Bed:
         self._stack.close()
 
     def _state(self) -> list[object]:
-        """What a test may not change: processes, cables, links, what the cores hold."""
+        """What a test may not leave changed: addresses and cables, links, what the cores hold."""
         state: list[object] = []
         for agent in self.agents:
             with MasterProxy(agent.host, agent.core_port) as master:
                 core = [master.getSystemState("/test"), sorted(master.getParamNames("/test")[2])]  # type: ignore[index, arg-type] # XML-RPC
-            state += [agent.pid, agent.process.returncode, agent.host.ip("-4", "address"), agent.linked(), core]
+            state += [agent.host.ip("-4", "address"), agent.linked(), core]
         return state
 
 
