@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import rmpa
 from rmpa.bridge import limits
@@ -139,9 +137,6 @@ def test_a_secured_mesh_relays_between_machines_unless_the_user_allows_plain_con
 WANT = Want("/chatter", "/talker", "/viewer")
 
 
-NAMES = st.from_regex(r"/[a-z][a-z0-9_]{0,10}", fullmatch=True)
-
-
 def test_a_request_carries_the_whole_contract_and_no_address() -> None:
     asked = DirectAsk(*WANT, Contract(transport=Transport.AUTO))
     written = msgspec.to_builtins(asked)
@@ -155,12 +150,6 @@ def test_a_notification_names_what_is_wanted() -> None:
     assert WANT._asdict() == {"name": "/chatter", "node": "/talker", "user": "/viewer"}
     assert read_ask(WANT._asdict()).want == WANT
     assert read_ask({"name": "/add", "node": "/adder"}).want == Want("/add", "/adder")
-
-
-@given(NAMES, NAMES, NAMES, st.sampled_from(list(Transport)), st.booleans())
-def test_what_is_written_can_be_read(name: str, node: str, user: str, transport: Transport, broken: bool) -> None:
-    asked = DirectAsk(name, node, user, Contract(transport=transport), broken)
-    assert read_ask(json.loads(json.dumps(msgspec.to_builtins(asked)))) == asked
 
 
 BAD: list[dict[str, Any]] = [

@@ -26,9 +26,8 @@ from tests.bridge.recorder import (
     ServiceExports,
     ServiceImports,
     Warn,
-    Withdraw,
 )
-from tests.bridge.services.test_rules import apply_rules, rules
+from tests.bridge.services.test_rules import rules
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -236,14 +235,6 @@ def test_a_leaving_node_gives_its_place_to_the_longest_waiting() -> None:
     assert not made.refused_nodes(1), "one that is gone waits no more"
 
 
-def test_what_policy_hides_takes_no_place() -> None:
-    made = imports(nodes=1)
-    secret = TopicOffer("/secret", "/other", "a/B")
-    assert made.advertised(1, Advertise(added=(secret,))) == []
-    assert published(made.advertised(1, Advertise(added=offers(range(1))))) == ["/n0/t0"]
-    assert not made.refused_nodes(1)
-
-
 def test_topics_beyond_the_limit_come_when_there_is_room() -> None:
     made = imports(topics=2)
     actions = made.advertised(1, Advertise(added=offers(range(4))))
@@ -394,19 +385,6 @@ def services(*, nodes: int = 100, count: int = 100) -> ServiceImports:
     return made
 
 
-def test_services_of_nodes_beyond_the_limit_wait_for_a_place() -> None:
-    made = services(nodes=1)
-    made.advertised(1, provided("/a", node="/first"))
-    assert made.advertised(1, provided("/b", "/c", node="/second")) == []
-    remote = made.get(1, "/b")
-    assert remote is not None
-    assert "limits.nodes = 1 of this module" in made.hidden(remote)
-    assert {node: set(names) for node, names in made.refused_nodes(1).items()} == {"/second": {"/b", "/c"}}
-    actions = made.advertised(1, provided(removed=("/a",)))
-    assert [type(action) for action in actions] == [Withdraw, Provide, Provide]
-    assert not made.refused_nodes(1)
-
-
 def test_another_peer_provides_what_one_has_no_place_for() -> None:
     made = services(nodes=1)
     made.link_up(2, "other", rank=20)
@@ -491,22 +469,3 @@ def test_after_reloads_each_service_has_one_provider(
             assert not waits
         elif not remote.shown:
             assert waits or remote.name in visible
-
-
-def test_own_services_beyond_the_limit_are_offered_later() -> None:
-    made = ServiceExports(rules(), LimitSettings(services=1))
-    made.link_up(1, "far")
-    add, mul = LocalService("/adder", "rosrpc://127.0.0.1:5"), LocalService("/multiplier", "rosrpc://127.0.0.1:6")
-    assert made.graph("/add", add) == []
-    (warning,) = made.graph("/mul", mul)
-    assert isinstance(warning, Warn)
-    assert "limits.services = 1" in warning.text
-    assert set(made.beyond) == {"/mul"}
-    made.graph("/add", None)
-    assert dict(made.offered) == {"/mul": mul}
-    assert not made.beyond
-    told = [action.message for action in made.advertise() if isinstance(action, Send)]
-    assert told == [AdvertiseServices(added=(ServiceOffer("/mul", "/multiplier"),))]
-    made.graph("/add", add)
-    assert apply_rules(made, rules()) == []
-    assert set(made.offered) == {"/add", "/mul"}, "the default limit is higher"

@@ -246,15 +246,6 @@ def test_two_networks_and_two_relays_of_which_one_is_used() -> None:
     assert [whose.name for whose, _ in b.imports.ways] == ["m3"], "a link of its own goes first"
 
 
-def test_who_does_not_relay_passes_nothing_on() -> None:
-    world = Map(3, set(), 1)
-    world.link(1, 2)
-    world.link(2, 3)
-    world.settle()
-    world.check()
-    assert world.modules[3].visible() == [("/t2", "/rmpa/m2/n"), ("/u2", "/rmpa/m2/n")]
-
-
 def test_a_long_row_ends_at_the_hop_limit() -> None:
     world = Map(limits.RELAY_HOPS_MAX + 3, set(range(1, 10)), 1)
     for number in range(1, limits.RELAY_HOPS_MAX + 3):

@@ -12,7 +12,7 @@ import pytest
 
 from rmpa.bridge import limits
 from rmpa.bridge.graph_part import GraphPart
-from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode, op_of
+from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode
 from rmpa.bridge.policy import PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import Part, PeerSession, PeerSessions, PeerState
@@ -20,7 +20,6 @@ from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.core.errors import LimitExceeded
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.http.rpc import call_api
@@ -188,46 +187,30 @@ def test_a_module_at_the_address_of_another_ends_its_session_in_a_plain_mesh_alo
     assert play(scene) == ["up 1", "down", *([] if secured else ["gone"]), "up 2"]
 
 
-def test_a_session_that_nothing_waits_for_ends_after_the_grace() -> None:
+@pytest.mark.parametrize(
+    ("silent", "crashed", "outages", "grace"),
+    [
+        (True, False, (), GRACE),
+        (True, True, (), mesh_limits.AWAY_GRACE),
+        (False, False, (), 0.0),
+        (True, False, (3.0, 9.0), 9.0),
+    ],
+)
+def test_a_session_ends_with_its_grace_or_what_is_kept(
+    silent: bool, crashed: bool, outages: tuple[float, ...], grace: float
+) -> None:
     async def scene(made: Scene) -> None:
-        made.sessions.link_down(made.link())
-        await asyncio.sleep(GRACE + 0.1)
+        link = made.link(silent=silent)
+        link.crashed = crashed
+        made.sessions.link_down(link)
+        if grace:
+            await asyncio.sleep(grace - 0.1)
+            assert made.states() == [PeerState.AWAY if outages else PeerState.SILENT]
+            await asyncio.sleep(0.2)
         assert made.states() == []
         made.link()
 
-    assert play(scene) == ["up 1", "down", "grace over", "gone", "up 2"]
-
-
-def test_a_peer_whose_agent_died_has_a_short_grace() -> None:
-    async def scene(made: Scene) -> None:
-        link = made.link()
-        link.crashed = True
-        made.sessions.link_down(link)
-        await asyncio.sleep(mesh_limits.AWAY_GRACE / 2)
-        assert made.states() == [PeerState.SILENT]
-        await asyncio.sleep(mesh_limits.AWAY_GRACE)
-        assert made.states() == []
-
-    assert play(scene) == ["up 1", "down", "grace over", "gone"]
-
-
-def test_a_link_that_was_closed_in_order_has_no_grace() -> None:
-    async def scene(made: Scene) -> None:
-        made.sessions.link_down(made.link(silent=False))
-        assert made.states() == []
-
-    assert play(scene) == ["up 1", "down", "grace over", "gone"]
-
-
-def test_a_session_waits_for_as_long_as_something_is_kept() -> None:
-    async def scene(made: Scene) -> None:
-        made.sessions.link_down(made.link())
-        await asyncio.sleep(8.9)
-        assert made.states() == [PeerState.AWAY]
-        await asyncio.sleep(0.2)
-        assert made.states() == []
-
-    assert play(scene, 3.0, 9.0) == ["up 1", "down", "grace over", "gone"]
+    assert play(scene, *outages) == ["up 1", "down", "grace over", "gone", "up 2"]
 
 
 def test_another_run_of_the_peer_ends_the_session_that_waits() -> None:
@@ -525,11 +508,3 @@ async def test_what_a_lost_link_has_said_is_dropped() -> None:
     assert not part.depends(part.session)
     await until_settled(part)
     assert not part.shown
-
-
-async def test_a_too_long_advertisement_ends_the_link_unparsed() -> None:
-    part = OnePart()
-    payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
-    assert op_of(payload) == "advertise"
-    with pytest.raises(LimitExceeded):
-        part.advertised(part.session, payload)

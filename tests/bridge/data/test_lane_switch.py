@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections import deque
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rmpa.bridge.data.route import BULK, EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, Priority
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Lane
+
+if TYPE_CHECKING:
+    from rmpa.mesh.frames import Lane
 
 SMALL = limits.EXPRESS_MESSAGE_MAX
 LARGE = SMALL + 1
@@ -55,39 +56,6 @@ def test_priority_outweighs_message_size(priority: Priority) -> None:
     assert switch.lane is (EXPRESS if priority is Priority.HIGH else BULK)
 
 
-def test_first_large_message_waits_for_the_fence() -> None:
-    switch = LaneSwitch(Contract())
-    assert not switch.judge(SMALL, 0.0)
-    assert switch.judge(LARGE, 1.0)
-    assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, BULK, False)
-    number = switch.fence()
-    assert (switch.lane, switch.fencing) == (EXPRESS, True)
-    assert switch.fenced(number)
-    assert (switch.lane, switch.target, switch.fencing) == (BULK, BULK, False)
-    assert not switch.judge(LARGE, 2.0)
-    assert not switch.judge(SMALL, 2.0)
-
-
-def test_return_needs_many_small_messages_for_long() -> None:
-    many_at_once = on_bulk()
-    assert not any(many_at_once.judge(SMALL, REST - 0.001) for _ in range(5 * ROW))
-    assert many_at_once.judge(SMALL, REST)
-    few_for_long = on_bulk()
-    assert not any(few_for_long.judge(SMALL, REST + n) for n in range(ROW - 1))
-    assert few_for_long.judge(SMALL, REST + ROW)
-    assert (few_for_long.lane, few_for_long.target) == (BULK, EXPRESS)
-    assert few_for_long.fenced(few_for_long.fence())
-    assert few_for_long.lane is EXPRESS
-
-
-def test_one_large_message_in_the_row_begins_it_anew() -> None:
-    switch = on_bulk()
-    assert not any(switch.judge(SMALL, REST) for _ in range(ROW - 1))
-    assert not switch.judge(LARGE, REST)
-    assert not any(switch.judge(SMALL, 2 * REST) for _ in range(ROW - 1))
-    assert switch.judge(SMALL, 2 * REST)
-
-
 def test_only_the_answer_to_the_present_fence_counts() -> None:
     switch = LaneSwitch(Contract(), large=True)
     assert not switch.fenced(0)
@@ -127,90 +95,6 @@ def test_new_link_begins_on_the_express_lane() -> None:
     switch.fence()
     switch.restart()
     assert (switch.lane, switch.target, switch.fencing) == (EXPRESS, BULK, False)
-
-
-class TwoLanes(RuleBasedStateMachine):
-    """A sender that follows ``judge``, over two queues that are independently slow."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.switch = LaneSwitch(Contract())
-        self.now = 0.0
-        self.sent = 0
-        self.held: list[int] = []
-        self.lanes: dict[Lane, deque[tuple[str, int]]] = {EXPRESS: deque(), BULK: deque()}
-        self.answers: deque[int] = deque()
-        self.came: list[int] = []
-
-    @rule(
-        size=st.sampled_from([0, SMALL, LARGE]),
-        count=st.sampled_from([1, 3, ROW + 1]),
-        wait=st.sampled_from([0, REST]),
-    )
-    def publish(self, size: int, count: int, wait: float) -> None:
-        self.now += wait
-        for _ in range(count):
-            self.sent += 1
-            if self.switch.fencing:
-                self.held.append(self.sent)
-            elif self.switch.judge(size, self.now):
-                self.held.append(self.sent)
-                self.lanes[self.switch.lane].append(("fence", self.switch.fence()))
-            else:
-                self.lanes[self.switch.lane].append(("message", self.sent))
-
-    @rule(lane=st.sampled_from(Lane), count=st.sampled_from([1, 2, 500]))
-    def carry(self, lane: Lane, count: int) -> None:
-        for _ in range(min(count, len(self.lanes[lane]))):
-            kind, number = self.lanes[lane].popleft()
-            if kind == "message":
-                self.came.append(number)
-            else:
-                self.answers.append(number)
-
-    @precondition(lambda self: self.answers)
-    @rule()
-    def answer(self) -> None:
-        if self.switch.fenced(self.answers.popleft()):
-            self.go_on()
-
-    @rule()
-    def lose_bulk(self) -> None:
-        self.lanes[BULK].clear()
-        if self.switch.lane_lost():
-            self.go_on()
-
-    def go_on(self) -> None:
-        self.lanes[self.switch.lane].extend(("message", number) for number in self.held)
-        self.held.clear()
-
-    @invariant()
-    def nothing_was_overtaken(self) -> None:
-        assert self.came == sorted(set(self.came))
-
-    @invariant()
-    def nothing_is_held_without_a_fence(self) -> None:
-        assert self.switch.fencing or not self.held
-        assert (
-            not self.switch.fencing
-            or self.answers
-            or any(kind == "fence" for lane in self.lanes.values() for kind, _ in lane)
-        )
-
-    def teardown(self) -> None:
-        """Everything comes to rest: nothing is held for ever."""
-        for _ in range(3):
-            for lane in Lane:
-                self.carry(lane, 1 << 30)
-            while self.answers:
-                self.answer()
-        assert not self.switch.fencing
-        self.nothing_was_overtaken()
-        super().teardown()
-
-
-TestTwoLanes = TwoLanes.TestCase
-TestTwoLanes.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
 
 
 @settings(deadline=None)

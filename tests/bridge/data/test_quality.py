@@ -80,14 +80,6 @@ def test_a_clock_that_is_ahead_is_taken_off() -> None:
     assert s.latency_error == pytest.approx(0.0002 + 0.1 * mesh_limits.CLOCK_DRIFT)
 
 
-def test_without_the_other_clock_there_is_no_latency() -> None:
-    quality = Quality()
-    feed(quality, [1.0, 1.1])
-    s = quality.summary(None, 1.1)
-    assert (s.latency, s.latency_error) == (None, None)
-    assert s.rate == pytest.approx(10)
-
-
 def test_a_stored_message_has_an_age_and_no_latency() -> None:
     quality = Quality()
     quality.arrived(1.0, WALL, WALL - 3600 * SECOND, 10)
@@ -594,22 +586,7 @@ def test_period_begins_anew_after_a_pause() -> None:
     assert admitted(throttle, [100.0 + n / 100 for n in range(31)]) == pytest.approx([100.09, 100.19, 100.29])
 
 
-def test_message_is_admitted_when_due() -> None:
-    throttle = Downsampler(3.0)
-    assert throttle.admit(0.123)
-    for _ in range(10_000):
-        assert not throttle.admit(throttle.due - 0.2 / 3.0)
-        assert throttle.admit(throttle.due)
-
-
 # The history of a peer's clock.
-
-
-def test_estimates_are_kept_in_order() -> None:
-    clock = PeerClockHistory()
-    for second in range(3):
-        clock.add(1.0, 0.01, float(second))
-    assert list(clock.estimates) == [(float(second), 1.0, 0.01) for second in range(3)]
 
 
 def test_a_clock_that_was_set_makes_all_before_void() -> None:

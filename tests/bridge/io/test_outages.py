@@ -92,6 +92,21 @@ async def settled(world: World) -> None:
             await world.rest(1.0)
 
 
+def fall_silent(world: World) -> None:
+    """The cable is out, and both sides have noticed."""
+    world.cut()
+    for index in (0, 1):
+        world.notice(index, silent=True)
+
+
+async def resume(world: World, speaker: Speaker) -> None:
+    """A new link; all that is kept comes, and what is published then."""
+    world.link()
+    await settled(world)
+    await talk(world, speaker, 1.0)
+    await settled(world)
+
+
 async def outage(world: World, speaker: Speaker, seconds: float) -> None:
     """The cable is out, the publisher goes on; each side notices by its lease, or a little before."""
     world.cut()
@@ -167,16 +182,11 @@ def test_beyond_it_all_that_was_kept_is_lost_and_the_receiver_says_so(window: fl
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, listener = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, seconds, linked=False)
         assert not speaker.connections, "nothing is kept any more"
         assert a.bridge.counters["message.given_up"] >= window / PERIOD
-        world.link()
-        await settled(world)
-        await talk(world, speaker, 1.0)
-        await settled(world)
+        await resume(world, speaker)
         assert unknown_at_receiver(b) == 1
         assert (lost_at_receiver(b), lost_at_sender(a)) == (0, 0)
         assert len(listener.got[speaker.number]) >= 1.0 / PERIOD
@@ -251,16 +261,11 @@ def test_a_receivers_agent_that_was_restarted_meanwhile_is_told(window: float, s
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, _ = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, seconds * (0.1 if early else 0.9), linked=False)
         await world.restart(b)
         await talk(world, speaker, seconds * (0.9 if early else 0.1), linked=False)
-        world.link()
-        await settled(world)
-        await talk(world, speaker, 1.0)
-        await settled(world)
+        await resume(world, speaker)
         assert unknown_at_receiver(b) == 1
         assert (lost_at_receiver(b), lost_at_sender(a)) == (0, 0)
 
@@ -272,16 +277,11 @@ def test_a_restarted_sender_makes_the_loss_unknown(seconds: float) -> None:
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, _ = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, seconds / 2, linked=False)
         await world.restart(a)
         await talk(world, speaker, seconds / 2, linked=False)
-        world.link()
-        await settled(world)
-        await talk(world, speaker, 1.0)
-        await settled(world)
+        await resume(world, speaker)
         assert unknown_at_receiver(b) == 1
         assert lost_at_receiver(b) == 0
 
@@ -295,9 +295,7 @@ def test_what_is_kept_for_a_peer_that_is_back_and_has_no_use_for_it_goes() -> No
     async def scene(world: World) -> None:
         a, _ = world.sides
         speaker, listener = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, 5.0, linked=False)
         world.leave(listener)
         world.link()
@@ -318,17 +316,12 @@ def test_a_subscriber_that_left_meanwhile_misses_nothing() -> None:
     async def scene(world: World) -> None:
         b = world.sides[1]
         speaker, listener = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, 60.0, linked=False)
         world.leave(listener)
         await talk(world, speaker, 2 * limits.RECONCILE_INTERVAL, linked=False)
         late = world.listen(b, "/sure")
-        world.link()
-        await settled(world)
-        await talk(world, speaker, 1.0)
-        await settled(world)
+        await resume(world, speaker)
         assert len(late.got[speaker.number]) == round(1.0 / PERIOD)
         assert lost_at_receiver(b) == 0
         assert unknown_at_receiver(b) == 0
@@ -377,9 +370,7 @@ def test_of_a_publisher_that_is_restarted_during_an_outage_messages_may_be_lost(
     async def scene(world: World) -> None:
         a, b = world.sides
         speaker, listener = await begin(world)
-        world.cut()
-        for index in (0, 1):
-            world.notice(index, silent=True)
+        fall_silent(world)
         await talk(world, speaker, 3.0, linked=False)
         again = world.speak(a, "/sure", "/one")
         await asyncio.sleep(1.0)

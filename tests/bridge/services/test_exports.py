@@ -53,18 +53,6 @@ def exports() -> ServiceExports:
     return made
 
 
-def test_a_link_begins_with_all_of_it_in_portions() -> None:
-    made = ServiceExports(rules())
-    count = 2 * limits.ADVERTISED_AT_ONCE + 1
-    for number in range(count):
-        made.graph(f"/s{number}", LocalService("/n", "rosrpc://127.0.0.1:5"))
-    (first,) = made.link_up(1, "base")
-    assert isinstance(first, Send)
-    messages = [first.message, *told(made)]
-    assert [(m.full, m.more) for m in messages] == [(True, True), (False, True), (False, False)]  # type: ignore[union-attr]
-    assert len({offer.service for m in messages for offer in m.added}) == count  # type: ignore[union-attr]
-
-
 def test_an_empty_graph_is_told_too() -> None:
     made = ServiceExports(rules())
     assert made.link_up(1, "base") == [Send(1, AdvertiseServices(full=True))]
@@ -131,17 +119,6 @@ def test_one_probe_answers_all_who_wait(exports: ServiceExports) -> None:
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)], "whoever asks again has another try"
 
 
-def test_requests_never_share_a_route_and_are_even(exports: ServiceExports) -> None:
-    exports.graph("/sub", ADD)
-    first = opened(exports)
-    exports.opened(1, OpenService(ROUTE + 2, "/sub"))
-    told(exports)
-    exports.opened(1, OpenService(ROUTE + 4, "/sub"))
-    serve = next(a for a in exports.described("/sub", ADD, ABOUT) if isinstance(a, ServeRoute))
-    assert {first % 2, serve.requests % 2} == {0}
-    assert first != serve.requests
-
-
 def test_a_link_that_is_gone_ends_its_routes(exports: ServiceExports) -> None:
     requests = opened(exports)
     assert exports.link_down(1) == [EndRoute(1, requests)]
@@ -166,15 +143,6 @@ def test_names_on_the_way_are_each_peers_own() -> None:
     assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/robot1/go", ADD)]
     (refused,) = made.opened(1, OpenService(ROUTE, "/robot1/go"))
     assert isinstance(refused, Send)
-
-
-def test_two_names_that_would_be_one_over_there_are_told_once() -> None:
-    made = ServiceExports(rules(peers=(PeerRule("robot", prefix="/robot1"),)))
-    made.graph("/go", ADD)
-    made.graph("/robot1/go", LocalService("/other", "rosrpc://127.0.0.1:6"))
-    made.link_up(0, "robot")
-    assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/go", ADD)]
-    assert told(made, 0) == []
 
 
 def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> None:

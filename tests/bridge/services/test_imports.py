@@ -92,17 +92,6 @@ def test_of_several_peers_the_lowest_guid_is_shown(imports: ServiceImports) -> N
     assert imports.advertised(3, AdvertiseServices(removed=("/add",)))[-1] == Provide(1, "/add", "/n")
 
 
-def test_policy_hides_here_too() -> None:
-    made = ServiceImports(rules(ServiceSettings(deny=("/add",)), (PeerRule("arm", policy=PolicySettings(allow=())),)))
-    made.link_up(1, "base", rank=1)
-    made.link_up(2, "arm", rank=2)
-    assert made.advertised(1, offer("/add", "/sub", full=True)) == [Provide(1, "/sub", "/n")]
-    assert made.advertised(2, offer("/mul", "/n/get_loggers", full=True)) == []
-    assert hidden(made, 1) == "policy: services.deny has '/add'"
-    assert 'peer "arm".allow' in hidden(made, 2, "/mul")
-    assert "loggers" in hidden(made, 2, "/n/get_loggers")
-
-
 def test_an_opened_service_is_known_until_its_server_is_another_one(imports: ServiceImports) -> None:
     opened(imports)
     assert imports.want(imports.get(1, "/add"), 1.0) == [], "it is open"

@@ -109,26 +109,6 @@ def test_one_connection_on_demand_serves_all_subscribers(offering: Exports) -> N
     assert offering.flowing(CMD) == ()
 
 
-def test_a_late_peer_gets_the_known_description_at_once(offering: Exports) -> None:
-    offering.link_up(2)
-    offering.opened(1, OpenRoute(1, "/cmd", "/joy"))
-    offering.described(CMD, ABOUT)
-    assert offering.opened(2, OpenRoute(1, "/cmd", "/joy")) == [
-        Send(2, RouteOpened(1, ABOUT)),
-        AddRoute(CMD, 2, 1, Contract()),
-    ]
-
-
-@pytest.mark.parametrize("topic", ["/nothing", "/secret", "/rosout"])
-def test_what_is_not_offered_is_not_opened(exports: Exports, topic: str) -> None:
-    graph(exports, {Source(topic, "/joy"): JOY} if topic != "/nothing" else {})
-    exports.link_up(1)
-    [action] = exports.opened(1, OpenRoute(7, topic, "/joy"))
-    assert isinstance(action, Send)
-    assert isinstance(action.message, RouteClosed)
-    assert "policy" in action.message.reason
-
-
 def test_a_lost_publisher_closes_every_route_and_forgets_them(offering: Exports) -> None:
     offering.opened(1, OpenRoute(7, "/cmd", "/joy"))
     offering.described(CMD, ABOUT)
@@ -193,33 +173,8 @@ def test_the_number_of_routes_is_bounded() -> None:
     assert isinstance(action.message, RouteClosed)
 
 
-def test_too_many_sources_are_cut_and_said() -> None:
-    exports = bounded(2)
-    actions = graph(exports, {Source(f"/t{i}", "/n"): JOY for i in range(3)})
-    assert [type(action) for action in actions] == [Warn]
-    assert len(exports.offered) == 2
-    assert set(exports.beyond) == {Source("/t2", "/n")}
-
-
 def many(count: int) -> dict[Source, LocalSource]:
     return {Source(f"/t{index:04}", "/n"): JOY for index in range(count)}
-
-
-def test_a_large_graph_is_told_a_part_at_a_time(exports: Exports) -> None:
-    graph(exports, many(200))
-    actions = exports.link_up(1)
-    exports.link_up(2)
-    while exports.pending:
-        told = exports.advertise()
-        assert len(told) <= 2
-        actions += told
-    messages = [action.message for action in actions if isinstance(action, Send) and action.peer == 1]
-    assert all(isinstance(message, Advertise) for message in messages)
-    assert [message.full for message in messages if isinstance(message, Advertise)] == [True, False, False, False]
-    offers = [offer for message in messages if isinstance(message, Advertise) for offer in message.added]
-    assert max(len(message.added) for message in messages if isinstance(message, Advertise)) == 64
-    assert {offer.source for offer in offers} == set(many(200))
-    assert len(offers) == 200
 
 
 def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> None:
@@ -234,22 +189,6 @@ def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> 
     exports.graph("/cmd", {})
     exports.graph("/cmd", {"/joy": LocalSource("std_msgs/Empty", JOY.uri)})
     assert exports.advertise() == [Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))]
-
-
-def test_room_is_given_to_a_source_that_there_were_too_many_for() -> None:
-    exports = bounded(2)
-    exports.link_up(1)
-    graph(exports, many(4))
-    assert [source.topic for source in exports.offered] == ["/t0000", "/t0001"]
-    exports.graph("/t0003", {})
-    exports.graph("/t0000", {})
-    assert [source.topic for source in exports.offered] == ["/t0001", "/t0002"]
-    assert exports.advertise() == [
-        Send(1, Advertise(added=(TopicOffer("/t0002", "/n", JOY.type),), removed=(Source("/t0000", "/n"),)))
-    ]
-    exports.graph("/t0001", {})
-    exports.graph("/t0002", {})
-    assert not exports.offered
 
 
 def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> None:

@@ -41,21 +41,6 @@ def state(imports: Imports, peer: int = 1) -> str:
     return found
 
 
-def test_an_offer_is_visible_at_once_and_asks_for_no_data(imports: Imports) -> None:
-    assert imports.advertised(1, Advertise(added=(OFFER,), full=True)) == [Publish(1, CMD, "sensor_msgs/Joy")]
-    assert imports.advertised(1, Advertise(added=(OFFER,))) == []
-    assert state(imports) == "idle"
-    assert imports.next_timer() is None
-
-
-def test_the_receiving_side_judges_too(imports: Imports) -> None:
-    offers = (TopicOffer("/secret", "/joy", "a/B"), TopicOffer("/rosout", "/joy", "rosgraph_msgs/Log"))
-    assert imports.advertised(1, Advertise(added=offers)) == []
-    entry = imports.get(1, Source("/secret", "/joy"))
-    assert entry is not None
-    assert "bridge.deny" in entry.hidden
-
-
 def test_the_way_of_a_route(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=(OFFER,)))
     assert imports.demand(1, CMD, 0.0, wanted=True) == [Send(1, OpenRoute(1, "/cmd", "/joy"))]
@@ -113,24 +98,6 @@ def test_nobody_waits_for_what_nobody_wants(imports: Imports) -> None:
     assert imports.next_timer() is None
 
 
-def test_a_source_that_is_removed_leaves_nothing(imports: Imports) -> None:
-    imports.advertised(1, Advertise(added=(OFFER,)))
-    imports.demand(1, CMD, 0.0, wanted=True)
-    imports.opened(1, RouteOpened(1, ABOUT), 0.0)
-    assert imports.advertised(1, Advertise(removed=(CMD,))) == [
-        Send(1, CloseRoute(1)),
-        Detach(1, CMD, 1),
-        Retract(1, CMD),
-    ]
-    assert imports.get(1, CMD) is None
-    assert imports.advertised(1, Advertise(removed=(CMD,))) == []
-
-
-def test_a_full_advertisement_removes_what_it_does_not_name(imports: Imports) -> None:
-    imports.advertised(1, Advertise(added=(OFFER, TopicOffer("/odom", "/base", "a/B"))))
-    assert imports.advertised(1, Advertise(added=(OFFER,), full=True)) == [Retract(1, Source("/odom", "/base"))]
-
-
 def test_a_lost_link_retracts_only_its_own_topics(imports: Imports) -> None:
     imports.link_up(2)
     imports.advertised(1, Advertise(added=(OFFER,)))
@@ -180,21 +147,6 @@ def test_a_publisher_with_another_type_than_offered_is_not_described(imports: Im
 
 def many(count: int) -> tuple[TopicOffer, ...]:
     return tuple(TopicOffer(f"/t{index:04}", "/n", "a/B") for index in range(count))
-
-
-def test_a_long_advertisement_comes_to_the_same_in_portions(imports: Imports) -> None:
-    imports.link_up(2)
-    for peer in (1, 2):
-        imports.advertised(peer, Advertise(added=(OFFER, *many(50))))
-    change = Advertise(added=many(100)[20:], full=True)
-    whole = imports.advertised(1, change)
-    parts: list[Any] = []
-    for wire, offer in imports.changes(2, change):
-        done = imports.take_in(2, wire, offer, 0.0)
-        assert len(done) <= 1
-        parts += done
-    assert [action._replace(peer=1) for action in parts] == whole
-    assert set(imports.offered_by(1)) == set(imports.offered_by(2)) == {offer.topic for offer in many(100)[20:]}
 
 
 def test_many_timers_are_dealt_with_a_few_at_a_time(imports: Imports) -> None:
@@ -332,14 +284,6 @@ def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Impor
     assert flowing.next_timer() is None, "nobody is there to be asked"
     flowing.link_down(1)
     assert flowing.get(1, CMD) is None
-
-
-def test_where_nothing_waits_the_peer_can_be_forgotten(flowing: Imports) -> None:
-    flowing.demand(1, CMD, 0.0, wanted=False)
-    assert flowing.link_away(1) == (
-        [Detach(1, CMD, 1), Retract(1, CMD), Detach(1, ODOM.source, 2, missed=True), Retract(1, ODOM.source)],
-        False,
-    )
 
 
 def test_back_it_goes_on_behind_what_came(flowing: Imports, positions: Positions) -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import call, call_api, connect, split_uri
-from rmpa.ros.wire.xmlrpc import RosFault, serialize_fault, serialize_response
+from rmpa.ros.http.rpc import call, connect, split_uri
+from rmpa.ros.wire.xmlrpc import serialize_response
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -52,22 +52,10 @@ def http(body: bytes, status: bytes = b"200 OK", length: bytes = b"Content-lengt
     )
 
 
-async def test_a_response_in_any_pieces() -> None:
-    whole = http(OK)
-    for parts in ([whole], [whole[:20], whole[20:]], [bytes([byte]) for byte in whole]):
-        async with answering(*parts) as uri:
-            assert await call_api(uri, "m") == (1, "", 5)
-
-
 @pytest.mark.trap(28)
 @pytest.mark.parametrize("status", [b"200 OK", b"500 whatever", b"404 Not Found"])
 async def test_the_status_is_not_believed(status: bytes) -> None:
     async with answering(http(OK, status)) as uri:
-        assert await call(uri, "m") == [1, "", 5]
-
-
-async def test_a_response_without_length_ends_with_the_connection() -> None:
-    async with answering(http(OK, length=b"")) as uri:
         assert await call(uri, "m") == [1, "", 5]
 
 
@@ -79,12 +67,6 @@ async def test_names_of_this_machine_need_no_resolver(monkeypatch: pytest.Monkey
     async with answering(http(OK)) as uri:
         for name in ("localhost", socket.gethostname()):
             assert await call(uri.replace("127.0.0.1", name), "m") == [1, "", 5]
-
-
-async def test_faults() -> None:
-    async with answering(http(serialize_fault(-1, "unknown method"))) as uri:
-        with pytest.raises(RosFault, match="unknown method"):
-            await call(uri, "m")
 
 
 @pytest.mark.parametrize(

@@ -112,13 +112,6 @@ async def test_answers_in_one_response_that_xmlrpcpp_reads(server: XmlRpcServer)
     assert parse_response(body) == [1, "127.0.0.1", [1, "two"]]
 
 
-@pytest.mark.parametrize("path", [b"/", b"/RPC2", b"/anything?at=all", b"*"])
-async def test_any_path(server: XmlRpcServer, path: bytes) -> None:
-    async with client(server) as c:
-        c.writer.write(post(CALL, path=path))
-        assert b" 200 " in (await c.response())[0]
-
-
 async def test_kept_alive_pipelined_and_byte_by_byte(server: XmlRpcServer) -> None:
     async with client(server) as c:
         c.writer.write(post(CALL) * 3)
@@ -129,13 +122,6 @@ async def test_kept_alive_pipelined_and_byte_by_byte(server: XmlRpcServer) -> No
             await c.writer.drain()
         assert b" 200 " in (await c.response())[0]
     assert server.counters["xmlrpc.calls"] == 4
-
-
-async def test_http_1_0_is_answered_and_closed(server: XmlRpcServer) -> None:
-    async with client(server) as c:
-        c.writer.write(post(CALL, version=b"1.0"))
-        await c.response()
-        assert await c.ended() == b""
 
 
 async def test_expect_continue_is_tolerated(server: XmlRpcServer) -> None:
@@ -291,13 +277,6 @@ async def test_unread_answers_block_no_other_client(server: XmlRpcServer, monkey
     assert server.counters["http.evicted.slow"] == 1
 
 
-async def test_calls_in_one_go_are_answered_behind_a_half_close(server: XmlRpcServer) -> None:
-    async with client(server) as c:
-        c.writer.write(post(CALL) * 5)
-        c.writer.write_eof()
-        assert (await c.ended()).count(b"HTTP/1.1 200 OK") == 5
-
-
 async def test_calls_in_one_go_are_answered_in_turn_with_those_of_others(server: XmlRpcServer) -> None:
     async with client(server) as greedy, client(server) as other:
         greedy.writer.write(post(CALL) * 200)
@@ -336,16 +315,6 @@ async def test_caller_may_disconnect_while_its_large_call_is_read(server: XmlRpc
     while len(server._connections):
         await asyncio.sleep(0.01)
     assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
-
-
-async def test_large_calls_are_answered(server: XmlRpcServer) -> None:
-    value = "x" * (2 * limits.HTTP_BODY_INLINE)
-    answer = await call(f"http://127.0.0.1:{server.port}/", "echo", value)
-    assert answer == [1, "127.0.0.1", [value]]
-    async with client(server) as c:
-        c.writer.write(post(b"<" * (limits.HTTP_BODY_INLINE + 1)))
-        with pytest.raises(RosFault):
-            parse_response((await c.response())[1])
 
 
 @pytest.mark.parametrize("start", [b"", b"POST / HT", post(CALL)[:-1]])
@@ -422,31 +391,6 @@ async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
 
 
 REQUEST = b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: %d\r\n\r\n"
-
-
-@pytest.mark.parametrize("size", [1, 10, 100, 10_000])
-async def test_plain_requests_in_any_pieces_one_after_the_other(server: XmlRpcServer, size: int) -> None:
-    body = serialize_call("echo", ["x"])
-    async with client(server) as c:
-        for _ in range(3):
-            data = REQUEST % len(body) + body
-            for begin in range(0, len(data), size):
-                c.writer.write(data[begin : begin + size])
-                await c.writer.drain()
-                await asyncio.sleep(0)
-            head, answer = await c.response()
-            assert head.startswith(b"HTTP/1.1 200 OK\r\n")
-            assert parse_response(answer) == [1, "127.0.0.1", ["x"]]
-
-
-@pytest.mark.parametrize("headers", [b"", b"X-Odd: 1\r\n"])
-async def test_requests_right_behind_each_other_are_answered_in_order(server: XmlRpcServer, headers: bytes) -> None:
-    async with client(server) as c:
-        for number in range(5):
-            body = serialize_call("echo", [number])
-            c.writer.write(REQUEST.replace(b"Host: x\r\n", b"Host: x\r\n" + headers) % len(body) + body)
-        for number in range(5):
-            assert parse_response((await c.response())[1]) == [1, "127.0.0.1", [number]]
 
 
 async def test_a_request_behind_one_that_waits_is_answered_after_it(server: XmlRpcServer, echo: Echo) -> None:

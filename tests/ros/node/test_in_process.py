@@ -123,14 +123,6 @@ async def test_it_waits_until_the_type_is_known() -> None:
     assert bed.got == [framed("late")]
 
 
-async def test_it_gets_the_latched_messages_after_the_header() -> None:
-    bed = Bed(LATCHED)
-    bed.publication.publish_framed(framed("the map"))
-    await bed.connect()
-    assert bed.headers[0]["latching"] == "1"
-    assert bed.got == [framed("the map")]
-
-
 async def test_a_message_in_parts_is_whole_for_those_that_take_no_parts() -> None:
     bed = Bed()
     await bed.connect()

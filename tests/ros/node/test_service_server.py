@@ -457,13 +457,6 @@ async def test_a_node_that_ends_answers_what_is_under_way() -> None:
     reading.close()
 
 
-async def test_a_service_is_served_once(node: SlaveNode) -> None:
-    serve(node, add)
-    with pytest.raises(ValueError, match="/server serves /add already"):
-        serve(node, add)
-    node.remove_service("/none")
-
-
 async def test_junk_instead_of_a_request_harms_no_other(node: SlaveNode) -> None:
     serve(node, echo)
     good = await ServiceConnection.open(node.service_uri, "/add", "/c")

@@ -11,7 +11,7 @@ from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import frame_message
-from rmpa.ros.wire.xmlrpc import RosFault, RosReply
+from rmpa.ros.wire.xmlrpc import RosReply
 from tests.ros.node.peers import STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
@@ -53,13 +53,6 @@ async def test_the_uri_bears_the_advertised_host() -> None:
     assert node.uri.endswith("/")
     assert node.address_of("/t") == ("robot.local", node._tcpros.address[1])
     await node.close()
-
-
-async def test_a_topic_is_published_once(node: SlaveNode) -> None:
-    node.add_publication(Publication("/t", "/p"))
-    with pytest.raises(ValueError, match="/p publishes /t already"):
-        node.add_publication(Publication("/t", "/p"))
-    assert node.publications() == {"/t": "*"}
 
 
 async def test_a_removed_topic_is_closed_and_unknown(node: SlaveNode) -> None:
@@ -107,11 +100,6 @@ async def test_updates_reach_subscriptions_and_owner() -> None:
     await until(lambda: not publication.subscribers)
     await node.close()
     await source.close()
-
-
-async def test_an_unknown_method_is_a_fault(node: SlaveNode) -> None:
-    with pytest.raises(RosFault, match="/p has no method getNothing"):
-        await call(node.uri, "getNothing", "/c")
 
 
 async def test_two_hundred_nodes_in_one_process() -> None:

@@ -467,18 +467,6 @@ async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk:
     link.close()
 
 
-async def test_large_messages_in_one_read_with_small_ones_around_them(publisher: RawPublisher) -> None:
-    said = InParts(publisher.uri)
-    link, _ = await publisher.serve()
-    await until(lambda: said.headers)
-    payloads = [b"a", LARGE, b"b", b"c", LARGE, LARGE, b"d"]
-    assert said.link._stream is not None
-    said.link._stream.feed(b"".join(map(frame_message, payloads)))
-    assert [m[4:] for m in said.messages] == payloads
-    said.close()
-    link.close()
-
-
 @pytest.mark.trap(14, 17)
 async def test_publisher_lost_within_parts_aborts_and_reconnects(publisher: RawPublisher) -> None:
     said = InParts(publisher.uri)

@@ -381,11 +381,6 @@ def test_no_address_is_special(name: str) -> None:
     assert address.packed[3] not in {0, 255}
 
 
-def test_two_nodes_of_one_name_share_no_address() -> None:
-    addresses = LoopbackAddresses(SALT)
-    assert addresses.take("/rmpa/base/driver", 0.0) != addresses.take("/rmpa/base/driver", 0.0)
-
-
 def test_a_freed_address_rests_even_for_the_same_node() -> None:
     addresses = LoopbackAddresses(SALT)
     first = addresses.take("/n", 0.0)

@@ -147,14 +147,6 @@ def test_an_empty_header_has_no_fields() -> None:
     assert parse_header(bytes(4)) == ({}, 4, 4)
 
 
-def test_messages_are_split_off_and_the_rest_is_left() -> None:
-    wire = frame_message(b"abc") + frame_message(b"") + frame_message(b"defgh")
-    messages, consumed, wanted = split_messages(memoryview(wire[:-1]))
-    assert [bytes(m) for m in messages] == [b"\x03\x00\x00\x00abc", b"\x00\x00\x00\x00"]
-    assert (consumed, wanted) == (11, 9)
-    assert split_messages(memoryview(wire))[1:] == (len(wire), 4)
-
-
 @given(st.lists(st.binary(max_size=20), max_size=8), st.integers(0, 200))
 def test_messages_come_out_however_the_stream_is_cut(payloads: list[bytes], cut: int) -> None:
     wire = b"".join(map(frame_message, payloads))

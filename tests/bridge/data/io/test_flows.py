@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
+from rmpa.bridge.data.export import ExportFlow
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.data.reception import ImportFlow, LinkTime
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
@@ -121,14 +121,6 @@ def test_a_source_that_is_left_keeps_nothing() -> None:
     assert late.sent == []
 
 
-def test_unlatched_messages_are_not_replayed() -> None:
-    flow, link = ExportFlow(), Link()
-    flow.add(9, Link(), 7, BEST, 0)
-    flow.message(memoryview(b"old"))
-    flow.add(1, link, 7, BEST, 0)
-    assert link.sent == []
-
-
 def test_contract_says_how_many_kept_messages_a_peer_gets() -> None:
     flow = ExportFlow()
     flow.add(1, Link(), 7, KEPT, 0)
@@ -192,14 +184,6 @@ def test_parts_or_the_whole_go_to_each_sender() -> None:
     assert flow.large
 
 
-def test_where_all_take_parts_nothing_is_copied_together() -> None:
-    flow = ExportFlow()
-    flow.add(1, Link(), 7, BULKY, 0)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(1000)))
-    assert flow._whole is None
-
-
 @pytest.mark.parametrize("latching", [False, True])
 def test_peer_added_in_the_middle_gets_no_half_message(latching: bool) -> None:
     flow, early, late = ExportFlow(), Link(), Link()
@@ -248,23 +232,6 @@ def test_dead_publisher_leaves_no_partial_message(latching: bool) -> None:
     give(flow, b"n" * BIG)
     assert got(streams) == [(2, b"n" * BIG)]
     assert got(late) == [(1, b"n" * BIG)]
-
-
-def test_suspended_route_keeps_what_others_send() -> None:
-    flow, old, new, other = ExportFlow(), Link(), Link(), Link()
-    sender = flow.add(1, old, 7, RELIABLE, 3)
-    flow.add(2, other, 7, BEST, 0)
-    flow.message(memoryview(b"a"))
-    assert isinstance(sender, ReliableRouteSender)
-    sender.suspend()
-    flow.message(memoryview(b"b"))
-    give(flow, bytes(BIG))
-    sender.resume(new, 8, 1)
-    assert got(old) == [(1, b"a")]
-    assert got(new) == [(2, b"b")]
-    sender.fenced(new.fences.popleft()[1])
-    assert got(new) == [(2, b"b"), (3, bytes(BIG))]
-    assert [payload for _, _, payload in other.sent] == [b"a", b"b"]
 
 
 # --- in: best effort ------------------------------------------------------------------------------------------
@@ -444,13 +411,6 @@ def test_a_frame_that_does_not_hold_one_message_breaks_the_protocol(payload: byt
     with pytest.raises(RemoteProtocolError, match="does not hold one message"):
         inlet.flow.message(1, 0, memoryview(payload))
     assert inlet.got == []
-
-
-def test_a_claimed_size_is_not_stored() -> None:
-    inlet = Inlet(RELIABLE)
-    inlet.begin(1, 1)
-    with pytest.raises(LimitExceeded):
-        inlet.flow.part(1, 0, FIRST, memoryview(b"\xff\xff\xff\xff"))
 
 
 def test_rest_of_a_dropped_message_is_dropped() -> None:
@@ -802,20 +762,6 @@ def test_overflow_is_the_exact_gap_on_a_new_link(clock: Clock) -> None:
     assert inlet.flow.watch.counts == {QosEventKind.MESSAGES_LOST: 5}
     assert acks == [9]
     assert inlet.flow.position == (5, 9)
-
-
-def test_new_epoch_shows_that_messages_are_missing(clock: Clock) -> None:
-    inlet = Inlet(RELIABLE)
-    inlet.begin(5, 1)
-    inlet.message(1)
-    inlet.message(2)
-    assert not inlet.begin(6, 1)
-    assert inlet.flow.position == (6, 0)
-    inlet.message(1, b"new")
-    clock.advance(1.0)
-    assert inlet.got[-1] == b"new"
-    assert inlet.acks == [1]
-    assert inlet.counts == (0, 0, 0, 0)
 
 
 def test_reliable_messages_survive_an_outage_within_their_lifespan(clock: Clock) -> None:

@@ -61,16 +61,6 @@ def on_bulk(link: Link, sender: RouteSender) -> None:
 # --- best effort ----------------------------------------------------------------------------------------------
 
 
-def test_small_messages_are_sent_at_once() -> None:
-    link, sender = fresh(best_effort)
-    for n in range(5):
-        assert sender.message(100 + n, memoryview(SMALL + bytes([n]))) == 0
-    assert link.sent == [("express", n + 1, SMALL + bytes([n])) for n in range(5)]
-    assert link.stamps == [100, 101, 102, 103, 104]
-    assert set(link.routes) == {7}
-    assert sender.lane == "express"
-
-
 def test_messages_behind_a_fence_keep_their_order() -> None:
     link, sender = fresh(best_effort)
     sender.message(0, b"1")
@@ -89,26 +79,6 @@ def test_messages_behind_a_fence_keep_their_order() -> None:
     assert link.sent[-1] == ("bulk", 5, b"5")
     sender.fenced(1)
     assert len(link.sent) == 5, "answered twice"
-
-
-def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
-    link, sender = fresh(best_effort)
-    on_bulk(link, sender)
-    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
-    for _ in range(ROW - 1):
-        sender.message(0, SMALL)
-    assert set(link.lanes) == {"bulk"}
-    sender.message(0, SMALL)
-    sender.message(0, SMALL)
-    assert list(link.fences) == [("bulk", 2)]
-    answer(link, sender)
-    sender.message(0, SMALL)
-    assert link.lanes[-3:] == ["express"] * 3
-    assert link.numbers == list(range(1, ROW + 4))
-    sender.message(0, LARGE)
-    assert list(link.fences) == [("express", 3)]
-    answer(link, sender)
-    assert link.sent[-1][:2] == ("bulk", ROW + 4)
 
 
 def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None:
@@ -153,29 +123,6 @@ def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -
         sender.message(0, b"")
     assert link.fences
     assert sender.message(0, bytes(1000)) == 0, "the count of bytes began anew"
-
-
-@pytest.mark.parametrize(
-    ("priority", "lane"), [(Priority.HIGH, "express"), (Priority.NORMAL, None), (Priority.LOW, "bulk")]
-)
-def test_the_priority_outweighs_the_size(priority: Priority, lane: str | None) -> None:
-    link, sender = fresh(best_effort, Contract(priority=priority))
-    assert bool(link.fences) is (priority is Priority.LOW), "a low one changes its lane before its first message"
-    if link.fences:
-        answer(link, sender)
-    sender.message(0, SMALL)
-    sender.message(0, LARGE)
-    if link.fences:
-        answer(link, sender)
-    assert link.lanes == ([lane] * 2 if lane else ["express", "bulk"])
-
-
-def test_large_source_changes_its_lane_first() -> None:
-    link, sender = fresh(best_effort, large=True)
-    assert list(link.fences) == [("express", 1)]
-    answer(link, sender)
-    sender.message(0, LARGE)
-    assert link.lanes == ["bulk"]
 
 
 def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
@@ -241,12 +188,6 @@ def test_both_lanes_get_the_bounds(
     ExportFlow().add(1, link, 7, contract, 1)
     assert link.express.terms == {7: (depth, ages[0], strict)}
     assert link.bulk.terms == {7: (depth, ages[1], strict)}
-
-
-def test_drops_of_a_lane_are_returned() -> None:
-    link, sender = fresh(best_effort)
-    link.drops.extend([3, 0, 2])
-    assert [sender.message(0, SMALL) for _ in range(3)] == [3, 0, 2]
 
 
 def test_sequences_wrap() -> None:
@@ -322,25 +263,6 @@ def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
     assert link.stamps == [0, 9], "the time of publication, not that of the turn"
     assert link.numbers == [1, 2], "what was left out is no gap"
     assert clock.due == []
-
-
-def test_newer_message_replaces_the_waiting_one(clock: Clock) -> None:
-    link, sender = fresh(best_effort, Contract(max_rate=10.0))
-    sender.message(0, b"a")
-    clock.advance(0.05)
-    sender.message(0, b"b")
-    clock.advance(0.045)  # a tenth of the interval early is on time
-    sender.message(0, b"c")
-    clock.advance(1.0)
-    assert [payload for _, _, payload in link.sent] == [b"a", b"c"]
-
-
-def test_a_pause_costs_the_next_one_nothing(clock: Clock) -> None:
-    link, sender = fresh(best_effort, Contract(max_rate=10.0))
-    for n in range(5):
-        sender.message(0, bytes([n]))
-        clock.advance(1.0)
-    assert len(link.sent) == 5
 
 
 @pytest.mark.parametrize("hertz", [30.01, 29.99, 30.0])
@@ -438,51 +360,6 @@ def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.Monke
     assert link.numbers == [1, 2, 5, 6, 7, 8, 9]
 
 
-def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
-    link, sender = fresh(reliable)
-    sender.message(0, SMALL)
-    sender.begin(0, BIG)
-    sender.message(0, bytes(BIG))
-    sender.message(0, SMALL)
-    assert link.log == [("express", "message", 7, 1), ("express", "fence", 7, 1)]
-    sender.acknowledged(1)
-    assert link.numbers == [1], "an acknowledgement opens the window, not the fence"
-    answer(link, sender)
-    assert link.sent == [("express", 1, SMALL), ("bulk", 2, bytes(BIG)), ("bulk", 3, SMALL)]
-    assert sender.sender.in_flight == 2
-
-
-def test_lost_bulk_lane_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
-    link, sender = fresh(reliable)
-    sender.message(0, LARGE)
-    answer(link, sender)
-    for n in range(4):
-        sender.message(0, bytes([n]))
-    sender.acknowledged(2)
-    link.log.clear()
-    sender.lane_lost()
-    assert link.log == [
-        ("bulk", "discard", 7),  # or the peer would see those that wait before those that were torn: a gap
-        ("bulk", "message", 7, 3),
-        ("bulk", "message", 7, 4),
-        ("bulk", "message", 7, 5),
-    ]
-    sender.acknowledged(5)
-    sender.lane_lost()
-    assert link.numbers == [1, 2, 3, 4, 5, 3, 4, 5]
-    assert sender.sender.idle
-
-
-def test_bulk_lost_during_an_express_fence_replays_nothing() -> None:
-    link, sender = fresh(reliable)
-    sender.message(0, SMALL)
-    sender.message(0, LARGE)
-    sender.lane_lost()
-    assert link.numbers == [1]
-    answer(link, sender)
-    assert link.numbers == [1, 2]
-
-
 def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     link, sender = fresh(reliable)
     sender.message(0, LARGE)
@@ -497,17 +374,6 @@ def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     assert link.log == [("bulk", "discard", 7)] + [
         ("express", "message", 7, number) for number in range(101, ROW + 2)
     ]
-
-
-def test_an_old_acknowledgement_does_no_harm() -> None:
-    link, sender = fresh(reliable, large=True)
-    answer(link, sender)
-    for _ in range(5):
-        sender.message(0, SMALL)
-    sender.acknowledged(4)
-    sender.acknowledged(2)
-    sender.lane_lost()
-    assert link.numbers == [1, 2, 3, 4, 5, 5]
 
 
 def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
@@ -536,22 +402,6 @@ def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
     assert new.numbers == list(range(after + 1, 6))
     assert 9 in new.express.terms
     assert 9 in new.bulk.terms
-
-
-def test_large_topic_changes_its_lane_on_a_new_link() -> None:
-    old, new = Link(), Link()
-    sender = reliable(old, large=True)
-    answer(old, sender)
-    sender.message(0, LARGE)
-    sender.suspend()
-    sender.lane_lost()
-    sender.fenced(1)
-    sender.resume(new, 8, 0)
-    assert new.log == [("express", "fence", 8, 2)]
-    sender.fenced(1)
-    assert not new.sent
-    answer(new, sender)
-    assert new.sent == [("bulk", 1, LARGE)]
 
 
 def test_later_acknowledgement_outweighs_the_position() -> None:

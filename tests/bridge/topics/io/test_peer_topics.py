@@ -15,7 +15,7 @@ from rmpa.bridge.proxies import PeerProxies, ProxyNodes
 from rmpa.bridge.sessions import PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import PeerTopic, PeerTopics
-from rmpa.core.contract import Contract, Durability, Liveliness, Reliability, Transport
+from rmpa.core.contract import Contract, Durability, Reliability, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
 from rmpa.mesh import limits as mesh_limits
@@ -217,28 +217,6 @@ def test_a_changed_header_reconnects_the_subscribers() -> None:
 # --- over links that fall -----------------------------------------------------------------------------------------
 
 
-def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
-    async def scene(proxied: Proxied) -> None:
-        listener = Heard(await proxied.publish())
-        flow = proxied.describe(SURE, epoch=5)
-        flow.message(1, 0, framed("one"))
-        flow.part(2, 0, FIRST, framed("half", 1000)[:500])
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        assert proxied.topics.position(CMD) == (5, 1)
-        assert proxied.topics.flow(CMD) is flow
-        assert proxied.describe(SURE, route=4, epoch=5) is flow
-        flow.message(2, 0, framed("two"))
-        flow.message(5, 0, framed("five"))
-        assert listener.texts == ["one", "two", "five"]
-        assert (flow.quality.messages, lost(flow)) == (3, 2)
-        assert not listener.closed
-        await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
-        assert proxied.acks[-1] == 5
-
-    play(scene)
-
-
 def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
     async def scene(proxied: Proxied) -> None:
         listener = Heard(await proxied.publish())
@@ -406,21 +384,6 @@ def test_a_missed_deadline_is_said_when_it_is_missed() -> None:
     play(scene)
 
 
-def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        proxied.describe(Contract(deadline=0.2))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        await asyncio.sleep(0.5)
-        assert proxied.kinds() == [QosEventKind.DEADLINE_MISSED] * 2
-        proxied.topics.retract(CMD)
-        await asyncio.sleep(60.0)
-        assert len(proxied.occurred) == 2
-
-    play(scene)
-
-
 @pytest.mark.parametrize("silent", [False, True])
 def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> None:
     async def scene(proxied: Proxied) -> None:
@@ -441,21 +404,6 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> Non
     play(scene)
 
 
-def test_a_source_that_is_back_within_its_lease_was_never_lost() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        contract = Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0)
-        proxied.describe(contract, epoch=5)
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        await asyncio.sleep(4.0)
-        proxied.describe(contract, epoch=5)
-        await asyncio.sleep(60.0)
-        assert proxied.occurred == []
-
-    play(scene)
-
-
 def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
@@ -468,18 +416,6 @@ def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None
         [(lost, occurred)] = proxied.occurred
         assert occurred.kind is QosEventKind.LIVELINESS_LOST
         assert 5.0 <= lost - began <= 5.5
-
-    play(scene)
-
-
-def test_manual_liveliness_is_judged_by_messages() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        flow = proxied.describe(Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0))
-        await asyncio.sleep(1.5)
-        flow.message(1, 0, framed("here"))
-        await asyncio.sleep(0.5)
-        assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST, QosEventKind.LIVELINESS_RESTORED]
 
     play(scene)
 
