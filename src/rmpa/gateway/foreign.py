@@ -55,6 +55,9 @@ class ForeignSite:
         agent: The gateway's agent.
         source: A source of it.
         number: Its number in the relay: negative, for no peer has such a one.
+
+    Attributes:
+        shown: By kind, name here, and proxy; the first one of several is in the graph.
     """
 
     def __init__(self, agent: Agent, source: ForeignSource, number: int) -> None:
@@ -67,7 +70,6 @@ class ForeignSite:
         self.number: Final = number
         self.proxies: Final = PeerProxies(prefix, agent.bridge.proxy_nodes)
         self.shown: dict[SourceKey, list[ProxiedSource]] = {}
-        """By kind, name here, and proxy; the first one of several is in the graph."""
         self._instance = origin.instance
 
     def key(self, source: ForeignSource) -> SourceKey:
@@ -133,12 +135,14 @@ class ProxiedSource:
     Args:
         source: The source.
         site: Its site, whose proxies it stands at.
+
+    Attributes:
+        refused: Why it is not in the graph; empty if it is.
     """
 
     def __init__(self, source: ForeignSource, site: ForeignSite) -> None:
         self.source = source
         self.refused = "another source of this node has its name here"
-        """Why it is not in the graph; empty if it is."""
         self._site = site
         self._origin = foreign_origin(source)
         self._key = f"{source.kind.name} {source.name}"
@@ -373,6 +377,7 @@ class TopicTap:
         on_described: ``(description)``.
         on_lost: ``(reason)``.
         on_closed: Called once it is closed.
+        connection: The connection to the publisher; ``None`` while its address is not known.
     """
 
     source: MeshSource
@@ -384,7 +389,6 @@ class TopicTap:
     on_lost: Callable[[str], None]
     on_closed: Callable[[TopicTap], None]
     connection: TopicConnection | None = None
-    """The connection to the publisher; ``None`` while its address is not known."""
     _description: TopicDescription | None = field(default=None, init=False)
     _closed: bool = field(default=False, init=False)
 

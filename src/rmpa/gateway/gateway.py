@@ -43,6 +43,10 @@ class Gateway:
         load: Reads the settings again; it may block.
         open_session: Opens the session; raises ``StartError``.
         make_neighbours: ``(graph, session, settings)``: makes the neighbours by their names; they are not started.
+
+    Attributes:
+        session: The session; ``None`` until it is open.
+        neighbours: The neighbours by their names; empty until the session is open.
     """
 
     def __init__(
@@ -66,14 +70,12 @@ class Gateway:
         if self.agent.trust is not None:
             self.agent.trust.membership.on_denied.append(self._denied)
         self.session: OpenSession | None = None
-        """The session; ``None`` until it is open."""
         self.neighbours: dict[str, Neighbour] = {}
-        """The neighbours by their names; empty until the session is open."""
         self._problem = ""
+        # Set where the neighbours have to be made anew.
         self._changed = asyncio.Event()
-        """Set where the neighbours have to be made anew."""
+        # Whether the session has to be opened anew with them.
         self._reopen = False
-        """Whether the session has to be opened anew with them."""
         self._leaving = asyncio.Lock()
         self._running: asyncio.Task[None] | None = None
 

@@ -6,173 +6,178 @@ from typing import Final
 
 from rmpa.core.limits import MIB
 
+# Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are
+# not read; the longest that ROS names and types make is some 900.
 KEY_MAX: Final = 2048
-"""Characters of a key expression or a liveliness token that another site or a ROS 2 node sent. Longer ones are not
-read; the longest that ROS names and types make is some 900."""
+# The largest number in a QoS of ROS 2: they are 64-bit there.
 QOS_NUMBER_MAX: Final = 2**63 - 1
-"""The largest number in a QoS of ROS 2: they are 64-bit there."""
+# Sites that a message passes at most; more mean a loop.
 PATH_MAX: Final = 8
-"""Sites that a message passes at most; more mean a loop."""
+# Calls of other sites that one service gets at once, as many as an agent opens connections to a server for.
 SITE_CALLS_AT_ONCE: Final = 32
-"""Calls of other sites that one service gets at once, as many as an agent opens connections to a server for."""
+# Calls of other sites that may wait for one service; further ones are refused at once.
 SITE_CALLS_WAITING: Final = 1024
-"""Calls of other sites that may wait for one service; further ones are refused at once."""
+# Seconds that a topic is there before the gateway asks its publisher whether it is latched.
 LATCH_LOOK_AFTER: Final = 5.0
-"""Seconds that a topic is there before the gateway asks its publisher whether it is latched."""
+# Bytes of what another site's gateway tells of a topic for ``rmpa why``.
 SITE_WHY_MAX: Final = MIB // 16
-"""Bytes of what another site's gateway tells of a topic for ``rmpa why``."""
+# Sites that are remembered as unreachable; those that left first are forgotten first.
 SITES_REMEMBERED_MAX: Final = 256
-"""Sites that are remembered as unreachable; those that left first are forgotten first."""
+# Topics and services of one site in ``rmpa site info``: some 2 MB of JSON.
 SITE_REPORT_SOURCES_MAX: Final = 5000
-"""Topics and services of one site in ``rmpa site info``: some 2 MB of JSON."""
+# Connections under the names of other sites' action servers: two for each pair of a client and a server.
 SITE_ACTIONS_MAX: Final = 1024
-"""Connections under the names of other sites' action servers: two for each pair of a client and a server."""
+# Bytes of one question or answer about parameters between gateways: some of the largest values.
 SITE_PARAM_BYTES_MAX: Final = 64 * MIB
-"""Bytes of one question or answer about parameters between gateways: some of the largest values."""
+# Seconds for a question about a parameter to another site: less than the module that asks waits for this
+# gateway.
 SITE_PARAM_TIMEOUT: Final = 20.0
-"""Seconds for a question about a parameter to another site: less than the module that asks waits for this gateway."""
+# Characters of a site's name, as for a module's name and for a label of DNS.
 SITE_NAME_MAX: Final = 63
-"""Characters of a site's name, as for a module's name and for a label of DNS."""
+# Characters of a node, topic or service of ROS 2; its own limit is about that for topics.
 ROS2_NAME_MAX: Final = 255
-"""Characters of a node, topic or service of ROS 2; its own limit is about that for topics."""
+# Nodes of ROS 2 that are shown; any program that reaches the router can declare more.
 ROS2_NODES_MAX: Final = 2000
-"""Nodes of ROS 2 that are shown; any program that reaches the router can declare more."""
+# Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB.
 ROS2_ENDPOINTS_MAX: Final = 20000
-"""Publishers, subscriptions, services and clients of ROS 2 that are looked at; each costs some 3 KB."""
+# Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first.
 ROS2_PROBLEMS_MAX: Final = 500
-"""Problems of the neighbour ROS 2 that are kept for ``rmpa site``; the oldest go first."""
+# Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own.
 ROS2_TYPES_MAX: Final = 500
-"""Types that are learnt from publishers and ROS 2 nodes, and pairs that are kept; ROS has some 160 of its own."""
+# Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB.
 ROS2_DESCRIPTION_MAX: Final = 256 * 1024
-"""Bytes of a type's description from a ROS 2 node; the largest of ROS 2's own types has 30 KB."""
+# Types in one description; for each, rosbags makes a class. The most that one of ROS 2's own has are some 20.
 ROS2_DESCRIBED_TYPES_MAX: Final = 128
-"""Types in one description; for each, rosbags makes a class. The most that one of ROS 2's own has are some 20."""
+# Fields of a type with those of all types within it, each time that it embeds them: conversions are made of
+# these. Some bytes of a definition can embed billions. The largest type of ROS has some 200.
 ROS2_PARTS_MAX: Final = 20_000
-"""Fields of a type with those of all types within it, each time that it embeds them: conversions are made of these.
-Some bytes of a definition can embed billions. The largest type of ROS has some 200."""
+# Fields and types in all descriptions that are kept: some 1 KB each.
 ROS2_LEARNT_FIELDS_MAX: Final = 100_000
-"""Fields and types in all descriptions that are kept: some 1 KB each."""
+# Elements of the arrays of one message that are converted one by one, and each 64 bytes that are made up for
+# fields that its sender lacks: a second of the gateway's time. Arrays of numbers are copied whole, and do not
+# count.
 ROS2_WORK_MAX: Final = 2_000_000
-"""Elements of the arrays of one message that are converted one by one, and each 64 bytes that are made up for fields
-that its sender lacks: a second of the gateway's time. Arrays of numbers are copied whole, and do not count."""
+# Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them
+# all.
 ROS2_ARRAY_MAX: Final = 1_000_000
-"""Elements of all arrays of fixed size in a type that a ROS 2 node describes: an empty message must have them all."""
 
 
 # --- other sites ---------------------------------------------------------------------------------------------------
 
+# Other sites that are shown; tokens of further ones are counted and left out.
 SITES_MAX: Final = 256
-"""Other sites that are shown; tokens of further ones are counted and left out."""
+# Modules of one other site that are shown, as many as the mesh has peers.
 SITE_MODULES_MAX: Final = 512
-"""Modules of one other site that are shown, as many as the mesh has peers."""
+# Topics (once for each publisher) and services of one other site that are shown, or of this one that are
+# offered.
 SITE_SOURCES_MAX: Final = 16_384
-"""Topics (once for each publisher) and services of one other site that are shown, or of this one that are offered."""
+# Topics and services of all other sites together that are shown: some 5 KB each. Any program that reaches the
+# router can announce more; they are counted as ``site.limit`` and left out.
 SITES_SOURCES_MAX: Final = 65_536
-"""Topics and services of all other sites together that are shown: some 5 KB each. Any program that reaches the router
-can announce more; they are counted as ``site.limit`` and left out."""
+# Sources that wait for one name here which another one holds; each is judged again whenever it is free.
 SITE_NAMES_WAITING_MAX: Final = 64
-"""Sources that wait for one name here which another one holds; each is judged again whenever it is free."""
+# Seconds for which the sources of a site stay when its leading gateway, or the way to it, is lost: longer than
+# another gateway of that site needs to take over. A site that is frozen is noticed within 1 s by Zenoh's lease,
+# and must be gone within 1.5 s.
 SITE_GRACE: Final = 0.5
-"""Seconds for which the sources of a site stay when its leading gateway, or the way to it, is lost: longer than
-another gateway of that site needs to take over. A site that is frozen is noticed within 1 s by Zenoh's lease, and
-must be gone within 1.5 s."""
+# Seconds for which a gateway must have been the first of its site before it leads; below ``SITE_GRACE``, so that
+# the other sites keep the sources.
 LEADER_PATIENCE: Final = 0.3
-"""Seconds for which a gateway must have been the first of its site before it leads; below ``SITE_GRACE``, so that the
-other sites keep the sources."""
+# Bytes of a publisher's header from another site, with the definition; the longest of ROS 1 has some 30 KB.
 HEADER_MAX: Final = 512 * 1024
-"""Bytes of a publisher's header from another site, with the definition; the longest of ROS 1 has some 30 KB."""
+# Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted.
 HELD_MESSAGES_MAX: Final = 1000
-"""Messages that wait at the receiver for the publisher's header; above it the oldest is dropped, and counted."""
+# Bytes of one best-effort topic that wait for a slow link: what is older than that is of no use. One message
+# always fits, and a burst of 1,000 small ones.
 BEST_EFFORT_BYTES: Final = 8 * 1024 * 1024
-"""Bytes of one best-effort topic that wait for a slow link: what is older than that is of no use. One message always
-fits, and a burst of 1,000 small ones."""
+# Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh.
 RELIABLE_BYTES: Final = 64 * 1024 * 1024
-"""Bytes of one reliable topic that wait for a slow link, as in a lane of the mesh."""
+# Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
+# 1 Mbit/s one such message takes 65 ms, for which all others of its priority wait.
 LARGE_MESSAGE: Final = 8 * 1024
-"""Bytes from which on a topic's messages yield to those of others, if its contract has no priority: on a line of
-1 Mbit/s one such message takes 65 ms, for which all others of its priority wait."""
+# Seconds after a topic of another site is back within which a subscriber counts as the one from before: what was
+# lost meanwhile is counted. roscpp's and rospy's nodes are back within two.
 RESUMED_WITHIN: Final = 10.0
-"""Seconds after a topic of another site is back within which a subscriber counts as the one from before: what was
-lost meanwhile is counted. roscpp's and rospy's nodes are back within two."""
+# Topics whose counts are kept while their site is away; of more, the oldest begin anew.
 INTERRUPTED_TOPICS_MAX: Final = 1024
-"""Topics whose counts are kept while their site is away; of more, the oldest begin anew."""
+# Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without
+# end; a server that dies ends its calls at once.
 ROS2_CALL_TIMEOUT: Final = 600.0
-"""Seconds of one call of a service between the mesh and ROS 2. Clients of ROS 1 and of rmw_zenoh wait without end; a
-server that dies ends its calls at once."""
+# Calls of one service that are under way at one time, each way; the next one gets an error.
 ROS2_CALLS_MAX: Final = 64
-"""Calls of one service that are under way at one time, each way; the next one gets an error."""
+# Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten.
 ROS2_PUBLISHERS_MAX: Final = 1000
-"""Publishers of one topic of ROS 2 whose sequence numbers are followed; the one silent for longest is forgotten."""
+# ROS 2 nodes that are asked for types at one time; any program can declare tokens of types that are not known.
 ROS2_ASKS_MAX: Final = 200
-"""ROS 2 nodes that are asked for types at one time; any program can declare tokens of types that are not known."""
+# Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it
+# answers: a node declares one after the other.
 ROS2_SERVICE_WAIT: Final = 3.0
-"""Seconds in which a ROS 2 node's get_type_description may appear after its first publisher, and in which it answers:
-a node declares one after the other."""
+# Seconds between two looks whether a session that listens has to be opened anew: its certificate was renewed,
+# which is each 3.5 days, or a module has joined that the table of access must name. Some 2 ms each.
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
-"""Seconds between two looks whether a session that listens has to be opened anew: its certificate was renewed, which
-is each 3.5 days, or a module has joined that the table of access must name. Some 2 ms each."""
+# Seconds until a session is opened again, at first, whose router did not answer.
 OPEN_RETRY_FIRST: Final = 0.5
-"""Seconds until a session is opened again, at first, whose router did not answer."""
+# Goals of one action that are known at one time, each way; the next one is rejected.
 ROS2_GOALS_MAX: Final = 1000
-"""Goals of one action that are known at one time, each way; the next one is rejected."""
+# Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``.
 ROS2_GOAL_KEPT: Final = 5.0
-"""Seconds for which a goal that has ended stays in the status of ROS 1; actionlib's ``status_list_timeout``."""
+# Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10.
 ROS2_RESULT_KEPT: Final = 60.0
-"""Seconds for which a client of ROS 2 may ask for the result of a goal that has ended; rcl's default is 10."""
+# Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted.
 ROS2_ACCEPT_TIMEOUT: Final = 10.0
-"""Seconds for an action server of ROS 1 to show a goal in its status; then the goal counts as not accepted."""
+# Actions that are joined, each way; the others are reported.
 ROS2_ACTIONS_MAX: Final = 500
-"""Actions that are joined, each way; the others are reported."""
 
 
 # Every bound of the gateway's Zenoh session, with unit and reason.
 
 
+# Seconds without a sign of life after which a Zenoh transport counts as dead: with the other side's grace a
+# frozen site is gone within 1.5 s (measured: 1.2 s with a lease of 0.8 s, 1.6 s with one of 1.2 s). Zenoh sends
+# a keep-alive four times in that time, from a thread of its own, and any data counts too.
 LEASE: Final = 1.0
-"""Seconds without a sign of life after which a Zenoh transport counts as dead: with the other side's grace a frozen
-site is gone within 1.5 s (measured: 1.2 s with a lease of 0.8 s, 1.6 s with one of 1.2 s). Zenoh sends a keep-alive
-four times in that time, from a thread of its own, and any data counts too."""
+# Seconds that a query or a declaration may wait for a transport before Zenoh closes it: Zenoh's own value.
 BLOCK_MAX: Final = 5.0
-"""Seconds that a query or a declaration may wait for a transport before Zenoh closes it: Zenoh's own value."""
+# Seconds that a message, or each fragment of it, waits for room in a transport before Zenoh drops the message
+# and, at once, those behind it. One batch of Zenoh (64 KB) takes a line of 1 Mbit/s half a second, and longer
+# where packets are lost: with 1 s here a burst of 1,000 messages lost most of them, with 10 s none. Zenoh's own
+# value, 1 ms, loses what is large on every slow link. A dead transport ends by its lease. A put that blocks
+# instead would end the link: Zenoh closes a transport behind which one message, with all its fragments, waits
+# for longer than ``BLOCK_MAX``.
 DROP_WAIT: Final = 10.0
-"""Seconds that a message, or each fragment of it, waits for room in a transport before Zenoh drops the message and,
-at once, those behind it. One batch of Zenoh (64 KB) takes a line of 1 Mbit/s half a second, and longer where packets
-are lost: with 1 s here a burst of 1,000 messages lost most of them, with 10 s none. Zenoh's own value, 1 ms, loses
-what is large on every slow link. A dead transport ends by its lease. A put that blocks instead would end the link:
-Zenoh closes a transport behind which one message, with all its fragments, waits for longer than ``BLOCK_MAX``."""
+# Seconds that all fragments of a message may wait together: 32 MB at 1 Mbit/s.
 DROP_WAIT_MAX: Final = 300.0
-"""Seconds that all fragments of a message may wait together: 32 MB at 1 Mbit/s."""
+# Messages of one subscriber that wait for the event loop; above it the oldest is dropped, and counted. It is
+# several bursts of 1,000, and 30 ms of what the loop can take.
 ARRIVED_MESSAGES: Final = 10_000
-"""Messages of one subscriber that wait for the event loop; above it the oldest is dropped, and counted. It is several
-bursts of 1,000, and 30 ms of what the loop can take."""
+# Bytes of one subscriber that wait for the event loop; one message always fits. It is 64 images of 1 MB.
 ARRIVED_BYTES: Final = 64 * 1024 * 1024
-"""Bytes of one subscriber that wait for the event loop; one message always fits. It is 64 images of 1 MB."""
+# Queries of one queryable that wait for the event loop; above it the oldest is finished without an answer.
 ARRIVED_QUERIES: Final = 1_000
-"""Queries of one queryable that wait for the event loop; above it the oldest is finished without an answer."""
+# Changes of tokens of one watcher that wait for the event loop: a hundred sites of a thousand sources, twice.
 ARRIVED_TOKENS: Final = 200_000
-"""Changes of tokens of one watcher that wait for the event loop: a hundred sites of a thousand sources, twice."""
+# Bytes of one message of Zenoh that are put together from its fragments: the largest of ROS, and its head.
+# Zenoh's own value is 1 GiB, which any program that connects could have this process hold.
 ZENOH_MESSAGE_MAX: Final = 257 * 1024 * 1024
-"""Bytes of one message of Zenoh that are put together from its fragments: the largest of ROS, and its head. Zenoh's
-own value is 1 GiB, which any program that connects could have this process hold."""
+# Bytes of an attachment; the longest that this gateway or ROS 2 writes has some 900. A message or query with a
+# longer one is dropped before it is stored, and counted as ``zenoh.attachment.long``.
 ATTACHMENT_MAX: Final = 4096
-"""Bytes of an attachment; the longest that this gateway or ROS 2 writes has some 900. A message or query with a
-longer one is dropped before it is stored, and counted as ``zenoh.attachment.long``."""
+# Characters of the key of a message, token or query, and of a query's parameters; those of ROS names have at
+# most some 900. Longer ones are dropped, and counted as ``zenoh.key.long``.
 ZENOH_KEY_MAX: Final = 4096
-"""Characters of the key of a message, token or query, and of a query's parameters; those of ROS names have at most
-some 900. Longer ones are dropped, and counted as ``zenoh.key.long``."""
+# Characters of the tokens that wait for the event loop.
 ARRIVED_TOKEN_BYTES: Final = 64 * 1024 * 1024
-"""Characters of the tokens that wait for the event loop."""
+# Answers to one query; further ones are dropped, and counted as ``zenoh.reply.limit``. A gateway asks for one
+# answer of each gateway of a site.
 REPLIES_MAX: Final = 20_000
-"""Answers to one query; further ones are dropped, and counted as ``zenoh.reply.limit``. A gateway
-asks for one answer of each gateway of a site."""
+# Bytes of all answers to one query; one answer always fits.
 REPLY_BYTES_MAX: Final = 256 * 1024 * 1024
-"""Bytes of all answers to one query; one answer always fits."""
+# Bytes of answers that wait for Zenoh in all; one always fits. Above it a query ends without the answer, which
+# is counted as ``zenoh.answer.limit``: a client that asks and does not read must not fill the memory.
 ANSWER_BYTES_MAX: Final = 256 * 1024 * 1024
-"""Bytes of answers that wait for Zenoh in all; one always fits. Above it a query ends without the answer, which is
-counted as ``zenoh.answer.limit``: a client that asks and does not read must not fill the memory."""
+# Answers that wait for Zenoh in all, likewise.
 ANSWERS_WAITING_MAX: Final = 20_000
-"""Answers that wait for Zenoh in all, likewise."""
+# Seconds between two looks at what arrived while much arrives; the delay that a message may have then.
 BUSY_PERIOD: Final = 0.001
-"""Seconds between two looks at what arrived while much arrives; the delay that a message may have then."""
+# Seconds that a publisher which is closed may still send what waits.
 FLUSH_MAX: Final = 1.0
-"""Seconds that a publisher which is closed may still send what waits."""

@@ -65,8 +65,8 @@ class ForeignSource:
     type: str
 
 
+# Kind, name here, and node here.
 SourceKey = tuple[SourceKind, str, str]
-"""Kind, name here, and node here."""
 
 
 class Neighbour(Protocol):

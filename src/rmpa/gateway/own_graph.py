@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription
 
 _log = logging.getLogger(__name__)
+# The node that subscribes to what neighbours want.
 TAP_NODE: Final = f"{OWN_NODE}/gateway"
-"""The node that subscribes to what neighbours want."""
 _ANY: Final = "*"
 _KINDS: Final = {RegistrationKind.PUBLISHER: SourceKind.TOPIC, RegistrationKind.SERVICE: SourceKind.SERVICE}
 
@@ -53,6 +53,9 @@ class MeshSources:
     Args:
         agent: The gateway's agent.
         name: Its name among its peers.
+
+    Attributes:
+        known: The sources that were reported.
     """
 
     def __init__(self, agent: Agent, name: str) -> None:
@@ -61,7 +64,6 @@ class MeshSources:
         self._relay = agent.bridge.relay
         self._local = LocalSources(agent.core, agent.bridge.relay)
         self.known: dict[SourceKey, MeshSource] = {}
-        """The sources that were reported."""
         self.watchers: list[Callable[[MeshSource, bool], None]] = []
         self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
         self._changed: dict[tuple[SourceKind, str], None] = {}
@@ -165,19 +167,22 @@ class AgentGraph(Part):
     Args:
         agent: The agent; it has to relay.
         settings: Its settings.
+
+    Attributes:
+        name: The gateway's name among its peers.
+        reloaded: Called with other rules, after the graph has taken them.
+        sources: The local sources by kind, name here and node here. What came from a neighbour is not among
+            them.
     """
 
     def __init__(self, agent: Agent, settings: Settings) -> None:
         self.agent: Final = agent
         self.name: Final = settings.name
-        """The gateway's name among its peers."""
         self.reloaded: Callable[[Settings], None] = lambda _: None
-        """Called with other rules, after the graph has taken them."""
         self._core = agent.core
         self._sources = MeshSources(agent, settings.name)
         self._sources.watchers.append(self._source_changed)
         self.sources: Final = self._sources.known
-        """The local sources by kind, name here and node here. What came from a neighbour is not among them."""
         agent.services.make_room = self._make_room
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 _EVERY_SITE: Final = ("*", "**")
 _NO_RULE: Final = "no gateway.rule fits: everything crosses"
+# Topics that each node of ROS 2 has; they do not cross unless a rule names them as they are.
 PLUMBING: Final = frozenset(("/rosout", "/parameter_events"))
-"""Topics that each node of ROS 2 has; they do not cross unless a rule names them as they are."""
+# What a module or a site must be allowed to have, or to be told of, a source.
 ACCESS: Final = {SourceKind.TOPIC: Access.SUBSCRIBE, SourceKind.SERVICE: Access.CALL}
-"""What a module or a site must be allowed to have, or to be told of, a source."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ _LIMIT_BURST: Final = 0.5
 # Messages of one read that are collected before they are queued for other sites; the read may go on for longer.
 _COLLECTED_MESSAGES: Final = 256
 
+# Seconds by which a timer may be early.
 _BOUNDARY = 0.001
-"""Seconds by which a timer may be early."""
 
 
 class ExportDialect(Protocol):
@@ -116,6 +116,13 @@ class Export:
         dialect: Of the neighbour.
         rate: Messages a second that cross at most; ``None``: no limit.
         size: Bytes a second that cross at most; ``None``: no limit.
+
+    Attributes:
+        about: The publisher's last header; ``None`` before the first.
+        wanted: Whether the neighbour subscribes.
+        problem: Why its messages do not cross; empty for nothing.
+        messages: Messages that were taken for the neighbour: the number of the last one.
+        limited: Messages that a limit has kept back.
     """
 
     # More than twelve fields: the demand, the publisher here, that of Zenoh, and the counts change each other.
@@ -135,15 +142,10 @@ class Export:
         self._dialect = dialect
         self._limits = TopicLimits(rate, size) if rate is not None or size is not None else None
         self.about: TopicDescription | None = None
-        """The publisher's last header; ``None`` before the first."""
         self.wanted = False
-        """Whether the neighbour subscribes."""
         self.problem = ""
-        """Why its messages do not cross; empty for nothing."""
         self.messages = 0
-        """Messages that were taken for the neighbour: the number of the last one."""
         self.limited = 0
-        """Messages that a limit has kept back."""
         self._failed = self._was_wanted = self._large = self._latched = self._repeated = False
         self._dropped_before = 0
         self._terms: tuple[str, ZenohQos] | None = None
@@ -152,12 +154,12 @@ class Export:
         self._opening = self._closed = False
         self._linger: asyncio.TimerHandle | None = None
         self._asking: list[asyncio.Future[TopicDescription]] = []
+        # The messages of the present read.
         self._collected: list[bytes] = []
-        """The messages of the present read."""
+        # The last message of a latched topic.
         self._last: bytes | None = None
-        """The last message of a latched topic."""
+        # When that is sent, which a limit holds back.
         self._held: asyncio.TimerHandle | None = None
-        """When that is sent, which a limit holds back."""
 
     @property
     def announced(self) -> bool:

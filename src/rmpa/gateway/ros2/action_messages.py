@@ -25,24 +25,25 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 UUID_BYTES: Final = 16
+# The id in a request to cancel that means all goals.
 ALL_GOALS: Final = bytes(UUID_BYTES)
-"""The id in a request to cancel that means all goals."""
 _U32: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<II")
 _INFO: Final = struct.Struct("<16siI")
 
+# The states of actionlib_msgs/GoalStatus.
 Ros1Status = IntEnum(
     "Ros1Status",
     "PENDING ACTIVE PREEMPTED SUCCEEDED ABORTED REJECTED PREEMPTING RECALLING RECALLED LOST",
     start=0,
 )
-"""The states of actionlib_msgs/GoalStatus."""
+# The states of action_msgs/GoalStatus.
 Ros2Status = IntEnum("Ros2Status", "UNKNOWN ACCEPTED EXECUTING CANCELING SUCCEEDED CANCELED ABORTED", start=0)
-"""The states of action_msgs/GoalStatus."""
+# The answers of action_msgs/CancelGoal.
 CancelCode = IntEnum("CancelCode", "NONE REJECTED UNKNOWN_GOAL GOAL_ENDED", start=0)
-"""The answers of action_msgs/CancelGoal."""
+# The states that another one follows.
 UNDER_WAY: Final = (Ros1Status.PENDING, Ros1Status.ACTIVE, Ros1Status.PREEMPTING, Ros1Status.RECALLING)
-"""The states that another one follows."""
+# Each state of ROS 1; the first of those with one counterpart stands for it in ROS 1.
 TO_ROS2: Final = {
     Ros1Status[ros1]: Ros2Status[ros2]
     for ros2, many in (
@@ -55,7 +56,6 @@ TO_ROS2: Final = {
     )
     for ros1 in many.split()
 }
-"""Each state of ROS 1; the first of those with one counterpart stands for it in ROS 1."""
 TO_ROS1: Final = {ros2: ros1 for ros1, ros2 in reversed(TO_ROS2.items())} | {Ros2Status.UNKNOWN: Ros1Status.LOST}
 
 

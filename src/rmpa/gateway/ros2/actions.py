@@ -33,12 +33,13 @@ if TYPE_CHECKING:
 # Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused.
 _ROS2_ACTION_READY: Final = 5.0
 
+# The node that publishes goals and cancellations for all clients of ROS 2, below ``/rmpa/ros2``.
 _NODE: Final = "/action_clients"
-"""The node that publishes goals and cancellations for all clients of ROS 2, below ``/rmpa/ros2``."""
 _LATCHED: Final = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 _SEND: Final = f"{PART}send_goal"
 _OF_SERVER: Final = ("status", "feedback", "result")
 _OF_CLIENTS: Final = ("goal", "cancel")
+# The topics of an action of ROS 1, and their types or the ends of their types.
 _TYPES: Final = {
     "goal": "ActionGoal",
     "cancel": "actionlib_msgs/GoalID",
@@ -46,7 +47,6 @@ _TYPES: Final = {
     "feedback": "ActionFeedback",
     "result": "ActionResult",
 }
-"""The topics of an action of ROS 1, and their types or the ends of their types."""
 
 
 # Clients of ROS 2, and an actionlib server of ROS 1.
@@ -56,17 +56,17 @@ _TYPES: Final = {
 class _SentToRos1:
     id: GoalId
     uuid: bytes
+    # When the goal is given up, unless the server shows it before; afterwards, when it is forgotten.
     deadline: float
-    """When the goal is given up, unless the server shows it before; afterwards, when it is forgotten."""
+    # The request ``send_goal`` that is not answered yet.
     asked: ArrivedQuery | None
-    """The request ``send_goal`` that is not answered yet."""
     status: Ros1Status = Ros1Status.PENDING
+    # Requests ``get_result`` that are not answered yet.
     waiting: list[ArrivedQuery] = field(default_factory=list)
-    """Requests ``get_result`` that are not answered yet."""
+    # The result of ROS 1 once it has come.
     result: bytes | None = None
-    """The result of ROS 1 once it has come."""
+    # Whether the server's status has named it.
     listed: bool = False
-    """Whether the server's status has named it."""
 
     @property
     def ended(self) -> bool:
@@ -85,8 +85,8 @@ class GoalsToRos1(Goals):
     def __init__(self, pair: ActionPair, out: OfferedAction, clock: SystemClock) -> None:
         super().__init__(pair, clock)
         self._out = out
+        # By the id in ROS 1, which is the text of the UUID.
         self._goals: dict[str, _SentToRos1] = {}
-        """By the id in ROS 1, which is the text of the UUID."""
 
     # --- from the clients of ROS 2 --------------------------------------------------------------------------------
 
@@ -348,12 +348,12 @@ class Ros2Actions:
 
     def __init__(self, context: Ros2Context) -> None:
         self._context = context
+        # The topics of servers and clients of ROS 1 by action, and what part each is.
         self._topics: dict[str, dict[MeshSource, str]] = {}
-        """The topics of servers and clients of ROS 1 by action, and what part each is."""
         self._offered: dict[str, OfferedAction] = {}
         self._shown: dict[str, ShownAction] = {}
+        # Actions whose server is gone, the last of each name: their topics stay for a moment.
         self._leaving: dict[str, ShownAction] = {}
-        """Actions whose server is gone, the last of each name: their topics stay for a moment."""
 
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Take a topic of an action."""

@@ -32,13 +32,14 @@ if TYPE_CHECKING:
     from rmpa.ros.types.definitions import Field
     from rmpa.ros.wire.tcpros import Buffer
 
+    # The fields of a type of one side by its name.
     FieldsOf = Callable[[str], Iterable[Field]]
-    """The fields of a type of one side by its name."""
 
 HEADER: Final = "std_msgs/msg/Header"
+# Numbers of one byte keep their bits under each of these names; other numbers are equal if they have one name.
 _ONE_BYTE: Final = ("byte", "char", "int8", "uint8")
-"""Numbers of one byte keep their bits under each of these names; other numbers are equal if they have one name."""
 _LITTLE_ENDIAN: Final = HEAD[:2]
+# What is raised for bytes that are not a message; rosbags does not check everything itself.
 _ERRORS: Final = (
     SerdeError,
     RmpaError,
@@ -49,7 +50,6 @@ _ERRORS: Final = (
     AssertionError,
     OverflowError,
 )
-"""What is raised for bytes that are not a message; rosbags does not check everything itself."""
 
 
 class NoConversion(RmpaError):  # noqa: N818 - the name says what happened
@@ -114,6 +114,9 @@ class Conversion:
         types: ROS 2's types, which know it.
         fields: The fields by path, if a mapping file lists them.
 
+    Attributes:
+        transcoder: What converts the bytes without making values, if that can be.
+
     Raises:
         NoConversion: The types are no pair.
     """
@@ -122,10 +125,9 @@ class Conversion:
         self.ros1 = ros1
         self.ros2 = ros2
         self._types = types
+        # What goes where, if a mapping file says it.
         self._mapped: list[tuple[list[str], list[str], Field, Ros2Field]] | None = None
-        """What goes where, if a mapping file says it."""
         self.transcoder: Transcoder | None = None
-        """What converts the bytes without making values, if that can be."""
         try:
             check_size(ros1.name, self._fields1)
             if fields is None:
@@ -360,8 +362,8 @@ def action_name(type_name: str, part: str) -> str:
 # An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions.
 
 
+# Stands between an action's name and those of its services and topics in ROS 2.
 PART: Final = "/_action/"
-"""Stands between an action's name and those of its services and topics in ROS 2."""
 CANCEL_TYPE: Final = "action_msgs/srv/CancelGoal"
 STATUS_TYPE: Final = "action_msgs/msg/GoalStatusArray"
 _UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
@@ -377,6 +379,15 @@ class ActionPair:
         rule: Its counterpart, ``package/action/Name``, and the fields if a mapping file lists them.
         types: ROS 2's types; the action's are learnt from ROS 1's fields if they are not known.
 
+    Attributes:
+        name: ``package/action/Name`` of ROS 2.
+        ros1: ``package/Name`` of ROS 1.
+        types: The type of each service and topic in ROS 2, and its hash.
+        goal: Converts goals, without the id.
+        feedback: Converts feedback, without the id.
+        result: ROS 1's result.
+        no_result: A result of ROS 1 without values, for goals that have none.
+
     Raises:
         NoConversion: The types are no pair.
     """
@@ -384,9 +395,7 @@ class ActionPair:
     def __init__(self, kinds: Sequence[MessageType], rule: TypePair, types: Ros2Types) -> None:
         goal, result, feedback = kinds
         self.name: Final = rule.name
-        """``package/action/Name`` of ROS 2."""
         self.ros1: Final = goal.name.removesuffix("Goal")
-        """``package/Name`` of ROS 1."""
         if rule.paths and f"{rule.name}_Goal" not in types:
             raise NoConversion(
                 f"the rule of {self.ros1} maps fields to {rule.name}, whose definition is not known here"
@@ -395,13 +404,9 @@ class ActionPair:
             types.learn({name: each for name, each in kind.specifications.items() if name != kind.name})
             types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
         self.types: Final = _define(rule.name, types)
-        """The type of each service and topic in ROS 2, and its hash."""
         self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.paths.get("goal"))
-        """Converts goals, without the id."""
         self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.paths.get("feedback"))
-        """Converts feedback, without the id."""
         self.result: Final = result
-        """ROS 1's result."""
         wrapped = f"{self.ros1}GetResultResponse"
         both = Specification.parse(wrapped, f"int8 status\n{result.name} result\n")
         paths = rule.paths.get("result")
@@ -410,7 +415,6 @@ class ActionPair:
         known = {**result.specifications, wrapped: both}
         self._result = Conversion(MessageType(wrapped, known), f"{rule.name}_GetResult_Response", types, paths)
         self.no_result: Final = result.serialize(result.make(None))
-        """A result of ROS 1 without values, for goals that have none."""
 
     def result_to_ros2(self, status: int, result: bytes) -> bytes:
         """``GetResult_Response``.

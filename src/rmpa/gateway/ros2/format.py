@@ -39,8 +39,8 @@ _ENTITY_ID_MAX: Final = 2**64 - 1
 # The largest ROS domain id in a key; ROS 2 uses 0 to 232.
 _DOMAIN_MAX: Final = 2**32 - 1
 
+# Bytes of a GID since ROS 2 Jazzy.
 GID_BYTES: Final = 16
-"""Bytes of a GID since ROS 2 Jazzy."""
 _HEAD: Final = struct.Struct("<qqB")
 _LABELS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
 _NUMBER: Final = 8
@@ -104,22 +104,22 @@ def _without_labels(raw: memoryview) -> memoryview:
 # rmw/types.h.
 
 
+# A duration that never ends, in nanoseconds: the default of all durations (RMW_DURATION_INFINITE).
 INFINITE: Final = 2**63 - 1
-"""A duration that never ends, in nanoseconds: the default of all durations (RMW_DURATION_INFINITE)."""
 _NANO: Final = 1_000_000_000
 _PARTS: Final = 6
+# Messages that *keep last* keeps by default.
 DEFAULT_DEPTH: Final = 10
-"""Messages that *keep last* keeps by default."""
 
 
+# Whether a message that is lost on the way is sent again.
 Ros2Reliability = IntEnum("Ros2Reliability", "RELIABLE BEST_EFFORT")
-"""Whether a message that is lost on the way is sent again."""
+# Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched.
 Ros2Durability = IntEnum("Ros2Durability", "TRANSIENT_LOCAL VOLATILE")
-"""Whether a later subscriber gets earlier messages; ``TRANSIENT_LOCAL`` is what ROS 1 calls latched."""
+# How many messages an endpoint keeps.
 Ros2History = IntEnum("Ros2History", "KEEP_LAST KEEP_ALL")
-"""How many messages an endpoint keeps."""
+# How a publisher shows that it is alive.
 Ros2Liveliness = IntEnum("Ros2Liveliness", "AUTOMATIC MANUAL_BY_NODE MANUAL_BY_TOPIC")
-"""How a publisher shows that it is alive."""
 _Kind = TypeVar("_Kind", bound=IntEnum)
 
 
@@ -296,10 +296,10 @@ def _nanoseconds(seconds: float | None) -> int:
 # key: it hears nothing, and is told nothing.
 
 
+# The first chunk of each token; ``**`` does not match it, as it begins with ``@``.
 ADMIN_SPACE: Final = "@ros2_lv"
-"""The first chunk of each token; ``**`` does not match it, as it begins with ``@``."""
+# The type hash of ROS 2 Humble, which has none.
 NO_HASH: Final = "TypeHashNotSupported"
-"""The type hash of ROS 2 Humble, which has none."""
 _EMPTY: Final = "%"
 _NODE_PARTS: Final = 9
 _ENDPOINT_PARTS: Final = 13

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
 
+# The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
-"""The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too."""
 
 
 # Two endpoints of one name that do not hear each other, as their keys differ: ROS 2 itself says nothing.
@@ -67,9 +67,10 @@ def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
 # ``limits`` allow is ignored and counted; so are the tokens of gateways, this one's included.
 
 
+# The namespace of the nodes that gateways declare: ``/rmpa/<module>/<node>``, as in the graphs of ROS 1. No ROS
+# 2 node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no
+# loop.
 OWN_NAMESPACE: Final = "/rmpa/"
-"""The namespace of the nodes that gateways declare: ``/rmpa/<module>/<node>``, as in the graphs of ROS 1. No ROS 2
-node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no loop."""
 _NAME: Final = re.compile(r"(/[A-Za-z0-9_]+)+")
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
 
@@ -80,6 +81,9 @@ class Ros2Graph:
     Args:
         domain: The ROS domain id; tokens of others are ignored.
         own_zid: The Zenoh session of this gateway; its tokens are ignored.
+
+    Attributes:
+        ignored: Tokens that were ignored, by reason.
     """
 
     def __init__(self, domain: int, own_zid: str) -> None:
@@ -88,11 +92,10 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
+        # By the name of a node the tokens and sessions of other gateways that show it.
         self._rivals: dict[str, dict[str, str]] = {}
-        """By the name of a node the tokens and sessions of other gateways that show it."""
         self._rival_tokens = 0
         self.ignored: Counter[str] = Counter()
-        """Tokens that were ignored, by reason."""
 
     @property
     def nodes(self) -> set[str]:
@@ -246,14 +249,16 @@ class OwnRos2Nodes:
         domain: The ROS domain id.
         name: The gateway's name.
         gid_bytes: The length of a GID: 16, and 24 in ROS 2 Humble.
+
+    Attributes:
+        own_name: The node that subscribes and calls for all nodes of the mesh.
+        gids: The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own.
     """
 
     def __init__(self, session: OpenSession, domain: int, name: str, gid_bytes: int) -> None:
         self.session = session
         self.own_name = OWN_NAMESPACE + _NOT_IN_NAMES.sub("_", name)
-        """The node that subscribes and calls for all nodes of the mesh."""
         self.gids: set[bytes] = set()
-        """The GIDs of all endpoints that are declared: what comes with one of them is this gateway's own."""
         self._domain = domain
         self._gid_bytes = gid_bytes
         self._numbers = itertools.count()

@@ -21,18 +21,19 @@ if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
     from pathlib import Path
 
+# A field of ROS 1 to one of ROS 2, each a path with dots.
 FieldPaths = dict[str, str]
-"""A field of ROS 1 to one of ROS 2, each a path with dots."""
+# What a rule may be of, and how ROS 2 has it in the names of types.
 _KINDS: Final = {"message": "msg", "service": "srv", "action": "action"}
-"""What a rule may be of, and how ROS 2 has it in the names of types."""
 _PARTS: Final = {"message": ("",), "service": ("request", "response"), "action": ("goal", "result", "feedback")}
+# The keys that map fields, and what of the type has them.
 _FIELD_KEYS: Final = {f"{part}_fields_1_to_2".lstrip("_"): part for parts in _PARTS.values() for part in parts}
-"""The keys that map fields, and what of the type has them."""
 _KEYS: Final = {
     *_FIELD_KEYS,
     *(f"ros{version}_{kind}_name" for version in (1, 2) for kind in ("package", *_KINDS)),
     "enable_foreign_mappings",
 }
+# Pairs with other names in ROS 2, as the mapping files of ROS 2's own packages have them.
 _USUAL: Final = {
     "rosgraph_msgs/Log": "rcl_interfaces/msg/Log",
     "tf/tfMessage": "tf2_msgs/msg/TFMessage",
@@ -41,7 +42,6 @@ _USUAL: Final = {
     "roscpp/Empty": "std_srvs/srv/Empty",
     "actionlib_tutorials/Fibonacci": "example_interfaces/action/Fibonacci",
 }
-"""Pairs with other names in ROS 2, as the mapping files of ROS 2's own packages have them."""
 _LOG: Final = "rosgraph_msgs/Log"
 _LOG_FIELDS: Final[FieldPaths] = {
     "header.stamp": "stamp",

@@ -79,10 +79,10 @@ class Ros2Neighbour:
         self.services = Ros2Services(context)
         # Actions take all topics and services of actions, so that no other part carries them.
         self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
+        # By proxy.
         self._sources: dict[str, set[MeshSource]] = {}
-        """By proxy."""
+        # The proxies that another gateway shows in ROS 2, with its session.
         self._standing_by: dict[str, str] = {}
-        """The proxies that another gateway shows in ROS 2, with its session."""
         self._watch: Declaration | None = None
         self._closed = False
 

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 _ROS2_DESCRIBE_AGAIN: Final = (0.5, 30.0)
 
 _log = logging.getLogger(__name__)
+# RMW_GID_STORAGE_SIZE up to ROS 2 Humble.
 _GID_BYTES_BEFORE: Final = 24
-"""RMW_GID_STORAGE_SIZE up to ROS 2 Humble."""
 SERVICE_NEEDS: Final = Needs(
     (),
     "`[[gateway.rule]]` for `ros2` alone: ROS 2 has no permissions",
@@ -117,6 +117,11 @@ class ServicePair:
         pair: Its counterpart.
         types: ROS 2's types; the service type is learnt from ROS 1's fields if it is not known.
 
+    Attributes:
+        type_hash: The hash in keys and tokens.
+        request: Converts requests.
+        response: Converts responses.
+
     Raises:
         NoConversion: The types are no pair.
     """
@@ -130,11 +135,8 @@ class ServicePair:
         self.ros1 = ros1
         self.ros2 = pair.name
         self.type_hash = types.service_hash(ros1, pair.name)
-        """The hash in keys and tokens."""
         self.request = Conversion(ros1.request, f"{pair.name}_Request", types, pair.paths.get("request"))
-        """Converts requests."""
         self.response = Conversion(ros1.response, f"{pair.name}_Response", types, pair.paths.get("response"))
-        """Converts responses."""
 
 
 class Ros2Context(OwnedTasks):
@@ -145,6 +147,11 @@ class Ros2Context(OwnedTasks):
         session: The Zenoh session.
         settings: The table ``[gateway]``.
         contracts: The contracts of topics, for their QoS.
+
+    Attributes:
+        types: The types of ROS 2's distribution, and those that were learnt.
+        ros2: ROS 2's graph; what this gateway declares is not in it.
+        problems: What is wrong, by what it is about.
 
     Raises:
         ConfigError: The distribution is not known, or a mapping file is wrong.
@@ -163,17 +170,14 @@ class Ros2Context(OwnedTasks):
         self.contracts: Final = contracts
         self.rules: Final = CrossingRules(settings.rules)
         self.types: Final = Ros2Types(ros2.distribution)
-        """The types of ROS 2's distribution, and those that were learnt."""
         self.mapping: Final = TypeMapping()
         for path in ros2.mapping:
             self.mapping.read(Path(path))
         size = _GID_BYTES_BEFORE if ros2.distribution in WITHOUT_HASH else GID_BYTES
         self.nodes: Final = OwnRos2Nodes(session, ros2.domain, graph.name, size)
         self.ros2: Final = Ros2Graph(ros2.domain, session.zid)
-        """ROS 2's graph; what this gateway declares is not in it."""
         self.asker: Final = Ros2TypeAsker(session, self.nodes, self.ros2, self.types)
         self.problems: dict[str, str] = {}
-        """What is wrong, by what it is about."""
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a message type of ROS 2, ``package/msg/Name``."""
@@ -397,13 +401,16 @@ class ShownRos2Service:
 
 
 class Ros2Services:
-    """Joins services both ways. Of several servers of one name the first is called, as in each of the graphs."""
+    """Joins services both ways. Of several servers of one name the first is called, as in each of the graphs.
+
+    Attributes:
+        shown: The services of ROS 2 in the gateway's graph, by their names in ROS 2.
+    """
 
     def __init__(self, context: Ros2Context) -> None:
         self._context = context
         self._offered: dict[str, list[OfferedService]] = {}
         self.shown: dict[str, ShownRos2Service] = {}
-        """The services of ROS 2 in the gateway's graph, by their names in ROS 2."""
 
     def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
         """Offer a service of a module to ROS 2, or take it back."""

@@ -43,8 +43,8 @@ _ROS2_GOAL_TIMEOUT: Final = 86_400.0
 # Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave.
 _ROS2_LAST_RESULTS: Final = 1.0
 
+# What the definition of an action is made of.
 KINDS: Final = ("Goal", "Result", "Feedback")
-"""What the definition of an action is made of."""
 
 
 class Goals:

@@ -53,8 +53,9 @@ _ROS2_EARLY_MESSAGES: Final = 1000
 # Bytes of these.
 _ROS2_EARLY_BYTES: Final = 16 * 1024 * 1024
 
+# Its publishers latch, in ROS 1 and ROS 2 (tf2_ros).
 _STATIC_TF: Final = "/tf_static"
-"""Its publishers latch, in ROS 1 and ROS 2 (tf2_ros)."""
+# Types of streams: their publishers are not asked whether they latch, since a driver may start by being asked.
 _STREAMS: Final = frozenset(
     (
         "sensor_msgs/Image",
@@ -65,7 +66,6 @@ _STREAMS: Final = frozenset(
         "stereo_msgs/DisparityImage",
     )
 )
-"""Types of streams: their publishers are not asked whether they latch, since a driver may start by being asked."""
 _TOPIC_ENDS: Final = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
 _SEQ: Final = struct.Struct("<I")
 
@@ -81,13 +81,15 @@ class Ros2Dialect:
         part: Tells it the types, and compares it with what ROS 2 has.
         source: The topic.
         decision: The rule that lets it cross.
+
+    Attributes:
+        endpoint: The publisher in ROS 2's graph; ``None`` while its type is not known.
     """
 
     def __init__(self, part: Ros2Topics, source: MeshSource, decision: CrossingDecision) -> None:
         self.source: Final = source
         self.why: Final = decision.why
         self.endpoint: OwnEndpoint | None = None
-        """The publisher in ROS 2's graph; ``None`` while its type is not known."""
         self.unconverted = 0
         self._part = part
         self._conversion: Conversion | None = None
@@ -162,14 +164,17 @@ class Ros2Dialect:
 
 
 class Ros2Publisher:
-    """What one node of ROS 2 publishes of a topic; it may have several publishers of it."""
+    """What one node of ROS 2 publishes of a topic; it may have several publishers of it.
+
+    Attributes:
+        kept: The last message of a transient local one that is not wanted.
+    """
 
     def __init__(self, node: str, topic: Ros2Import) -> None:
         self.node: Final = node
         self.endpoints: list[Ros2Endpoint] = []
         self.wanted = False
         self.kept: bytes | None = None
-        """The last message of a transient local one that is not wanted."""
         self.received = self.dropped = 0
         source = ForeignSource(SourceKind.TOPIC, SITE, "", node, topic.decision.name, topic.ros1_type)
         self.topic: ProxiedTopic = topic.part.context.graph.show_topic(
@@ -194,6 +199,10 @@ class Ros2Import:
         first: A publisher of the topic.
         ros1_type: ``package/Name`` of ROS 1.
         decision: The rule that lets it cross, and its name here.
+
+    Attributes:
+        problem: Why its messages do not come; empty for nothing.
+        publishers: By node.
     """
 
     # More than twelve fields: publishers, demand, and messages that are too early change each other.
@@ -205,9 +214,7 @@ class Ros2Import:
         self.decision: Final = decision
         self.conversion: Conversion | None = None
         self.problem = ""
-        """Why its messages do not come; empty for nothing."""
         self.publishers: dict[str, Ros2Publisher] = {}
-        """By node."""
         self._by_gid: dict[bytes, Ros2Publisher] = {}
         self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
@@ -406,17 +413,19 @@ class Ros2Topics:
     Args:
         context: What the parts share.
         find: Finds a ROS 1 type on this machine by its name; raises ``RmpaError`` if there is none.
+
+    Attributes:
+        refused: Why topics do not cross, by ``<topic> of <node>``.
+        imports: ROS 2's topics in the gateway's graph, by key.
     """
 
     def __init__(self, context: Ros2Context, find: Callable[[str], MessageType] = find_message_type) -> None:
         self.context: Final = context
         self.pairs: Final = Ros2Pairs(context.types, context.mapping, find)
         self.refused: dict[str, str] = {}
-        """Why topics do not cross, by ``<topic> of <node>``."""
+        # By name here, then by proxy.
         self._exports: dict[str, dict[str, tuple[Export, Ros2Dialect]]] = {}
-        """By name here, then by proxy."""
         self.imports: dict[str, Ros2Import] = {}
-        """ROS 2's topics in the gateway's graph, by key."""
         self._looks = asyncio.Semaphore(_LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:

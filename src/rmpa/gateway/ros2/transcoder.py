@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
+# The head of CDR: little-endian, no options.
 HEAD: Final = b"\x00\x01\x00\x00"
-"""The head of CDR: little-endian, no options."""
+# Bytes above which slices of a memoryview are quicker than those of bytes, for they are not copied twice.
 _VIEWED: Final = 1 << 15
-"""Bytes above which slices of a memoryview are quicker than those of bytes, for they are not copied twice."""
 _U32: Final = struct.Struct("<I")
 
 
@@ -96,6 +96,9 @@ class FunctionText:
     ``s`` is the source, ``i`` the place in it, and ``c`` that in CDR where it is made. What is known of the place in
     CDR before the program runs is its rest ``_rest`` by ``_known``: after a string nothing (1), after an alignment
     the alignment.
+
+    Attributes:
+        texts: The names of fields, for errors: ``TEXTS`` of the function, whose code has none.
     """
 
     def __init__(self, *, to_cdr: bool) -> None:
@@ -107,7 +110,6 @@ class FunctionText:
         self._run = 0
         self._names = 0
         self.texts: list[str] = []
-        """The names of fields, for errors: ``TEXTS`` of the function, whose code has none."""
 
     def text(self, parts: Iterable[LayoutPart]) -> str:
         """The function for a message of these parts."""

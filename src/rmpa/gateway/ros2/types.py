@@ -28,14 +28,17 @@ if TYPE_CHECKING:
 
 
 class Ros2Sequences:
-    """Counts gaps in the numbers that each publisher gives its messages."""
+    """Counts gaps in the numbers that each publisher gives its messages.
+
+    Attributes:
+        lost: Messages that publishers sent and that did not come.
+        repeated: Messages that came again.
+    """
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
         self.lost = 0
-        """Messages that publishers sent and that did not come."""
         self.repeated = 0
-        """Messages that came again."""
 
     def accept(self, attachment: Ros2Attachment, *, history: bool) -> bool:
         """Take in a message.
@@ -72,26 +75,26 @@ class Ros2Sequences:
 # the gateway reports that instead of sending what the other side would misread.
 
 
+# The ROS 2 distributions whose types are known, with rosbags' store of each.
 DISTRIBUTIONS: Final = {
     name.removeprefix("ROS2_").lower(): store
     for name, store in Stores.__members__.items()
     if name.startswith("ROS2_")
 }
-"""The ROS 2 distributions whose types are known, with rosbags' store of each."""
+# Distributions before REP 2016: their endpoints have no type hash.
 WITHOUT_HASH: Final = frozenset(("dashing", "eloquent", "foxy", "galactic", "humble"))
-"""Distributions before REP 2016: their endpoints have no type hash."""
+# What stands for the hash in the keys of distributions that have none.
 NO_HASH: Final = "TypeHashNotSupported"
-"""What stands for the hash in the keys of distributions that have none."""
+# ROS 1's primitive times, and the messages of ROS 2 that have the same 8 bytes.
 TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
-"""ROS 1's primitive times, and the messages of ROS 2 that have the same 8 bytes."""
+# The one field of a type of ROS 2 that has none.
 EMPTY_MEMBER: Final = "structure_needs_at_least_one_member"
-"""The one field of a type of ROS 2 that has none."""
+# rosidl makes ``char`` of a definition an unsigned byte (rosidl_adapter), and hashes it so; ROS 1's is one too.
 _BASE_NAMES: Final = {"char": "uint8"}
-"""rosidl makes ``char`` of a definition an unsigned byte (rosidl_adapter), and hashes it so; ROS 1's is one too."""
 _ARRAYS: Final = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 _HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+# The fields of a type of ROS 2, each with what rosbags calls its description.
 Fields = list[tuple[str, Any]]
-"""The fields of a type of ROS 2, each with what rosbags calls its description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,8 +309,8 @@ def check_size(name: str, fields_of: Callable[[str], Iterable[Field]]) -> None:
 # A response is checked before it is used: rosbags makes Python code of the names in it.
 
 
+# The last part of the service's name; the others are its node's.
 SERVICE: Final = "get_type_description"
-"""The last part of the service's name; the others are its node's."""
 SERVICE_TYPE: Final = "type_description_interfaces/srv/GetTypeDescription"
 _REQUEST: Final = f"{SERVICE_TYPE}_Request"
 _RESPONSE: Final = f"{SERVICE_TYPE}_Response"
@@ -319,14 +322,14 @@ _PARTS: Final = {
     ),
 }
 _NUMBERS: Final = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+# type_description_interfaces/msg/FieldType, without those that ROS 1 lacks. ``char`` of C++ (13) is one octet.
 _BASES: Final = dict(enumerate(_NUMBERS, 2)) | {13: "uint8", 15: "bool", 16: "byte", 17: "string", 21: "string"}
-"""type_description_interfaces/msg/FieldType, without those that ROS 1 lacks. ``char`` of C++ (13) is one octet."""
 _NESTED: Final = 1
 _BOUNDED_STRING: Final = 21
 _TYPE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
 _FIELD_NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
+# What is added to a type's number for an array of fixed size, a bounded and an unbounded sequence of it.
 _ARRAY, _BOUNDED, _UNBOUNDED = 48, 96, 144
-"""What is added to a type's number for an array of fixed size, a bounded and an unbounded sequence of it."""
 
 
 @functools.cache

@@ -28,28 +28,31 @@ if TYPE_CHECKING:
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
 _SITE_SETTLE: Final = 0.05
 
+# Seconds within which a gateway that ends withdraws what it announced: that too is what its site had.
 _ENDING: Final = 2.0
-"""Seconds within which a gateway that ends withdraws what it announced: that too is what its site had."""
 
 
 class CatalogueChange(Enum):
-    """What has happened to a module or a source."""
+    """What has happened to a module or a source.
+
+    Attributes:
+        RENEWED: Its token had gone and came back in time: another gateway may have it now.
+    """
 
     FOUND = "found"
     RENEWED = "renewed"
-    """Its token had gone and came back in time: another gateway may have it now."""
     GONE = "gone"
 
 
 @dataclass(slots=True)
 class _Site:
     gateways: set[SiteGateway] = field(default_factory=set)
+    # Those whose token is there, or just went, with the sources likewise.
     modules: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
-    """Those whose token is there, or just went, with the sources likewise."""
+    # Sources whose token came before that of their module.
     orphans: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
-    """Sources whose token came before that of their module."""
+    # With the orphans.
     sources: int = 0
-    """With the orphans."""
     interrupted_until: float = 0.0
     refused: int = 0
 
@@ -76,8 +79,8 @@ class SiteCatalogue:
         self._own = own
         self._tell = changed
         self._sites: dict[str, _Site] = {}
+        # Of all sites together.
         self._sources = 0
-        """Of all sites together."""
         self._ending: TimerQueue[str] = TimerQueue()
         self._by_token: dict[str, SiteModule | SiteSource] = {}
         self.counters = counters if counters is not None else Counters()
@@ -324,8 +327,8 @@ class SiteHistory:
         self._now = now
         self._there: frozenset[str] = frozenset()
         self._since: dict[str, float] = {}
+        # When each source was withdrawn: infinite while it is there, and 0 if it went with its site.
         self._had: dict[str, dict[SiteSource, float]] = {}
-        """When each source was withdrawn: infinite while it is there, and 0 if it went with its site."""
 
     @property
     def away(self) -> tuple[str, ...]:

@@ -41,10 +41,10 @@ _LATCHED: Final = 1
 _HEAD: Final = struct.Struct("<BBQq16s")
 _RUN: Final = struct.Struct("<Q")
 _NUMBERS: Final = struct.Struct("<Qq")
+# From here on, and before the numbers, all attachments of one source are the same.
 _COMMON: Final = 18
-"""From here on, and before the numbers, all attachments of one source are the same."""
+# Sources that a reader remembers; then it begins anew.
 _SOURCES_KEPT: Final = 256
-"""Sources that a reader remembers; then it begins anew."""
 
 
 class MessageSource(NamedTuple):
@@ -279,15 +279,15 @@ class SequenceCounter:
 # that name its site. Releases without addressed sources ignore their tokens.
 
 
+# The first two chunks of each key; the number is that of the format.
 ROOT: Final = "rmpa/1"
-"""The first two chunks of each key; the number is that of the format."""
 _UP: Final = "up"
+# The chunk before the one other site that a source is for.
 TO: Final = "to"
-"""The chunk before the one other site that a source is for."""
+# Stands in the place of the module in the tokens of gateways.
 GATEWAY: Final = "-gateway"
-"""Stands in the place of the module in the tokens of gateways."""
+# The type of a service whose server was not asked.
 UNKNOWN_TYPE: Final = "*"
-"""The type of a service whose server was not asked."""
 _UNKNOWN: Final = "-"
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 _RANK_MAX: Final = 999

@@ -59,10 +59,10 @@ _NEEDS: Final = Needs(
 # Each question has ``"askers": ["arm"]``, the modules of the other site that ask.
 
 
+# The last chunk of the key at which gateways ask.
 GATEWAYS: Final = "-"
-"""The last chunk of the key at which gateways ask."""
+# The requests of ``bridge.params.rules`` without ``param.``.
 OPERATIONS: Final = ("get", "names", "set", "delete")
-"""The requests of ``bridge.params.rules`` without ``param.``."""
 
 
 class _Text(msgspec.Struct, omit_defaults=True, kw_only=True):

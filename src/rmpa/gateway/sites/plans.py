@@ -61,6 +61,9 @@ class SiteExports:
         rules: Decide what may cross.
         changed: ``(item, there)``: a module or a source is to be announced, or withdrawn; a module before its
             sources, and after them.
+
+    Attributes:
+        modules: The modules that offer something, with the number of exports.
     """
 
     def __init__(
@@ -70,17 +73,16 @@ class SiteExports:
         self._rules = rules
         self._changed = changed
         self._sources: dict[SourceKey, MeshSource] = {}
+        # By the site that it is for; empty: for all.
         self._entries: dict[SourceKey, dict[str, SiteExport]] = {}
-        """By the site that it is for; empty: for all."""
+        # The other sites that were ever there: a site that is away for a while keeps what is addressed to it.
         self._sites: dict[str, None] = {}
-        """The other sites that were ever there: a site that is away for a while keeps what is addressed to it."""
         self._addressed: set[SourceKey] = set()
         self._announced: set[SiteSource] = set()
         self._refused: dict[SourceKey, str] = {}
+        # Of what is refused: what may be offered once something else has gone.
         self._crowded: dict[SourceKey, None] = {}
-        """Of what is refused: what may be offered once something else has gone."""
         self.modules: dict[SiteModule, int] = {}
-        """The modules that offer something, with the number of exports."""
 
     @property
     def entries(self) -> list[SiteExport]:
@@ -212,8 +214,8 @@ def _problem(announced: SiteSource) -> str:
 # only the first ``limits.SITE_NAMES_WAITING_MAX`` wait.
 
 
+# Site, module, kind, node, name there.
 _Ident = tuple[str, str, SourceKind, str, str]
-"""Site, module, kind, node, name there."""
 _Name = tuple[SourceKind, str]
 
 
@@ -231,8 +233,8 @@ class SiteImports:
         self._changed = changed
         self._runs: dict[_Ident, list[SiteSource]] = {}
         self._shown: dict[_Ident, SiteImport] = {}
+        # Why it is not shown, and the name that it waits for.
         self._hidden: dict[_Ident, tuple[str, _Name | None]] = {}
-        """Why it is not shown, and the name that it waits for."""
         self._holders: dict[_Name, dict[_Ident, SiteImport]] = {}
         self._waiting: dict[_Name, dict[_Ident, None]] = {}
         self._own: dict[_Name, list[MeshSource]] = {}

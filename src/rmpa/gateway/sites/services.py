@@ -53,10 +53,10 @@ _DESCRIBE_TIMEOUT: Final = 10.0
 
 _NEEDS: Final = Needs((Access.CALL,), "the service, of the site", key="rmpa/1/<site>/<module>/s/**")
 _STATUS: Final = "actionlib_msgs/GoalStatusArray"
+# The parameter of a query for the type.
 DESCRIPTION: Final = "description"
-"""The parameter of a query for the type."""
+# The md5 sum in the attachment of a call whose client has not asked for the type.
 NO_MD5: Final = "0" * 32
-"""The md5 sum in the attachment of a call whose client has not asked for the type."""
 _MD5_LENGTH: Final = 32
 
 
@@ -282,14 +282,16 @@ class SiteServices:
 
     Args:
         context: What is shared with topics and parameters.
+
+    Attributes:
+        waiting: Bytes of the requests of other sites that are under way here.
     """
 
     def __init__(self, context: SiteContext) -> None:
         self.context = context
         self.waiting = 0
-        """Bytes of the requests of other sites that are under way here."""
+        # By module, service and the site that it is for.
         self._exported: dict[tuple[str, str, str], ExportedService] = {}
-        """By module, service and the site that it is for."""
         self.imported: dict[ForeignSource, ImportedService] = {}
         self._ending: list[Answering] = []
 
@@ -343,10 +345,10 @@ class SiteActions:
 
     def __init__(self, graph: AgentGraph) -> None:
         self._graph = graph
+        # By action the topics of goals and cancellations of this site, with the number of their exports.
         self._clients: dict[str, Counter[MeshSource]] = {}
-        """By action the topics of goals and cancellations of this site, with the number of their exports."""
+        # By action the topics of status of other sites.
         self._servers: dict[str, set[ForeignSource]] = {}
-        """By action the topics of status of other sites."""
         self._listening: dict[tuple[MeshSource, ForeignSource], TopicTap] = {}
 
     def client(self, source: MeshSource, *, there: bool) -> None:

@@ -36,6 +36,15 @@ class SiteNeighbour:
     Args:
         context: What is shared with topics and services.
         own: This gateway: its site, rank and run.
+
+    Attributes:
+        catalogue: What the other sites have.
+        history: Since when they are there or away.
+        exports: What this site offers.
+        imports: What is shown of the other sites.
+        leads: Whether this gateway is the one of its site that exports and imports.
+        on_leads: Called when that begins, and when it ends.
+        closing: Called when it closes.
     """
 
     # More than twelve fields: it is the one place that knows the machines and the parts.
@@ -44,21 +53,14 @@ class SiteNeighbour:
         self.context = context
         self.own = own
         self.catalogue = SiteCatalogue(own.site, self._site_changed, context.counters)
-        """What the other sites have."""
         self.history = SiteHistory(time.monotonic)
-        """Since when they are there or away."""
         self.exports = SiteExports(own.site, context.rules, self._own_changed)
-        """What this site offers."""
         self.imports = SiteImports(context.rules, self._import_changed)
-        """What is shown of the other sites."""
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
         self.leads = False
-        """Whether this gateway is the one of its site that exports and imports."""
         self.on_leads: Callable[[bool], None] = lambda _: None
-        """Called when that begins, and when it ends."""
         self.closing: list[Callable[[], Awaitable[None]]] = [self.topics.close, self.services.close]
-        """Called when it closes."""
         self._actions = SiteActions(context.graph)
         self._leader = Leader(own, limits.LEADER_PATIENCE, time.monotonic())
         self._sites: tuple[str, ...] = ()

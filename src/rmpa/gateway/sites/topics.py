@@ -56,8 +56,8 @@ _IDLE_CHECK: Final = 1.0
 # Seconds between two such questions at most: the pause doubles while no message comes.
 _IDLE_CHECK_MAX: Final = 60.0
 
+# What an error begins with that a rule causes: asking again is of no use.
 REFUSED: Final = "refused: "
-"""What an error begins with that a rule causes: asking again is of no use."""
 _HEADER_NEEDS: Final = Needs((Access.SUBSCRIBE,), "the topic, of the site", key="rmpa/1/<site>/<module>/d/t/**")
 _DEFINITION_NEEDS: Final = Needs(
     (), "the definition of a type whose md5 sum is known", key="rmpa/1/<site>/<module>/d/m/*"
@@ -123,13 +123,15 @@ class SiteDialect:
     Args:
         entry: The source.
         contract: The topic's contract.
+
+    Attributes:
+        run: By which the numbers of its messages are told apart from those of an earlier export.
     """
 
     def __init__(self, entry: SiteExport, contract: Contract) -> None:
         self._announced = entry.announced
         self._contract = contract
         self.run: Final = max(1, time.time_ns())
-        """By which the numbers of its messages are told apart from those of an earlier export."""
         self.payload: Callable[[memoryview], bytes] = bytes
         self.attachment: Callable[[int, int], bytes]
 
@@ -173,6 +175,9 @@ class ImportedTopic:
         entry: The source.
         part: Subscribes to its key.
         interrupted: What ``close`` returned before, if the same topic was there and went.
+
+    Attributes:
+        wanted: Whether its key is subscribed to for it.
     """
 
     # More than twelve fields: demand, header, and the counts of what was lost meanwhile change each other.
@@ -181,7 +186,6 @@ class ImportedTopic:
         now = time.monotonic()
         self.entry = entry
         self.wanted = False
-        """Whether its key is subscribed to for it."""
         self._part = part
         self._description: TopicDescription | None = None
         self._problem = ""
@@ -375,21 +379,25 @@ class ImportedTopic:
         self._ask()
 
 
+# The counts of a topic that went while nodes subscribed, so that what is lost meanwhile is counted.
 Interrupted = tuple[SequenceCounter, int]
-"""The counts of a topic that went while nodes subscribed, so that what is lost meanwhile is counted."""
+# Site, module, node and name there.
 _Ident = tuple[str, str, str, str]
-"""Site, module, node and name there."""
 
 
 @dataclass(slots=True)
 class _Subscription:
-    """The subscription to one topic of one module at another site, which its publishers share."""
+    """The subscription to one topic of one module at another site, which its publishers share.
+
+    Attributes:
+        topics: By node.
+        latched: The last latched message of nodes that are not wanted: they were told once, and would not be
+            again.
+    """
 
     declared: Declaration
     topics: dict[str, ImportedTopic] = field(default_factory=dict)
-    """By node."""
     latched: dict[str, tuple[bytes, int, MessageSource]] = field(default_factory=dict)
-    """The last latched message of nodes that are not wanted: they were told once, and would not be again."""
 
 
 class SiteTopics:
@@ -401,8 +409,8 @@ class SiteTopics:
 
     def __init__(self, context: SiteContext) -> None:
         self.context = context
+        # By module and topic, then by node and the site that it is for (empty: for all).
         self._exported: dict[tuple[str, str], dict[tuple[str, str], tuple[Export, SiteDialect]]] = {}
-        """By module and topic, then by node and the site that it is for (empty: for all)."""
         self._imported: dict[_Ident, ImportedTopic] = {}
         self._interrupted: dict[_Ident, Interrupted] = {}
         self._subscriptions: dict[str, _Subscription] = {}

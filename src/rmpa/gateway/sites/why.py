@@ -45,8 +45,8 @@ _T = TypeVar("_T")
 _NEEDS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, of the site", key="rmpa/1/<site>/-gateway/why"
 )
+# The words for what a source is.
 KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
-"""The words for what a source is."""
 _DEMAND_THERE: Final = "demand there"
 _NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
 _ROUTER: Final = "see access_control of the router, if it is a zenohd with rules of your own"

@@ -31,11 +31,11 @@ _MESSAGES: Final = (
     *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
     *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
 )
+# The keys of sites; ``**`` alone fits no chunk that begins with ``@``, as the caches of latched topics do.
 _SITES: Final = ("rmpa/1/**", "rmpa/1/**/@adv/**")
-"""The keys of sites; ``**`` alone fits no chunk that begins with ``@``, as the caches of latched topics do."""
 _ALL: Final = ("**", "**/@adv/**", "@ros2_lv/**")
+# Where zenohd listens if the settings name no endpoint.
 _LISTEN: Final = ("tls/0.0.0.0:7447",)
-"""Where zenohd listens if the settings name no endpoint."""
 _HEAD: Final = """\
 // For zenohd 1.10 or later; made by rmpa gateway zenoh-config from [gateway] and [trust].
 // Both sides show a certificate of the mesh. zenohd reads this file and the certificates once, at its start: start

@@ -50,8 +50,8 @@ _RECONNECT_MAX: Final = 2.0
 # Factor between the waits of two attempts.
 _RECONNECT_GROWTH: Final = 1.5
 
+# Protocols of endpoints that are encrypted, and that certificates are checked at.
 _ENCRYPTED: Final = ("tls", "quic")
-"""Protocols of endpoints that are encrypted, and that certificates are checked at."""
 _INSECURE: Final = "or say --insecure, and every program that reaches it may read and write everything"
 
 
@@ -404,6 +404,9 @@ class PendingGet:
     Args:
         done: Resolved in the event loop with all answers, as soon as there are too many.
         arrivals: Counts answers that are dropped, and calls functions in the event loop.
+
+    Attributes:
+        unfinished: Whether it was resolved because there were too many answers, and more may come.
     """
 
     def __init__(self, done: asyncio.Future[list[ZenohReply]], arrivals: Arrivals) -> None:
@@ -413,7 +416,6 @@ class PendingGet:
         self._replies: list[ZenohReply] = []
         self._bytes = 0
         self.unfinished = False
-        """Whether it was resolved because there were too many answers, and more may come."""
 
     def add(self, reply: Any) -> None:
         """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""

@@ -63,6 +63,9 @@ class BoundedQueue(Generic[_T]):
     Args:
         messages: Items that wait at most.
         size: Bytes that wait at most.
+
+    Attributes:
+        dropped: Items that found no room.
     """
 
     def __init__(self, messages: int, size: int) -> None:
@@ -71,7 +74,6 @@ class BoundedQueue(Generic[_T]):
         self._items: deque[tuple[_T, int]] = deque()
         self._bytes = 0
         self.dropped = 0
-        """Items that found no room."""
 
     def _push(self, item: _T, size: int, besides: int = 0) -> Sequence[_T]:
         """Queue an item; return those that were dropped. ``besides``: items that count, and wait elsewhere."""
@@ -177,22 +179,24 @@ class Arrivals:
 
     Args:
         loop: The event loop that everything is delivered in.
+
+    Attributes:
+        refused: What was dropped or refused, by its reason; guarded by ``lock``.
+        discarded: What was dropped, with the function that is told; guarded by ``lock``.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self.lock = threading.Lock()
         self.refused: Counter[str] = Counter()
-        """What was dropped or refused, by its reason; guarded by ``lock``."""
         self.discarded: deque[tuple[Callable[..., None], object]] = deque()
-        """What was dropped, with the function that is told; guarded by ``lock``."""
         self._ready: deque[ArrivalQueue[object]] = deque()
         self._woken = False
         self._closed = False
         self._window_end = 0.0
         self._in_window = 0
+        # What waits in memory for Zenoh to take it; guarded by ``lock``.
         self._answers = self._answer_bytes = 0
-        """What waits in memory for Zenoh to take it; guarded by ``lock``."""
 
     def call(self, function: Callable[[], None]) -> None:
         """Call a function in the loop, from any thread."""
@@ -305,6 +309,9 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         key: Its key.
         qos: Its bounds.
         undeclare: Called in the event loop once nothing of it is sent any more.
+
+    Attributes:
+        handle: Zenoh's publisher; nothing is sent before it is declared.
     """
 
     def __init__(self, lane: SendingLane, key: str, qos: ZenohQos, undeclare: Callable[[], None]) -> None:
@@ -313,7 +320,6 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         self.key: Final = key
         self._undeclare = undeclare
         self.handle: Any = None
-        """Zenoh's publisher; nothing is sent before it is declared."""
         self._taken = 0
         self._scheduled = False
         self._flush_timer: asyncio.TimerHandle | None = None
@@ -409,13 +415,15 @@ class SendingLane:
         loop: The event loop that the publishers belong to.
         name: The thread's name.
         failures: The exceptions of Zenoh's ``put``.
+
+    Attributes:
+        changed: Guards the queues of all publishers of this lane.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, name: str, failures: tuple[type[Exception], ...]) -> None:
         self.loop: Final = loop
         self._failures = failures
         self.changed: Final = threading.Condition(threading.Lock())
-        """Guards the queues of all publishers of this lane."""
         self._ready: deque[QueuedPublisher] = deque()
         self._stopped = False
         self._failed = False
