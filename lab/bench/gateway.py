@@ -377,7 +377,7 @@ def _idle(run: _Run) -> None:
 def _conversion(run: _Run) -> None:
     """In this process: there and back, each call timed by processor time."""
     from rmpa.gateway.ros2.conversion import Conversion
-    from rmpa.gateway.ros2.mapping import TypeMapping
+    from rmpa.gateway.ros2.pairs import TypeMapping
     from rmpa.gateway.ros2.types import Ros2Types
     from rmpa.ros.types.messages import MessageType
 

@@ -20,9 +20,8 @@ from rmpa.gateway.ros2.action_messages import (
 )
 from rmpa.gateway.ros2.actions import GoalsToRos1
 from rmpa.gateway.ros2.conversion import ActionPair
-from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.shown_action import GoalsToRos2
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
 

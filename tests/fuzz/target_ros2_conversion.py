@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError
-from rmpa.gateway.ros2.mapping import TypeMapping
+from rmpa.gateway.ros2.pairs import TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.messages import MessageType
 

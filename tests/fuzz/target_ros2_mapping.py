@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from rmpa.core.errors import ConfigError
-from rmpa.gateway.ros2.mapping import TypeMapping
+from rmpa.gateway.ros2.pairs import TypeMapping
 
 SEEDS: list[bytes] = [
     b"",

@@ -8,10 +8,9 @@ from rosbags.typesys.base import TypesysError
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
-from rmpa.gateway.ros2.pairs import Ros2Pairs, derive_service, described_types
+from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping, derive_service, described_types
 from rmpa.gateway.ros2.services import ServicePair
-from rmpa.gateway.ros2.types import Ros2Types, parse_type_response
+from rmpa.gateway.ros2.types import Ros2Types, TypePair, parse_type_response
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.gateway.sites.answers import WhyQuestion, parse_ways
 from rmpa.gateway.sites.keys import TopicHeader
-from rmpa.gateway.sites.why import WhyQuestion, parse_ways
 from rmpa.observe.peer_info import OK, Check
 from rmpa.observe.why.diagnosis import Diagnosis
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import PeerRefused
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

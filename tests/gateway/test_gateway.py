@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping
 
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import Neighbour
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.rules import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
 
 __all__ = ["pytest_asyncio_loop_factories", "settings"]

@@ -8,8 +8,7 @@ from rmpa.config.peer_rules import Access, Effect, PermissionRule, PolicySetting
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import ServiceSettings, Settings, TrustSettings
 from rmpa.core.counters import Counters
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.rules import CrossingDecision, CrossingRules
+from rmpa.gateway.rules import CrossingDecision, CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.trust.permissions import Permissions
 
 T = SourceKind.TOPIC

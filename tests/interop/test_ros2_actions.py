@@ -10,8 +10,7 @@ import pytest
 from lab.bed.gateways import ROUTER_PORT
 from lab.bed.processes import eventually
 from rmpa.gateway.ros2.conversion import ActionPair
-from rmpa.gateway.ros2.mapping import TypePair
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks
 from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall

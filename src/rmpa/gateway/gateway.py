@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import Neighbour
+    from rmpa.gateway.rules import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
 
 # Seconds until a gateway without keys looks again whether an agent of a secured mesh runs beside it.

@@ -22,7 +22,7 @@ from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic, TopicTap
-from rmpa.gateway.neighbour import MeshSource, SourceKind
+from rmpa.gateway.rules import MeshSource, SourceKind
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.loop import yielding_to_data
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import ForeignSource, SourceKey
+    from rmpa.gateway.rules import ForeignSource, SourceKey
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription, TopicDescription

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.neighbour import MeshSource, ZenohQos
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.rules import MeshSource
+    from rmpa.gateway.zenoh.config import ZenohQos
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import TopicDescription

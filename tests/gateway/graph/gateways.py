@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from rmpa.agent.agent import Agent
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.own_graph import AgentGraph
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 from rmpa.ros.wire.tcpros import TopicDescription
 from tests.agent.test_agent import until
 

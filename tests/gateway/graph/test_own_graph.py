@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.rules import SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.conftest import settings
 from tests.agent.test_agent import Sink, node, until

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
 from rmpa.gateway.foreign import foreign_origin
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
+from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.agent.conftest import settings
 from tests.agent.test_agent import Sink, node, until

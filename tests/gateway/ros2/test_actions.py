@@ -27,9 +27,9 @@ from rmpa.gateway.ros2.action_messages import (
 )
 from rmpa.gateway.ros2.actions import GoalsToRos1
 from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
-from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
+from rmpa.gateway.ros2.pairs import TypeMapping
 from rmpa.gateway.ros2.shown_action import GoalsToRos2
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
-from rmpa.gateway.ros2.mapping import TypeMapping
+from rmpa.gateway.ros2.pairs import TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType

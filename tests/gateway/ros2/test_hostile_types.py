@@ -17,8 +17,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2 import transcoder
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.graph import Ros2Graph
-from rmpa.gateway.ros2.mapping import TypeMapping
-from rmpa.gateway.ros2.pairs import Ros2Pairs
+from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping
 from rmpa.gateway.ros2.transcoder import LayoutPart, Transcoder
 from rmpa.gateway.ros2.types import Ros2Types, parse_type_response
 from rmpa.ros.types.messages import MessageType

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
+from rmpa.gateway.ros2.pairs import TypeMapping
+from rmpa.gateway.ros2.types import TypePair
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.mapping import TypeMapping
-from rmpa.gateway.ros2.pairs import Ros2Pairs, derive_ros1
+from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping, derive_ros1
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.messages import MessageType

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
+from rmpa.gateway.ros2.pairs import TypeMapping
 from rmpa.gateway.ros2.services import ServicePair, ros1_without_use, ros2_without_use, type_by_name
-from rmpa.gateway.ros2.types import Ros2Types
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.installed import ServiceType, known_services
 
 MAPPING = TypeMapping()

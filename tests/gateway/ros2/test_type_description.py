@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.mapping import TypeMapping
-from rmpa.gateway.ros2.pairs import Ros2Pairs
+from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types, parse_type_response, type_request
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.ros2.type_descriptions import respond, response

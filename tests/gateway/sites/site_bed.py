@@ -13,8 +13,7 @@ from rmpa.config.peer_rules import ServiceRule
 from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
-from rmpa.gateway.neighbour import MeshSource, SourceKind
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.rules import CrossingRules, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteGateway
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext

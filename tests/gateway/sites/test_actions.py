@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.services import SiteActions
 
 GOAL, CANCEL = "arm_msgs/MoveActionGoal", "actionlib_msgs/GoalID"

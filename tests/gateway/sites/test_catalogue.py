@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.catalogue import CatalogueChange, SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 

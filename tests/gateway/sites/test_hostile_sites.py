@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.rules import CrossingRules, SourceKind
+from rmpa.gateway.sites.answers import parse_ways
 from rmpa.gateway.sites.catalogue import SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import (
     AttachmentReader,
@@ -28,7 +28,6 @@ from rmpa.gateway.sites.keys import (
 )
 from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
 from rmpa.gateway.sites.plans import SiteImports
-from rmpa.gateway.sites.why import parse_ways
 
 if TYPE_CHECKING:
     from collections.abc import Callable

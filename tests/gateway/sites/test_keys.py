@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.keys import (
     SiteGateway,
     SiteModule,

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource, parse_token
 from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
 

@@ -10,8 +10,7 @@ import pytest
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteExport, SiteImport
 from rmpa.gateway.sites.services import SiteServices, asked_type, read_description

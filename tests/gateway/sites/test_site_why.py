@@ -15,12 +15,11 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
-from rmpa.gateway.sites.answers import SiteAnswers
+from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.sites.answers import SiteAnswers, SiteWhy, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.plans import SiteImport
-from rmpa.gateway.sites.why import SiteWhy, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check
 from rmpa.observe.why.diagnosis import Diagnosis

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ZenohPriority
 from rmpa.gateway.sites.keys import SequenceCounter, TopicHeader
 from rmpa.gateway.sites.topics import qos_of
 from rmpa.gateway.topics import TopicLimits
+from rmpa.gateway.zenoh.config import ZenohPriority
 from rmpa.ros.wire.tcpros import TopicDescription
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"

@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.neighbour import ZenohPriority, ZenohQos
-from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode
+from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode, ZenohPriority, ZenohQos
 from rmpa.gateway.zenoh.session import open_session
 from tests.gateway.zenoh_bed import bed, free_port, until
 
 if TYPE_CHECKING:
-    from rmpa.gateway.neighbour import ZenohSample
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.config import ArrivedQuery, ZenohSample
 
 pytest.importorskip("zenoh")
 
@@ -219,7 +217,7 @@ async def test_the_process_ends_after_close() -> None:
     program = """
 import asyncio
 from tests.gateway.zenoh_bed import bed
-from rmpa.gateway.neighbour import ZenohQos
+from rmpa.gateway.zenoh.config import ZenohQos
 async def main():
     async with bed() as net:
         session = await net.session()

@@ -14,10 +14,9 @@ import pytest
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
-from rmpa.gateway.neighbour import ZenohQos
 from rmpa.gateway.zenoh import access as trust
 from rmpa.gateway.zenoh.access import open_trusted_session, revoked_modules, zenohd_config
-from rmpa.gateway.zenoh.config import ZenohConfig
+from rmpa.gateway.zenoh.config import ZenohConfig, ZenohQos
 from rmpa.gateway.zenoh.session import open_session
 from rmpa.trust.certificates import DenyList
 from tests.gateway.zenoh_bed import until

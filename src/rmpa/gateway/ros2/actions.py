@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind, ZenohQos
 from rmpa.gateway.ros2 import action_messages as messages
 from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, action_name
@@ -18,13 +17,15 @@ from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability,
 from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
 from rmpa.gateway.ros2.shown_action import KINDS, Goals, JoinedAction, ShownAction, find_types
+from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.zenoh.config import ZenohQos
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.services import Ros2Context
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer

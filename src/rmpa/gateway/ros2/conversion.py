@@ -27,8 +27,7 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.gateway.ros2.mapping import FieldPaths, TypePair
-    from rmpa.gateway.ros2.types import Ros2Types
+    from rmpa.gateway.ros2.types import FieldPaths, Ros2Types, TypePair
     from rmpa.ros.types.definitions import Field
     from rmpa.ros.wire.tcpros import Buffer
 

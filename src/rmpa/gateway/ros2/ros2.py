@@ -11,13 +11,12 @@ from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
 from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.rules import CrossingRules, SourceKind
 from rmpa.observe.operations import INFO, REPORT, WHY
 from rmpa.observe.peer_info import FAIL, OK, WARN, Check, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
@@ -29,9 +28,9 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
-    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.topics import Export
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.observe.operations import SiteAnswerer

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.policy import Needs
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering, OwnedTasks
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
+from rmpa.gateway.foreign import Answering, OwnedTasks
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment, Ros2Qos, data_key
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, Ros2TypeAsker, valid_name
-from rmpa.gateway.ros2.mapping import TypeMapping, TypePair
-from rmpa.gateway.ros2.pairs import derive_service
-from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types
-from rmpa.gateway.rules import CrossingRules
+from rmpa.gateway.ros2.pairs import TypeMapping, derive_service
+from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types, TypePair
+from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
 from rmpa.ros.types.definitions import known_types
 from rmpa.ros.types.find import find_service_type
 
@@ -28,10 +26,10 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
     from rmpa.gateway.foreign import ProxiedService
-    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.types.installed import ServiceType

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2 import action_messages as messages
 from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
 from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, NoConversion
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Qos
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.pairs import derive_ros1
+from rmpa.gateway.ros2.types import TypePair
+from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.foreign import ProxiedTopic, TopicTap
-    from rmpa.gateway.neighbour import MeshSource
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.session import Declaration
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import Buffer, TopicDescription

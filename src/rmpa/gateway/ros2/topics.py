@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ForeignSource, SourceKind
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
 from rmpa.gateway.ros2.format import (
     GID_BYTES,
@@ -24,6 +23,7 @@ from rmpa.gateway.ros2.format import (
 from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
 from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
+from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.topics import Export
 from rmpa.ros.types.find import find_message_type, type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.gateway.foreign import ProxiedTopic
-    from rmpa.gateway.neighbour import MeshSource, ZenohQos, ZenohSample
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
-    from rmpa.gateway.rules import CrossingDecision
+    from rmpa.gateway.rules import CrossingDecision, MeshSource
+    from rmpa.gateway.zenoh.config import ZenohQos, ZenohSample
     from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer

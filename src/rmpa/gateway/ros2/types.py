@@ -6,7 +6,7 @@ import functools
 import re
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
@@ -25,6 +25,28 @@ if TYPE_CHECKING:
     from rmpa.ros.types.definitions import Specification
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import Buffer
+
+
+# A field of ROS 1 to one of ROS 2, each a path with dots.
+FieldPaths = dict[str, str]
+
+
+class TypePair(NamedTuple):
+    """A type of ROS 2 for one of ROS 1.
+
+    Args:
+        name: ``package/msg/Name``, ``package/srv/Name`` or ``package/action/Name``.
+        paths: The fields by path, if a rule lists them, else they go by name. Of a message they are under ``""``, of
+            a service under ``request`` and ``response``, of an action under ``goal``, ``result`` and ``feedback``.
+    """
+
+    name: str
+    paths: Mapping[str, FieldPaths] = {}
+
+    @property
+    def fields(self) -> FieldPaths | None:
+        """The fields of a message, if a rule lists them."""
+        return self.paths.get("")
 
 
 class Ros2Sequences:

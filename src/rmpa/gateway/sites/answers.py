@@ -1,30 +1,428 @@
-"""The neighbour "other sites" with all that answers for it: ``rmpa site``, ``rmpa param`` and ``rmpa why``."""
+"""The neighbour "other sites" with all that answers for it: ``rmpa site``, ``rmpa param`` and ``rmpa why``.
+
+What the gateways of two sites tell each other for ``rmpa why``, and the stages at one of them.
+
+The importing gateway asks the exporting one (``get`` on ``rmpa/1/<site>/-gateway/why``), whose stages it shows as
+they are told, between those of the site and its own::
+
+    site ─ source there ─ rule there ─ demand there ─ sent ─ rule here ─ shown ─ header (md5) ─ demand here ─ arrived
+"""
 
 from __future__ import annotations
 
+import asyncio
 import secrets
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
 
 from rmpa.bridge.context import BridgeContext
+from rmpa.bridge.policy import Needs
+from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
-from rmpa.core.identity import peer_name_problem
+from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.gateway import limits
-from rmpa.gateway.rules import CrossingRules
-from rmpa.gateway.sites.keys import SiteGateway
+from rmpa.gateway.rules import ACCESS, CrossingRules, SourceKind
+from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway
 from rmpa.gateway.sites.params import SiteParams
+from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import SiteContext
-from rmpa.gateway.sites.why import KINDS, SiteWhy
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
-from rmpa.observe.peer_info import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.peer_info import (
+    FAIL,
+    OK,
+    UNKNOWN,
+    WARN,
+    Check,
+    SiteInfo,
+    SiteModuleInfo,
+    SiteSourceInfo,
+    SitesReport,
+)
+from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
+from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteModule, SiteSource
+    from rmpa.gateway.sites.plans import SiteExport, SiteImport
+    from rmpa.gateway.sites.topics import ImportedTopic
+    from rmpa.gateway.topics import Export
+    from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
+    from rmpa.ros.wire.tcpros import Buffer
+
+# Seconds for a question to another site's gateway.
+_SITE_ASK_TIMEOUT: Final = 5.0
+
+_T = TypeVar("_T")
+_NEEDS: Final = Needs(
+    (Access.SUBSCRIBE, Access.CALL), "the topic or service, of the site", key="rmpa/1/<site>/-gateway/why"
+)
+# The words for what a source is.
+KINDS: Final = {SourceKind.TOPIC: "topic", SourceKind.SERVICE: "service"}
+_DEMAND_THERE: Final = "demand there"
+_NO_DEMAND: Final = "that is no fault; to try it: rmpa topic echo"
+_ROUTER: Final = "see access_control of the router, if it is a zenohd with rules of your own"
+_RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway of {}, and run rmpa reload there"
+_PERMISSIONS: Final = (
+    "change [[permission]] in the rmpa.toml of the gateway of {} and of its modules, and reload them"
+)
+_SENT_LOSSES: Final = {
+    "dropped": "were dropped by its queue, for the way is slower than the topic",
+    "limited": "were left out by rate or size of the rule",
+}
+_ARRIVED_LOSSES: Final = {
+    "lost": "were lost between the gateways",
+    "mismatched": "have another md5 sum than their header",
+    "dropped": "were dropped here for slow subscribers",
+}
+
+
+class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
+    """What one gateway asks another.
+
+    Attributes:
+        site: The site that asks.
+        name: A topic or service, by its name in its module.
+        module: Of this module alone; empty for all.
+        service: Whether a service is meant.
+    """
+
+    site: str
+    name: str
+    module: str = ""
+    service: bool = False
+
+    @classmethod
+    def parse(cls, data: Buffer) -> WhyQuestion:
+        """Read one.
+
+        Raises:
+            RemoteProtocolError: It is none.
+        """
+        found = _parse(data, cls, limits.KEY_MAX)
+        if not is_global_name(found.name):
+            raise RemoteProtocolError(f"{found.name[:80]!r} is not a topic, nor a service")
+        return found
+
+
+def parse_ways(data: Buffer) -> tuple[Diagnosis, ...]:
+    """The answer of the leading gateway of a site, its texts without control characters: ways out of that site.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    ways = _parse(data, tuple[Diagnosis, ...], limits.SITE_WHY_MAX)
+    return tuple(msgspec.structs.replace(way, stages=tuple(map(_printable, way.stages))) for way in ways)
+
+
+def _parse(data: Buffer, kind: type[_T], most: int) -> _T:
+    if len(data) > most:
+        raise RemoteProtocolError(f"a text of rmpa why has {len(data)} bytes, more than {most}")
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RemoteProtocolError(f"not a text of rmpa why: {printable(str(error))}") from None
+
+
+def _printable(stage: Check) -> Check:
+    return Check(printable(stage.name), stage.level, printable(stage.text), printable(stage.remedy))
+
+
+# The stages, from what a part of the neighbour reports of a topic or service.
+
+
+def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:
+    """The stages of a topic behind its rule at the exporting gateway.
+
+    Args:
+        site: Its site.
+        export: The topic.
+        asked: Whether another site asks, which knows whether it subscribes; else it is a fault that none does.
+    """
+    if not export.wanted:
+        text = f"no other site subscribes, as the gateway of {site} hears: nothing is sent"
+        return [Check(_DEMAND_THERE, WARN if asked else FAIL, text, _NO_DEMAND)]
+    waiting = f", {export.waiting} wait" if export.waiting else ""
+    text = f"the gateway of {site} has sent {export.messages} messages{waiting}"
+    lost = _lost(export, _SENT_LOSSES)
+    remedy = "rate and size of a [[gateway.rule]] say what may be left out; a contract says what goes first"
+    sent = Check(
+        "sent", OK if export.messages and not lost else WARN, "; ".join((text, *lost)), remedy if lost else ""
+    )
+    return [Check(_DEMAND_THERE, OK, "another site subscribes"), sent]
+
+
+def here_stages(entry: SiteImport, found: ImportedTopic | ImportedService | None) -> list[Check]:
+    """The stages of the importing site for what is shown there; ``found`` is ``None`` if it does not lead."""
+    source, there, topic = entry.source, entry.announced.name, entry.source.kind is SourceKind.TOPIC
+    was = f" (its {there})" if source.name != there else ""
+    shown = f"it is {source.name} here{was}, at /rmpa/{source.site}/{source.module}{source.node}"
+    stages = [Check("rule here", OK, entry.why or "it may come in"), Check("shown", OK, shown)]
+    if found is None:
+        return stages
+    if found.problem:
+        name = "md5" if "md5" in found.problem else "header" if topic else "calls"
+        return [*stages, Check(name, FAIL if topic else WARN, found.problem, _ROUTER if name == "header" else "")]
+    if isinstance(found, ImportedService):
+        return [*stages, Check("calls", OK, f"{found.calls} calls from here, {found.failed} failed")]
+    if not found.wanted:
+        text = "no node of this site subscribes: it crosses once one does"
+        return [*stages, Check("demand here", FAIL, text, _NO_DEMAND)]
+    stages.append(Check("demand here", OK, "a node of this site subscribes"))
+    if not found.messages:
+        return [*stages, Check("arrived", WARN, "no message has come since then", "does its publisher publish?")]
+    lost = _lost(found, _ARRIVED_LOSSES)
+    text = f"{found.messages} messages have come, {found.rate():.1f} Hz"
+    return [*stages, Check("arrived", WARN if lost else OK, "; ".join((text, *lost)))]
+
+
+def _lost(topic: Export | ImportedTopic, losses: Mapping[str, str]) -> list[str]:
+    return [f"{getattr(topic, key)} {words}" for key, words in losses.items() if getattr(topic, key)]
+
+
+def _refused_stage(where: str, refused: str, site: str) -> Check:
+    """The stage of a source that may not cross.
+
+    Args:
+        where: ``here`` or ``there``.
+        refused: The rule or permission that decided, as text.
+        site: The site whose gateway has refused it.
+    """
+    if "[[permission]]" in refused or refused.startswith("the permissions"):
+        return Check(f"permission {where}", FAIL, refused, _PERMISSIONS.format(site))
+    return Check(f"rule {where}", FAIL, refused, _RULES.format(site))
+
+
+def _told(site: str, module: str, name: str, there: Diagnosis | None, refusal: str) -> tuple[Check, ...]:
+    """The stages of the exporting site, as its gateway tells them."""
+    if refusal:
+        return (Check("source there", UNKNOWN, f"the gateway of {site} does not tell: {refusal}"),)
+    if there is None:
+        whose = f"{module} at {site}" if module else f"a module at {site}"
+        text = f"no node of {whose} has {name}, as the gateway there sees it"
+        remedy = f"start it there; or the [bridge] or [services] of {whose} keeps it at home: `rmpa why {name}` there"
+        return (Check("source there", FAIL, text, remedy),)
+    return there.stages
+
+
+class SiteWhy:
+    """The ways of topics and services through this gateway.
+
+    Args:
+        sites: Its neighbour "other sites".
+    """
+
+    def __init__(self, sites: SiteNeighbour) -> None:
+        self._sites = sites
+        self._rules = sites.context.rules
+        self._site = sites.own.site
+        self._queryable = sites.context.session.queryable(_why_key(self._site), self._take, _NEEDS)
+        sites.closing.append(self.close)
+
+    async def close(self) -> None:
+        """Answer no more."""
+        self._queryable.close()
+
+    async def ways(
+        self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
+    ) -> list[Diagnosis]:
+        """The ways of a name to here from other sites, and from a module of this site to others.
+
+        Args:
+            name: A topic or service, by its name at the module that asks.
+            site: From this site alone; empty for all.
+            module: From this module of it alone; empty for all.
+            asker: The module that asks, whose own sources are told of too; empty for this machine's user.
+            service: Whether a service is meant.
+        """
+        known = site in self._sites.catalogue.sites or site in self._sites.history.away
+        if not self._sites.leads or (site and not known and not module):
+            return []  # a name that is no site's is a peer's
+        kinds = (SourceKind.SERVICE,) if service else tuple(ACCESS)
+
+        def meant(there: SiteSource) -> bool:
+            fits = site in ("", there.site) and module in ("", there.module.name)
+            return fits and there.kind in kinds
+
+        found = [(entry.announced, entry, "") for entry in self._sites.imports.entries if meant(entry.announced)]
+        # Its name there is asked for with its site alone.
+        shown = [each for each in found if name in (each[1].source.name, each[0].name if site else "")]
+        refused = [(there, None, why) for there, why in self._sites.imports.refusals() if meant(there)]
+        told = [
+            (there, entry, why)
+            for there, entry, why in (*shown, *(each for each in refused if each[0].name == name))
+            if self._rules.tells(asker, there.kind, entry.source.name if entry is not None else there.name)
+        ]
+        ways = list(await asyncio.gather(*(self._way(*each) for each in told)))
+        permitted = [kind for kind in kinds if self._rules.tells(asker, kind, name)]
+        if site and not ways and permitted:
+            ways.append(await self._no_way(name, site, module, permitted))
+        elif site and not ways:
+            denied = permission_there(self._sites.context.graph.name, asker, ACCESS[kinds[0]], name)
+            ways.append(self._diagnosis(name, f"{site}/{module}" if module else site, "", kinds[0], [denied]))
+        if site:
+            return ways
+        for away, had in self._sites.history.had(name) if permitted else ():
+            ways.append(await self._no_way(name, away, had, permitted))
+
+        def own(source: MeshSource) -> bool:
+            mine = source.module == asker and source.name == name if asker else source.here == name
+            return mine and source.kind in kinds
+
+        return [*ways, *(msgspec.structs.replace(way, name=name) for way in self._leaving(own))]
+
+    # --- what comes in ----------------------------------------------------------------------------------------------
+
+    async def _way(self, there: SiteSource, entry: SiteImport | None, refused: str) -> Diagnosis:
+        site, module = there.site, there.module.name
+        ways, refusal = await self._ask(site, there.name, module)
+        mine = KINDS[there.kind], module
+        told = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
+        stages = [self._site_stage(site), *_told(site, module, there.name, told, refusal)]
+        topic = self._sites.topics.imported(entry) if entry is not None else None
+        if entry is None:
+            here = [_refused_stage("here", refused, self._site)]
+        else:
+            here = here_stages(entry, topic or self._sites.services.imported.get(entry.source))
+        unheard = next((at for at, stage in enumerate(stages) if stage.name == _DEMAND_THERE), None)
+        if unheard is not None and stages[unheard].level is not OK and topic is not None and topic.wanted:
+            text = f"a node here subscribes, and the gateway of {site} hears of none: a router keeps it back"
+            stages[unheard] = Check("router", FAIL, text, _ROUTER)
+        name = entry.source.name if entry is not None else there.name
+        return self._diagnosis(name, f"{site}/{module}", there.node, there.kind, [*stages, *here])
+
+    async def _no_way(self, name: str, site: str, module: str, kinds: list[SourceKind]) -> Diagnosis:
+        """A site is named that has nothing of that name, as it is seen here; of kinds that the asker may have."""
+        kind = SourceKind.TOPIC if SourceKind.TOPIC in kinds else SourceKind.SERVICE
+        ways, refusal = await self._ask(site, name, module, service=kind is SourceKind.SERVICE)
+        there = next((way for way in ways if way.kind in [KINDS[each] for each in kinds]), None)
+        stages = [self._site_stage(site), *_told(site, module, name, there, refusal)]
+        if there is not None and there.flows:
+            text = f"site {site} offers it, and the offer has not come here"
+            remedy = "in a moment? else routers that do not reach each other, or too many sources: `rmpa site info`"
+            stages.append(Check("offer", FAIL, text, remedy))
+        elif refusal:
+            text, remedy = f"site {site} announces no {name}", f"`rmpa why {name}` there tells more"
+            stages.append(Check("offer", FAIL, text, remedy))
+        node = there.node if there is not None else ""
+        return self._diagnosis(name, f"{site}/{module}" if module else site, node, kind, stages)
+
+    def _site_stage(self, site: str) -> Check:
+        gateways, history = len(self._sites.catalogue.gateways(site)), self._sites.history
+        if site not in self._sites.catalogue.sites:
+            if site in history.away:
+                text = f"site {site} is unreachable since {history.since_ago(site) or 0:.0f} s"
+                remedy = "is its gateway on, and its way to the router? `rmpa site list` there"
+                return Check("site", FAIL, text, remedy)
+            text = f"no gateway of a site {site} is at the routers that this site's gateway reaches"
+            return Check("site", FAIL, text, "`rmpa site list` shows the sites; gateway.connect of both must meet")
+        if not gateways:
+            text = f"there is no gateway at site {site} any more, and what it announced is about to go"
+            return Check("site", FAIL, text, f"start `rmpa gateway --site {site}` there")
+        return Check("site", OK, f"site {site} is joined by {gateways} gateway{'s' if gateways > 1 else ''}")
+
+    def _diagnosis(self, name: str, peer: str, node: str, kind: SourceKind, stages: list[Check]) -> Diagnosis:
+        to = f"site {self._site}"
+        return Diagnosis.of(until_failure(stages), kind=KINDS[kind], name=name, peer=peer, to=to, node=node)
+
+    # --- what goes out ----------------------------------------------------------------------------------------------
+
+    def _leaving(self, meant: Callable[[MeshSource], bool], asking: str = "") -> Iterator[Diagnosis]:
+        """The ways of sources of this site to the one that is ``asking``; empty: for its own module, to all."""
+        for source, entries in self._sites.exports.offered():
+            if not meant(source):
+                continue
+            if not asking:
+                yield from (self._way_out(source, "", entry, "") for entry in entries)
+                continue
+            entry = next((each for each in entries if each.announced.to in ("", asking)), None)
+            refused = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind])
+            if entry is not None or refused:
+                yield self._way_out(source, asking, entry, refused)
+        for source, why in self._sites.exports.refusals():
+            if meant(source):
+                yield self._way_out(source, asking, None, why)
+
+    def _way_out(self, source: MeshSource, asking: str, entry: SiteExport | None, refused: str) -> Diagnosis:
+        where, to = "there" if asking else "here", entry.announced.to if entry is not None else ""
+        text = f"{source.node} of {source.module} at {self._site} has it: {source.type}"
+        stages = [Check(f"source {where}", OK, text)]
+        if refused or entry is None:
+            stages.append(_refused_stage(where, refused, self._site))
+        else:
+            rules = self._rules
+            rule = rules.outgoing_to(to, source.module, source.name) if to else rules.outgoing(source)
+            stages.append(Check(f"rule {where}", OK, rule.why))
+            if (export := self._sites.topics.exported(entry)) is not None:
+                if export.problem:
+                    remedy = f"`rmpa why {source.name}` at {self._site}"
+                    stages.append(Check(f"publisher {where}", FAIL, export.problem, remedy))
+                stages += sent_stages(self._site, export, asked=bool(asking))
+        return Diagnosis.of(
+            until_failure(stages),
+            kind=KINDS[source.kind],
+            name=source.name if asking else source.here,
+            peer=source.module,
+            to=f"site {asking or to}" if asking or to else "other sites",
+            node=source.node,
+        )
+
+    # --- the other gateway --------------------------------------------------------------------------------------
+
+    async def _ask(
+        self, site: str, name: str, module: str, *, service: bool = False
+    ) -> tuple[tuple[Diagnosis, ...], str]:
+        """What the gateway of a site tells, and why it does not."""
+        if site not in self._sites.catalogue.sites:
+            return (), "it is not there"
+        question = msgspec.json.encode(WhyQuestion(site=self._site, name=name, module=module, service=service))
+        replies = await self._sites.context.session.get(
+            _why_key(site), question, timeout=_SITE_ASK_TIMEOUT, all_complete=True
+        )
+        problem = "it does not answer; is it of an earlier release?"
+        for reply in replies:
+            try:
+                if reply.ok:
+                    return parse_ways(reply.payload), ""
+                problem = reply.payload.decode(errors="replace")
+            except RemoteProtocolError as error:
+                problem = str(error)
+        return (), problem
+
+    def _take(self, query: ArrivedQuery) -> None:
+        if not self._sites.leads:
+            query.finish()
+            return
+        try:
+            question = WhyQuestion.parse(query.payload)
+        except RemoteProtocolError as error:
+            query.reply_error(str(error))
+            return
+        kinds = (SourceKind.SERVICE,) if question.service else tuple(ACCESS)
+        denials = {kind: self._rules.denial(question.site, question.name, ACCESS[kind]) for kind in kinds}
+
+        def meant(source: MeshSource) -> bool:
+            named = source.name == question.name and question.module in ("", source.module)
+            return named and not denials.get(source.kind, "")
+
+        ways = list(self._leaving(meant, question.site))
+        if denial := denials[kinds[0]]:
+            # Whether or not it is there: that is not told.
+            stages = [_refused_stage("there", denial, self._site)]
+            ways.append(self._diagnosis(question.name, question.module, "", kinds[0], stages))
+        query.reply(query.key, msgspec.json.encode(ways))
+        query.finish()
+
+
+def _why_key(site: str) -> str:
+    return f"{ROOT}/{site}/{GATEWAY}/why"
 
 
 class SiteAnswers:

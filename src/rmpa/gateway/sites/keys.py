@@ -28,7 +28,7 @@ import msgspec
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_global_name, is_type_name, peer_name_problem
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.rules import SourceKind
 from rmpa.ros.wire.tcpros import TopicDescription, printable
 
 if TYPE_CHECKING:

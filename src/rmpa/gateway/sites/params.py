@@ -19,7 +19,7 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering
+from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, MessageSource
 from rmpa.gateway.sites.services import NO_MD5, caller
 from rmpa.ros.limits import PARAM_DEPTH_MAX

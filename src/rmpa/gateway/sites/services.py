@@ -26,16 +26,17 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RemoteProtocolError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering, OwnedTasks
-from rmpa.gateway.neighbour import SourceKind, ZenohPriority
+from rmpa.gateway.foreign import Answering, OwnedTasks
+from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key
+from rmpa.gateway.zenoh.config import ZenohPriority
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 if TYPE_CHECKING:
     from rmpa.gateway.foreign import TopicTap
-    from rmpa.gateway.neighbour import ForeignSource, MeshSource
     from rmpa.gateway.own_graph import AgentGraph
+    from rmpa.gateway.rules import ForeignSource, MeshSource
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.counters import earliest, logged_failure
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import SourceKind
+from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue, SiteHistory
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, token_keys
 from rmpa.gateway.sites.plans import SiteExports, SiteImports
@@ -19,7 +19,7 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext

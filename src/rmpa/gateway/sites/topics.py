@@ -16,10 +16,10 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.contract import Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.answering import Answering
-from rmpa.gateway.neighbour import ZenohPriority, ZenohQos
+from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
 from rmpa.gateway.topics import Export
+from rmpa.gateway.zenoh.config import ZenohPriority, ZenohQos
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -28,11 +28,10 @@ if TYPE_CHECKING:
     from rmpa.bridge.context import BridgeContext
     from rmpa.core.contract import Contract, Contracts
     from rmpa.core.counters import Counters
-    from rmpa.gateway.neighbour import ZenohSample
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.config import ArrivedQuery, ZenohSample
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.wire.tcpros import TopicDescription
 

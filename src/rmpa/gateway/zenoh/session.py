@@ -16,8 +16,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ZenohPriority, ZenohSample
-from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
+from rmpa.gateway.zenoh.config import (
+    ArrivedQuery,
+    PendingGet,
+    SerialWorker,
+    SocketTuning,
+    ZenohPriority,
+    ZenohSample,
+    content,
+)
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, keep_thread_state
 from rmpa.runtime.accept import in_thread
 
@@ -25,8 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.policy import Needs
-    from rmpa.gateway.neighbour import ZenohQos, ZenohReply
-    from rmpa.gateway.zenoh.config import ZenohConfig
+    from rmpa.gateway.zenoh.config import ZenohConfig, ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds between two looks at which connections Zenoh has, to bound what the kernel holds of new ones.

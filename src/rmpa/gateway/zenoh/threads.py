@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.neighbour import ZenohQos
+    from rmpa.gateway.zenoh.config import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 # Messages of one publisher that are sent in one turn, while others of its priority wait.

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.config.rules import GatewaySettings
-from rmpa.gateway.neighbour import ZenohQos
 from rmpa.gateway.ros2.action_messages import parse_outcome
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
@@ -22,9 +21,9 @@ from rmpa.gateway.ros2.format import (
     data_key,
     parse_token,
 )
-from rmpa.gateway.ros2.mapping import TypePair
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
-from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
+from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types, TypePair
+from rmpa.gateway.zenoh.config import ZenohQos
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph
@@ -34,7 +33,7 @@ from tests.gateway.ros2.type_descriptions import response
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.gateway.neighbour import MeshSource
+    from rmpa.gateway.rules import MeshSource
 
 JAZZY = Ros2Types("jazzy")
 TEST = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]

@@ -9,11 +9,11 @@ import pytest
 
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.gateway.neighbour import SourceKind
 from rmpa.gateway.ros2 import services
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
+from rmpa.gateway.rules import SourceKind
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
 from tests.gateway.memory_zenoh import MemoryQuery, MemorySession, eventually

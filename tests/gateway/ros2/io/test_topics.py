@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.config.rules import Crossing, CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.gateway import limits
-from rmpa.gateway.neighbour import ZenohQos
 from rmpa.gateway.ros2.conversion import Conversion
 from rmpa.gateway.ros2.format import (
     NO_HASH,
@@ -18,6 +17,7 @@ from rmpa.gateway.ros2.format import (
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
+from rmpa.gateway.zenoh.config import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
@@ -26,7 +26,7 @@ from tests.gateway.ros2.type_descriptions import response
 if TYPE_CHECKING:
     import pytest
 
-    from rmpa.gateway.neighbour import ZenohSample
+    from rmpa.gateway.zenoh.config import ZenohSample
 
 LATCHED = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id"
