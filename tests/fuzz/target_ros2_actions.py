@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
-from rmpa.gateway.ros2.action_messages import (
+from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.goals import (
     GoalId,
     GoalState,
+    GoalsToRos1,
+    GoalsToRos2,
     Ros1Status,
     Ros2Status,
     cancel_request,
@@ -18,9 +21,6 @@ from rmpa.gateway.ros2.action_messages import (
     ros2_states,
     with_uuid,
 )
-from rmpa.gateway.ros2.actions import GoalsToRos1
-from rmpa.gateway.ros2.conversion import ActionPair
-from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
@@ -32,7 +32,7 @@ _JAZZY = Ros2Types("jazzy")
 _PARTS = [MessageType(f"actionlib/Test{part}") for part in ("Goal", "Result", "Feedback")]
 _PAIR = ActionPair(_PARTS, TypePair("actionlib/action/Test"), _JAZZY)
 _UUID = bytes(range(16))
-_GOAL = GoalId("goal", 1, 2)
+_GOAL = GoalId("goal", (1, 2))
 _STATE = GoalState(_GOAL, Ros1Status.ACTIVE, "text")
 
 SEEDS: list[bytes] = [
@@ -49,36 +49,53 @@ SEEDS: list[bytes] = [
 
 
 class _Out:
-    """Counts what the goals do, and is the request of a client."""
+    """Counts what the goals do."""
 
-    def __init__(self, payload: bytes) -> None:
-        self.payload = payload
-        self.done = 0
+    pair = _PAIR
+    done = 0
 
     def tell_ros1(self, *_: object) -> None:
         self.done += 1
 
-    tell_ros2 = ask = answer = reply_error = tell_ros1
+    tell_ros2 = ask = answer = tell_ros1
+
+
+class _ToRos2(_Out, GoalsToRos2):
+    pass
+
+
+class _ToRos1(_Out, GoalsToRos1):
+    pass
+
+
+class _Query:
+    """The request of a client."""
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload = payload
+
+    def reply_error(self, _text: str) -> None:
+        pass
 
 
 def fuzz(data: bytes) -> None:
     """What is read is written as it was; machines take all bytes, or refuse them with a documented error."""
-    out: Any = _Out(data)
-    to_ros2, to_ros1 = GoalsToRos2(_PAIR, out, SystemClock()), GoalsToRos1(_PAIR, out, SystemClock())
+    query: Any = _Query(data)
+    to_ros2, to_ros1 = _ToRos2(SystemClock()), _ToRos1(SystemClock())
     takes: list[Callable[[Any], object]] = [
         to_ros2.goal, to_ros2.cancel, to_ros2.feedback, to_ros2.status, to_ros1.status, to_ros1.feedback,
         to_ros1.result, lambda raw: to_ros2.answered("get_result", _UUID, raw),
     ]  # fmt: skip
     for take, message in (
         *((take, data) for take in takes),
-        *((take, out) for take in (to_ros1.send_goal, to_ros1.get_result, to_ros1.cancel_goal)),
+        *((take, query) for take in (to_ros1.send_goal, to_ros1.get_result, to_ros1.cancel_goal)),
     ):
         try:
             take(message)
         except RmpaError as error:
             if not str(error).isprintable():
                 raise AssertionError("an error's text is not safe to log") from error
-    if out.done > 12:
+    if to_ros1.done + to_ros2.done > 12:
         raise AssertionError("one message made many")
     _round_trips(data)
 

@@ -6,12 +6,13 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rmpa.gateway.zenoh.config import ZenohReply, ZenohSample
+from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh.config import ArrivedQuery, ZenohPriority, ZenohQos
+    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 

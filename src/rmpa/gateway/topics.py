@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.foreign import TopicTap
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.config import ZenohQos
     from rmpa.gateway.zenoh.session import OpenSession
-    from rmpa.gateway.zenoh.threads import QueuedPublisher
+    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohQos
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Queries that wait for the header of one publisher; further ones are refused at once.

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.action_messages import (
+from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
+from rmpa.gateway.ros2.goals import (
     ALL_GOALS,
     GoalId,
     GoalState,
+    GoalsToRos1,
+    GoalsToRos2,
     Ros1Status,
     Ros2Status,
     cancel_request,
@@ -25,10 +28,7 @@ from rmpa.gateway.ros2.action_messages import (
     send_goal_response,
     with_uuid,
 )
-from rmpa.gateway.ros2.actions import GoalsToRos1
-from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
 from rmpa.gateway.ros2.pairs import TypeMapping
-from rmpa.gateway.ros2.shown_action import GoalsToRos2
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
@@ -80,7 +80,7 @@ def test_the_messages_of_ros2_are_those_of_its_types() -> None:
     assert (bytes(goal.goal_id.uuid), goal.goal.goal) == (UUID, 7)
     info = types["action_msgs/msg/GoalInfo"](uuid, types["builtin_interfaces/msg/Time"](0, 0))
     assert cancel_request(UUID) == cdr(f"{CANCEL_TYPE}_Request", goal_info=info)
-    made = ros2_states([(UUID, GoalId("a", 3, 4), status) for status in Ros2Status])
+    made = ros2_states([(UUID, GoalId("a", (3, 4)), status) for status in Ros2Status])
     listed = read("action_msgs/msg/GoalStatusArray", made).status_list
     assert [(bytes(each.goal_info.goal_id.uuid), each.goal_info.stamp.sec, each.status) for each in listed] == [
         (UUID, 3, int(status)) for status in Ros2Status
@@ -89,7 +89,7 @@ def test_the_messages_of_ros2_are_those_of_its_types() -> None:
 
 
 def test_the_messages_of_ros1_are_those_of_its_types() -> None:
-    state = GoalState(GoalId("goal é", 5, 6), Ros1Status.ABORTED, "it is hot")
+    state = GoalState(GoalId("goal é", (5, 6)), Ros1Status.ABORTED, "it is hot")
     plain = RESULT.to_plain(RESULT.deserialize(ros1_message(STAMP, state.serialize(), b"\7\0\0\0")))
     assert plain["result"] == {"result": 7}
     assert plain["status"] == {
@@ -153,7 +153,7 @@ class Out(SystemClock):
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         self.asked.append((service, uuid, request))
 
-    def answer(self, query: Query, response: bytes) -> None:
+    def answer(self, query: Any, response: bytes) -> None:
         assert not query.response
         query.response = response
 
@@ -174,15 +174,33 @@ class Out(SystemClock):
         return next((uuid, request) for each, uuid, request in asked if each == service)
 
 
-def to_ros2() -> tuple[GoalsToRos2, Out]:
-    out = Out()
-    return GoalsToRos2(PAIR, cast("Any", out), out), out
+class ToRos2(Out, GoalsToRos2):
+    """What becomes of goals for ROS 2."""
+
+    def __init__(self) -> None:
+        Out.__init__(self)
+        GoalsToRos2.__init__(self, self)
+        self.pair = PAIR
+
+
+class ToRos1(Out, GoalsToRos1):
+    """What becomes of goals for ROS 1."""
+
+    def __init__(self) -> None:
+        Out.__init__(self)
+        GoalsToRos1.__init__(self, self)
+        self.pair = PAIR
+
+
+def to_ros2() -> tuple[ToRos2, Out]:
+    goals = ToRos2()
+    return goals, goals
 
 
 def to_ros1() -> tuple[Any, Out]:
     """The goals as of any type: their requests are those of a test."""
-    out = Out()
-    return GoalsToRos1(PAIR, cast("Any", out), out), out
+    goals: Any = ToRos1()
+    return goals, goals
 
 
 # --- clients of ROS 1, a server of ROS 2 ------------------------------------------------------------
@@ -261,7 +279,7 @@ def test_a_goal_that_the_server_rejects_or_does_not_answer_ends() -> None:
     assert not out.asked, "an answer that comes late"
 
 
-@pytest.mark.parametrize("cancel", [GoalId(), GoalId("g1"), GoalId("", 2**32 - 1, 0)])
+@pytest.mark.parametrize("cancel", [GoalId(), GoalId("g1"), GoalId("", (2**32 - 1, 0))])
 def test_a_cancellation_waits_for_the_acceptance(cancel: GoalId) -> None:
     goals, out = to_ros2()
     goals.goal(goal_message())

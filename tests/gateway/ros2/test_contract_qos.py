@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rmpa.core.contract import ContractRule, Contracts, Durability, History, Priority, Reliability
 from rmpa.gateway.ros2.format import ros2_qos, zenoh_qos
-from rmpa.gateway.zenoh.config import ZenohPriority
+from rmpa.gateway.zenoh.threads import ZenohPriority
 
 
 def terms(*, latching: bool = False, **values: object) -> tuple[str, bool, ZenohPriority, int, int]:

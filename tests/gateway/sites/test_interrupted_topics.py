@@ -10,7 +10,7 @@ from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.keys import MessageSource, SiteModule, SiteSource
 from rmpa.gateway.sites.plans import SiteImport
 from rmpa.gateway.sites.topics import SiteTopics
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
 from tests.gateway.memory_graph import MemoryGraph
 from tests.gateway.memory_zenoh import MemoryZenoh, eventually
 from tests.gateway.sites.site_bed import MD5, site_context

@@ -266,7 +266,7 @@ async def test_a_message_without_a_true_attachment_is_counted_and_dropped() -> N
         yard, hall = await bed.pair()
         yard.graph.add("/scan", described())
         topic = await hall.subscribed("/scan")
-        from rmpa.gateway.zenoh.config import ZenohQos
+        from rmpa.gateway.zenoh.threads import ZenohQos
 
         stranger = await bed.zenoh.session()
         publisher = stranger.publisher("rmpa/1/yard/arm/t/odd_msgs%Odd/scan", ZenohQos(), lambda _there: None)

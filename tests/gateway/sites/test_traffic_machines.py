@@ -16,7 +16,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SequenceCounter, TopicHeader
 from rmpa.gateway.sites.topics import qos_of
 from rmpa.gateway.topics import TopicLimits
-from rmpa.gateway.zenoh.config import ZenohPriority
+from rmpa.gateway.zenoh.threads import ZenohPriority
 from rmpa.ros.wire.tcpros import TopicDescription
 
 MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:

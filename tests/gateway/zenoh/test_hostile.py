@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
 from tests.gateway.zenoh_bed import ZenohBed, bed, until
 
 if TYPE_CHECKING:

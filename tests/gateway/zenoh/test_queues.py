@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.zenoh.config import ZenohQos
-from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane
+from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, ZenohQos
 from tests.gateway.zenoh_bed import until
 
 if TYPE_CHECKING:

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode, ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode
 from rmpa.gateway.zenoh.session import open_session
+from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import bed, free_port, until
 
 if TYPE_CHECKING:
-    from rmpa.gateway.zenoh.config import ArrivedQuery, ZenohSample
+    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.threads import ZenohSample
 
 pytest.importorskip("zenoh")
 
@@ -217,7 +219,7 @@ async def test_the_process_ends_after_close() -> None:
     program = """
 import asyncio
 from tests.gateway.zenoh_bed import bed
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
 async def main():
     async with bed() as net:
         session = await net.session()

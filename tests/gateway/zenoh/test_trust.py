@@ -16,8 +16,9 @@ from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
 from rmpa.gateway.zenoh import access as trust
 from rmpa.gateway.zenoh.access import open_trusted_session, revoked_modules, zenohd_config
-from rmpa.gateway.zenoh.config import ZenohConfig, ZenohQos
+from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
+from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from tests.gateway.zenoh_bed import until
 from tests.gateway.zenoh_fleet import Fleet, allow, deny

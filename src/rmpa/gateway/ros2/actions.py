@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import asyncio
-import uuid as uuids
-from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.errors import RmpaError
+from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2 import action_messages as messages
-from rmpa.gateway.ros2.action_messages import CancelCode, GoalId, GoalState, Ros1Status, Ros2Status
-from rmpa.gateway.ros2.conversion import PART, ActionPair, ConversionError, action_name
+from rmpa.gateway.ros2.conversion import PART, ActionPair, NoConversion, action_name
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
+from rmpa.gateway.ros2.goals import Goals, GoalsToRos1, GoalsToRos2
 from rmpa.gateway.ros2.graph import SITE, valid_name
+from rmpa.gateway.ros2.pairs import derive_ros1
 from rmpa.gateway.ros2.services import SERVICE_NEEDS
-from rmpa.gateway.ros2.shown_action import KINDS, Goals, JoinedAction, ShownAction, find_types
+from rmpa.gateway.ros2.types import TypePair
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
+from rmpa.ros.types.definitions import Specification, known_specifications
+from rmpa.ros.types.find import find_message_type
+from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.loop import MachineTimer, SystemClock
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from rmpa.gateway.foreign import ProxiedTopic, TopicTap
     from rmpa.gateway.ros2.format import Ros2Endpoint
+    from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.session import Declaration
     from rmpa.gateway.zenoh.threads import QueuedPublisher
-    from rmpa.ros.wire.tcpros import Buffer
-    from rmpa.runtime.loop import SystemClock
+    from rmpa.ros.wire.tcpros import TopicDescription
 
+# Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once.
+_ROS2_GOAL_TIMEOUT: Final = 86_400.0
+# Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave.
+_ROS2_LAST_RESULTS: Final = 1.0
+# What the definition of an action is made of.
+KINDS: Final = ("Goal", "Result", "Feedback")
 # Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused.
 _ROS2_ACTION_READY: Final = 5.0
 
@@ -50,188 +60,101 @@ _TYPES: Final = {
 }
 
 
-# Clients of ROS 2, and an actionlib server of ROS 1.
-
-
-@dataclass(slots=True)
-class _SentToRos1:
-    id: GoalId
-    uuid: bytes
-    # When the goal is given up, unless the server shows it before; afterwards, when it is forgotten.
-    deadline: float
-    # The request ``send_goal`` that is not answered yet.
-    asked: ArrivedQuery | None
-    status: Ros1Status = Ros1Status.PENDING
-    # Requests ``get_result`` that are not answered yet.
-    waiting: list[ArrivedQuery] = field(default_factory=list)
-    # The result of ROS 1 once it has come.
-    result: bytes | None = None
-    # Whether the server's status has named it.
-    listed: bool = False
-
-    @property
-    def ended(self) -> bool:
-        return self.result is not None
-
-
-class GoalsToRos1(Goals):
-    """The goals of one action.
+class JoinedAction(Goals):
+    """An action of one side, as that of a server at the other one.
 
     Args:
-        pair: The action's types.
-        out: Answers the requests, and has what is told to both sides published.
-        clock: Both clocks.
+        context: What the parts share.
+        name: The action's name in ROS 2.
+        here: Its name in the gateway's graph.
+        server: The server's node in the gateway's graph or ROS 2's.
+        shown: The node that publishes its topics for ROS 1, below ``/rmpa/ros2``.
     """
 
-    def __init__(self, pair: ActionPair, out: OfferedAction, clock: SystemClock) -> None:
-        super().__init__(pair, clock)
-        self._out = out
-        # By the id in ROS 1, which is the text of the UUID.
-        self._goals: dict[str, _SentToRos1] = {}
+    # More than twelve fields: the action's names, what was declared at either side, and its goals with their timer.
 
-    # --- from the clients of ROS 2 --------------------------------------------------------------------------------
+    def __init__(self, context: Ros2Context, name: str, here: str, server: str, shown: str) -> None:
+        super().__init__(SystemClock())
+        self.here = here
+        self._context = context
+        self._name = name
+        self._server = server
+        self._shown = shown
+        # Whether its types were found, and its server is there.
+        self._open = False
+        self._closed = False
+        self._timer = MachineTimer(self.next_timer, self.handle_timer)
+        self._topics: dict[str, ProxiedTopic] = {}
+        self._taps: dict[MeshSource, TopicTap] = {}
+        self._declared: list[Declaration | OwnEndpoint | QueuedPublisher] = []
+        self._sequence = 0
+        context.spawn(self._join())
 
-    def send_goal(self, query: ArrivedQuery) -> None:
-        """A client calls ``send_goal``."""
-        uuid, cdr = messages.split_uuid(query.payload)
-        body, name, stamp = self.pair.goal.to_ros1(cdr), _name(uuid), self._clock.wall_ns()
-        if name in self._goals or len(self._goals) >= limits.ROS2_GOALS_MAX:
-            self._out.answer(query, messages.send_goal_response(stamp, accepted=False))
-            return
-        goal_id = GoalId(name, *divmod(stamp, 10**9))
-        self._goals[name] = _SentToRos1(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
-        self._out.tell_ros1("goal", messages.ros1_message(stamp, goal_id.serialize(), body))
+    def close(self) -> None:
+        """The server is gone: goals under way end as aborted, and all is taken back but the topics for ROS 1."""
+        self._closed, self._open = True, False
+        self._context.say(self.here, "")
+        self.server_gone()
+        self._timer.close()
+        for each in (*self._declared, *self._taps.values()):
+            each.close()
 
-    def get_result(self, query: ArrivedQuery) -> None:
-        """A client calls ``get_result``; of a goal that is not known the status is UNKNOWN, as rcl answers."""
-        uuid, _ = messages.split_uuid(query.payload)
-        goal = self._goals.get(_name(uuid))
-        if goal is None:
-            self._out.answer(query, self.pair.result_to_ros2(Ros2Status.UNKNOWN, self.pair.no_result))
-        elif sum(len(each.waiting) for each in self._goals.values()) >= limits.ROS2_GOALS_MAX:
-            query.reply_error("too many clients wait for results")
-        else:
-            goal.waiting.append(query)
-            if goal.ended:
-                self._give_result(goal)
+    def finish(self) -> None:
+        """Take its topics out of ROS 1's graph."""
+        for topic in self._topics.values():
+            topic.close()
+        self._topics.clear()
 
-    def cancel_goal(self, query: ArrivedQuery) -> None:
-        """A client calls ``cancel_goal``: one goal, all up to a stamp, or all (action_msgs/CancelGoal)."""
-        uuid, until = messages.parse_cancel_request(query.payload)
-        every = uuid == messages.ALL_GOALS and until == (0, 0)
-        asked = [goal for goal in self._goals.values() if every or goal.uuid == uuid or goal.id.stamp <= until]
-        open_goals = [goal for goal in asked if not goal.ended]
-        for goal in open_goals:
-            # With a stamp ROS 1 would cancel all older goals too.
-            self._out.tell_ros1("cancel", GoalId(goal.id.id).serialize())
-        code = CancelCode.NONE
-        if uuid != messages.ALL_GOALS and not open_goals:
-            code = CancelCode.GOAL_ENDED if asked else CancelCode.UNKNOWN_GOAL
-        self._out.answer(query, messages.cancel_response(code, [(goal.uuid, goal.id) for goal in open_goals]))
+    def tell_ros1(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 1."""
+        if topic in self._topics:
+            self._topics[topic].publish(message)
 
-    # --- from the server of ROS 1 ---------------------------------------------------------------------------------
+    async def _join(self) -> None:
+        """Find the types, and join the action if they are a pair."""
+        raise NotImplementedError
 
-    def status(self, raw: Buffer) -> None:
-        """The server publishes its status; a goal that it named before, and names no more, is lost."""
-        listed, changed = messages.parse_states(raw), False
-        for each in listed:
-            changed |= self._take_state(each)
-        if changed:
-            self._tell_states()
-        named = {each.goal.id for each in listed}
-        for goal in list(self._goals.values()):
-            if goal.id.id in named:
-                goal.listed = True
-            elif goal.listed and not goal.ended:
-                self._end(goal, Ros1Status.LOST, self.pair.no_result)
+    def _show(self, part: str, header: TopicDescription, on_demand: Callable[[bool], None]) -> None:
+        source = ForeignSource(SourceKind.TOPIC, SITE, "", self._shown, f"{self.here}/{part}", header.type)
+        self._topics[part] = self._context.graph.show_topic(source, on_demand)
+        self._topics[part].describe(header)
 
-    def feedback(self, raw: Buffer) -> None:
-        """The server publishes feedback."""
-        state, body = messages.parse_outcome(raw)
-        goal = self._goals.get(state.goal.id)
-        if goal is not None and not goal.ended:
-            if self._take_state(state):
-                self._tell_states()
-            self._out.tell_ros2("feedback", messages.with_uuid(goal.uuid, self.pair.feedback.to_ros2(body)))
+    def _declare(self, node: str, kind: EntityKind, part: str, qos: Ros2Qos | None = None) -> OwnEndpoint:
+        name, types = f"{self._name}{PART}{part}", self.pair.types[part]
+        made = self._context.nodes.declare(node, kind, name, *types, qos or Ros2Qos())
+        self._declared.append(made)
+        return made
 
-    def result(self, raw: Buffer) -> None:
-        """The server publishes a result."""
-        state, body = messages.parse_outcome(raw)
-        goal = self._goals.get(state.goal.id)
-        if goal is not None and not goal.ended:
-            self._end(goal, state.status, body)
-
-    def server_gone(self) -> None:
-        """The server is gone: all goals end as aborted."""
-        for goal in [goal for goal in self._goals.values() if not goal.ended]:
-            self._end(goal, Ros1Status.LOST, self.pair.no_result)
-
-    # --- time ------------------------------------------------------------------------------------------------------
-
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is to be called; ``None``: not."""
-        times = [goal.deadline for goal in self._goals.values() if goal.asked is not None or goal.ended]
-        return min(times, default=None)
-
-    def handle_timer(self, now: float) -> None:
-        """Give up goals that the server does not show, and forget results that were kept long enough."""
-        for name, goal in list(self._goals.items()):
-            if goal.deadline > now or (goal.asked is None and not goal.ended):
-                continue
-            if goal.asked is not None:
-                goal.asked.reply_error("the action server of ROS 1 does not show the goal")
-                self._out.tell_ros1("cancel", GoalId(name).serialize())
-            del self._goals[name]
-            for query in goal.waiting:
-                query.reply_error("the goal is not known any more")
-
-    # --- inside ----------------------------------------------------------------------------------------------------
-
-    def _take_state(self, state: GoalState) -> bool:
-        """Take in one goal's state; return whether it has changed."""
-        goal = self._goals.get(state.goal.id)
-        if goal is None or goal.ended:
-            return False
-        if state.status is Ros1Status.REJECTED:
-            self._end(goal, state.status, self.pair.no_result)
-            return True
-        self._accept(goal, accepted=True)
-        if state.status not in messages.UNDER_WAY or goal.status is state.status:
-            return False  # an end is told with its result
-        goal.status = state.status
-        return True
-
-    def _accept(self, goal: _SentToRos1, *, accepted: bool) -> None:
-        query, goal.asked = goal.asked, None
-        if query is not None:
-            self._out.answer(query, messages.send_goal_response(self._clock.wall_ns(), accepted=accepted))
-
-    def _end(self, goal: _SentToRos1, status: Ros1Status, body: bytes) -> None:
-        self._accept(goal, accepted=status is not Ros1Status.REJECTED)
-        goal.status, goal.result, goal.deadline = status, body, self._clock.now() + limits.ROS2_RESULT_KEPT
-        self._tell_states()
-        self._give_result(goal)
-
-    def _give_result(self, goal: _SentToRos1) -> None:
-        waiting, goal.waiting = goal.waiting, []
-        for query in waiting:
-            try:
-                self._out.answer(query, self.pair.result_to_ros2(messages.TO_ROS2[goal.status], goal.result or b""))
-            except ConversionError as error:
-                query.reply_error(str(error))
-
-    def _tell_states(self) -> None:
-        states = (
-            (goal.uuid, goal.id, messages.TO_ROS2[goal.status]) for goal in self._goals.values() if goal.asked is None
+    def _tap(self, source: MeshSource, part: str, changed: Callable[[object], None]) -> None:
+        """Listen to a topic of ROS 1, as the node that publishes the others."""
+        listener = f"/rmpa/{SITE}{self._shown}"
+        self._taps[source] = self._context.graph.tap(
+            source, partial(self._take, part), changed, changed, listener=listener
         )
-        self._out.tell_ros2("status", messages.ros2_states(states))
+
+    def _take(self, part: str, message: Any) -> None:
+        """Take a message of a topic, by the method with its name."""
+        if self._open:
+            try:
+                getattr(self, part)(message)
+            except RmpaError as error:
+                self._context.say(f"{self.here} (messages)", str(error))
+            self._timer.arm()
+
+    def _attachment(self, gid: bytes) -> bytes:
+        self._sequence += 1
+        return Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize()
 
 
-def _name(uuid: bytes) -> str:
-    return str(uuids.UUID(bytes=uuid))
+async def find_types(*names: str) -> list[MessageType]:
+    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
+    return [await asyncio.to_thread(find_message_type, name) for name in names]
 
 
-class OfferedAction(JoinedAction):
+# A server of ROS 1 for clients of ROS 2.
+
+
+class OfferedAction(JoinedAction, GoalsToRos1):
     """Offers one actionlib server to ROS 2.
 
     Args:
@@ -240,8 +163,6 @@ class OfferedAction(JoinedAction):
         ros1: ``package/Name`` of the action.
         server: The server's topics by *status*, *feedback* and *result*.
     """
-
-    _goals: GoalsToRos1 | None
 
     def __init__(self, context: Ros2Context, name: str, ros1: str, server: Mapping[str, MeshSource]) -> None:
         self.ros1 = ros1
@@ -288,7 +209,7 @@ class OfferedAction(JoinedAction):
             return
         if self._closed:
             return
-        self._begin(GoalsToRos1(pair, self, self._clock))
+        self.pair, self._open = pair, True
         for part, kind in zip(_OF_CLIENTS, topics, strict=True):
             self._show(part, kind.describe(), partial(self._demand, part))
         for part in ("send_goal", "get_result", "cancel_goal"):
@@ -334,14 +255,171 @@ class OfferedAction(JoinedAction):
         self._request("send_goal", query)
 
     def _request(self, service: str, query: ArrivedQuery) -> None:
-        if self._goals is None or self._closed:
+        if not self._open:
             query.reply_error("the action server of ROS 1 is gone")
             return
         try:
-            getattr(self._goals, service)(query)
+            getattr(self, service)(query)
         except RmpaError as error:
             query.reply_error(str(error))
-        self._arm()
+        self._timer.arm()
+
+
+class ShownAction(JoinedAction, GoalsToRos2):
+    """Shows one action server of ROS 2 to actionlib's clients.
+
+    Args:
+        context: What the parts share.
+        server: The server's endpoint *send_goal*.
+        name: The action's name in ROS 2.
+        here: Its name in the gateway's graph.
+    """
+
+    def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
+        self.server = server
+        self._clients: set[MeshSource] = set()
+        self._callers: dict[str, OwnEndpoint] = {}
+        self._leaving: asyncio.TimerHandle | None = None
+        super().__init__(context, name, here, server.node.name, server.node.name)
+
+    def follow(self, clients: set[MeshSource]) -> None:
+        """The topics *goal* and *cancel* of its clients are these now."""
+        self._clients = clients
+        if not self._open:
+            return
+        for source in self._taps.keys() - clients:
+            self._taps.pop(source).close()
+        for source in clients - self._taps.keys():
+            self._tap(source, source.here.rpartition("/")[2], _ignore)
+        if clients and "feedback" not in self._callers:  # from the first client on
+            for part in ("feedback", "status"):
+                self._callers[part] = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
+                key, take = self._callers[part].endpoint.key(), partial(self._take, part)
+                self._declared.append(
+                    self._context.session.subscribe(key, lambda sample, take=take: take(sample.payload))  # type: ignore[misc]
+                )
+
+    def close(self) -> None:
+        """The server is gone: goals under way end as aborted, then the topics go."""
+        super().close()
+        # The last results have to leave before their publishers.
+        self._leaving = asyncio.get_running_loop().call_later(_ROS2_LAST_RESULTS, self.finish)
+
+    def finish(self) -> None:
+        """Take its topics out of the graph, once it is closed."""
+        if self._leaving is not None:
+            self._leaving.cancel()
+        super().finish()
+
+    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        """Call a service of the server, and tell the goals what comes of it."""
+        if self._open:
+            self._context.spawn(self._ask(service, uuid, request))
+
+    # --- inside ----------------------------------------------------------------------------------------------------
+
+    async def _join(self) -> None:
+        try:
+            pair = await self._find_pair()
+            headers = [kind.describe() for kind in await find_types("actionlib_msgs/GoalStatusArray")]
+            headers += await self._outcome_headers(pair)
+        except RmpaError as error:
+            self._context.say(self.here, f"the action of ROS 2's node {self._server} is not shown: {error}")
+            return
+        if self._closed:
+            return
+        self.pair, self._open = pair, True
+
+        def wanted(there: bool) -> None:
+            if self._open:
+                self.show_status(wanted=there)
+                self._timer.arm()
+
+        for part, header in zip(("status", "feedback", "result"), headers, strict=True):
+            self._show(part, header, wanted if part == "status" else _ignore)
+        self.follow(self._clients)
+
+    @staticmethod
+    async def _outcome_headers(pair: ActionPair) -> list[TopicDescription]:
+        """The headers of an action's feedback and result; made where this machine has no definition."""
+        try:
+            return [
+                kind.describe() for kind in await find_types(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
+            ]
+        except RmpaError:
+            return [_wrapped(pair.ros1, "Feedback", pair.feedback.ros1), _wrapped(pair.ros1, "Result", pair.result)]
+
+    async def _find_pair(self) -> ActionPair:
+        """The types; the server's node is asked for what is not known here.
+
+        Raises:
+            RmpaError: The types are no pair, or ROS 2's are not known.
+        """
+        context, server = self._context, self.server
+        ros2 = server.type.removesuffix("_SendGoal")
+        ros1 = context.mapping.ros1_type(ros2)
+        rule = context.mapping.action(ros1)
+        if rule.name != ros2:
+            rule = TypePair(ros2)
+        known: list[MessageType] = []
+        try:
+            known = await find_types(*(f"{ros1}{kind}" for kind in KINDS))
+            pair = ActionPair(known, rule, context.types)
+            if pair.types["send_goal"][1] == server.type_hash:
+                return pair
+            problem = f"{ros2} has another definition there than {ros1} here: its type hash differs"
+        except RmpaError as error:
+            problem = str(error)
+        own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
+        try:
+            fields = await context.asker.learn(
+                (server.name, EntityKind.SERVICE),
+                (f"{self._name}{PART}get_result", EntityKind.SERVICE),
+                (f"{self._name}{PART}feedback", EntityKind.PUBLISHER),
+                of=server,
+            )
+            types = context.types.variant(fields)
+            kinds = known or [
+                derive_ros1(types.store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own
+            ]
+            return ActionPair(kinds, rule, types)
+        except RmpaError as error:
+            raise NoConversion(f"{problem}; {error}") from error
+        except KeyError as error:
+            raise NoConversion(f"{problem}; {ros2} has no form in ROS 1: {error}") from error
+
+    async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        if service not in self._callers:
+            self._callers[service] = self._declare(self._context.nodes.own_name, EntityKind.CLIENT, service)
+        caller = self._callers[service]
+        try:
+            answers = await self._context.session.get(
+                caller.endpoint.key(),
+                request,
+                self._attachment(caller.gid),
+                timeout=_ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT,
+                all_complete=True,
+            )
+            answer = next((answer for answer in answers if answer.ok), None)
+            if answer is None:
+                text = answers[0].payload.decode(errors="replace") if answers else "it is gone"
+                raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
+            self.answered(service, uuid, answer.payload)
+        except RmpaError as error:
+            self.failed(service, uuid, str(error))
+        self._timer.arm()
+
+
+def _wrapped(ros1: str, part: str, kind: MessageType) -> TopicDescription:
+    """The message of actionlib around a feedback or result, as its genaction.py makes it."""
+    name = f"{ros1}Action{part}"
+    text = f"Header header\nactionlib_msgs/GoalStatus status\n{kind.name} {part.lower()}\n"
+    known = {**known_specifications("std_msgs/Header"), **known_specifications("actionlib_msgs/GoalStatus")}
+    return MessageType(name, {**known, **kind.specifications, name: Specification.parse(name, text)}).describe()
+
+
+def _ignore(_value: object) -> None:
+    """Nothing is to be done."""
 
 
 class Ros2Actions:

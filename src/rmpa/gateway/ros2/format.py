@@ -26,7 +26,7 @@ from rmpa.core.contract import Durability, History, Liveliness, Priority, Reliab
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import ROUTE_QUEUE_MESSAGES
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract, Contracts

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import CrossingDecision, MeshSource
-    from rmpa.gateway.zenoh.config import ZenohQos, ZenohSample
     from rmpa.gateway.zenoh.session import Declaration
+    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 

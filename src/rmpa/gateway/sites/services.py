@@ -29,7 +29,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering, OwnedTasks
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key
-from rmpa.gateway.zenoh.config import ZenohPriority
+from rmpa.gateway.zenoh.threads import ZenohPriority
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
 

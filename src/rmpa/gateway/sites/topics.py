@@ -19,7 +19,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
 from rmpa.gateway.topics import Export
-from rmpa.gateway.zenoh.config import ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.zenoh.config import ArrivedQuery, ZenohSample
+    from rmpa.gateway.zenoh.config import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
+    from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first.

@@ -12,12 +12,13 @@ import socket
 import stat
 import threading
 from dataclasses import dataclass, replace
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
+from rmpa.gateway.zenoh.threads import ZenohReply
 
 if TYPE_CHECKING:
     import asyncio
@@ -52,71 +53,6 @@ _RECONNECT_GROWTH: Final = 1.5
 # Protocols of endpoints that are encrypted, and that certificates are checked at.
 _ENCRYPTED: Final = ("tls", "quic")
 _INSECURE: Final = "or say --insecure, and every program that reaches it may read and write everything"
-
-
-class ZenohPriority(IntEnum):
-    """Zenoh's priorities; a lower number goes first."""
-
-    REAL_TIME = 1
-    INTERACTIVE_HIGH = 2
-    INTERACTIVE_LOW = 3
-    DATA_HIGH = 4
-    DATA = 5
-    DATA_LOW = 6
-    BACKGROUND = 7
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohQos:
-    """The QoS of one publisher, and the bounds of its queue in this process.
-
-    Args:
-        reliable: Zenoh's reliability ``RELIABLE``; else ``BEST_EFFORT``.
-        block: Congestion control ``BLOCK`` (it waits in a thread of its own); else ``DROP``.
-        priority: Zenoh's priority.
-        messages: Messages that wait at most; above it the oldest is dropped, and counted.
-        bytes: Bytes that wait at most; one message always fits.
-        cache: Samples that a later subscriber gets (an advanced publisher); 0: an ordinary publisher.
-    """
-
-    reliable: bool = True
-    block: bool = True
-    priority: ZenohPriority = ZenohPriority.DATA
-    messages: int = 1000
-    bytes: int = 64 * 1024 * 1024
-    cache: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohSample:
-    """One message that was received.
-
-    Args:
-        key: Its key.
-        payload: Its bytes.
-        attachment: Its attachment; empty if it has none.
-    """
-
-    key: str
-    payload: bytes
-    attachment: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohReply:
-    """One answer to ``get``.
-
-    Args:
-        key: The key that was answered; empty for an error.
-        payload: The answer, or the error's text in UTF-8.
-        attachment: Its attachment; empty if it has none.
-        ok: Whether it is an answer and no error.
-    """
-
-    key: str
-    payload: bytes
-    attachment: bytes
-    ok: bool
 
 
 class ZenohMode(StrEnum):

@@ -16,23 +16,24 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import (
-    ArrivedQuery,
-    PendingGet,
-    SerialWorker,
-    SocketTuning,
+from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
+from rmpa.gateway.zenoh.threads import (
+    ArrivalQueue,
+    Arrivals,
+    QueuedPublisher,
+    SendingLane,
     ZenohPriority,
     ZenohSample,
-    content,
+    keep_thread_state,
 )
-from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, keep_thread_state
 from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.policy import Needs
-    from rmpa.gateway.zenoh.config import ZenohConfig, ZenohQos, ZenohReply
+    from rmpa.gateway.zenoh.config import ZenohConfig
+    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds between two looks at which connections Zenoh has, to bound what the kernel holds of new ones.

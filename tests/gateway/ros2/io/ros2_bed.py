@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.rules import CrossingRule
     from rmpa.core.contract import Contracts
-    from rmpa.gateway.zenoh.config import ZenohSample
+    from rmpa.gateway.zenoh.threads import ZenohSample
 
 STRING = MessageType("std_msgs/String")
 
@@ -61,7 +61,7 @@ class Ros2Publisher:
 
 
 def zenoh_qos(qos: Ros2Qos) -> Any:
-    from rmpa.gateway.zenoh.config import ZenohQos
+    from rmpa.gateway.zenoh.threads import ZenohQos
 
     return ZenohQos(cache=qos.depth if qos.latched else 0)
 

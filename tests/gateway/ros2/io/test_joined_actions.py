@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.config.rules import GatewaySettings
-from rmpa.gateway.ros2.action_messages import parse_outcome
 from rmpa.gateway.ros2.actions import Ros2Actions
 from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import (
@@ -21,9 +20,10 @@ from rmpa.gateway.ros2.format import (
     data_key,
     parse_token,
 )
+from rmpa.gateway.ros2.goals import parse_outcome
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types, TypePair
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.definitions import SEPARATOR, known_text
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_graph import MemoryGraph

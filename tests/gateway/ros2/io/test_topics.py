@@ -17,7 +17,7 @@ from rmpa.gateway.ros2.format import (
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types
-from rmpa.gateway.zenoh.config import ZenohQos
+from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.messages import MessageType
 from tests.gateway.memory_zenoh import MemoryQuery, eventually
 from tests.gateway.ros2.io.ros2_bed import STRING, find_none, string, topic_bed
@@ -26,7 +26,7 @@ from tests.gateway.ros2.type_descriptions import response
 if TYPE_CHECKING:
     import pytest
 
-    from rmpa.gateway.zenoh.config import ZenohSample
+    from rmpa.gateway.zenoh.threads import ZenohSample
 
 LATCHED = Ros2Qos(durability=Ros2Durability.TRANSIENT_LOCAL, depth=1)
 HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id"
