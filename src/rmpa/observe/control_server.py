@@ -145,7 +145,7 @@ class ControlServer:
             if self._group is not None:
                 os.chown(self.path, -1, self._group)
                 self.path.chmod(0o660)
-            sock.listen(limits.CONTROL_BACKLOG)
+            sock.listen(128)
         except OSError as error:
             sock.close()
             raise StartError(str(self.path), f"cannot be bound: {error.strerror}") from None
@@ -185,8 +185,9 @@ class ControlServer:
             else:
                 await self._send(writer, refused)
                 writer.write_eof()
-                # What the client sends is awaited: a socket closed before that would break its ``send``.
-                async with asyncio.timeout(limits.CONTROL_REFUSED_TIMEOUT):
+                # What the client sends is awaited: a socket closed before that would break its ``send``. It holds
+                # its place among the clients for so long.
+                async with asyncio.timeout(1.0):
                     await reader.read(limits.CONTROL_REQUEST_MAX)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
             pass  # gone, idle, or closed half-way: none is an error

@@ -416,13 +416,8 @@ class Diagnostics(PublicationEvents):
         self._clock = SystemClock()
         self._health = Health()
         self._sequence = 0
-        self._publication = Publication(
-            TOPIC,
-            bridge.node.name,
-            _ARRAY,
-            queue_messages=limits.DIAGNOSTICS_QUEUE,
-            events=self,
-        )
+        # The queue is short: a newer message repeats all of an older one.
+        self._publication = Publication(TOPIC, bridge.node.name, _ARRAY, queue_messages=10, events=self)
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
@@ -444,7 +439,8 @@ class Diagnostics(PublicationEvents):
 
     def _again(self) -> None:
         used = self._publication.subscribers or any(not s.link.rests for s in self._bridge.sessions.linked())
-        self._timer = call_at_tick(limits.DIAGNOSTICS_INTERVAL if used else limits.CLOCKS_IDLE_INTERVAL, self._look)
+        # Once a second as in diagnostic_updater; a link that is used again is noticed by the next look.
+        self._timer = call_at_tick(1.0 if used else 5.0, self._look)
 
     def first_subscriber(self) -> None:
         """Of ``PublicationEvents``."""

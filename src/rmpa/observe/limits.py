@@ -24,10 +24,6 @@ CONTROL_CALL_TIMEOUT: Final = 10.0
 """Time-out of one call of a client: a stopped agent must not block the command line."""
 CONTROL_LOOK_TIMEOUT: Final = 1.0
 """Time-out of a connection that only tests whether an agent runs; the kernel accepts it even for a stopped agent."""
-CONTROL_REFUSED_TIMEOUT: Final = 1.0
-"""A client that is turned away has this long to read why; it holds its place among the clients for so long."""
-CONTROL_BACKLOG: Final = 128
-"""Connections that wait to be accepted; the kernel refuses further ones at once."""
 CONTROL_PINGS_MAX: Final = 100
 """Pings of one call, which must end within its time-out. The command line asks for one at a time."""
 CONTROL_HANDLER_TIMEOUT: Final = 30.0
@@ -39,19 +35,11 @@ GRAPH_HISTORY: Final = 4096
 client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
-CPU_INTERVAL: Final = 1.0
-"""The least time over which the agent's CPU share is measured; the kernel counts in ticks of 10 ms."""
-DIAGNOSTICS_INTERVAL: Final = 1.0
-"""Interval of the messages on /diagnostics, as in diagnostic_updater; peers' clocks are recorded as often."""
-CLOCKS_IDLE_INTERVAL: Final = 5.0
-"""The same while all links rest and /diagnostics has no subscriber; a link in use is noticed by the next look."""
 DIAGNOSTICS_STALE: Final = 60.0
 """How long a peer that is gone, with its topics, is shown as stale on /diagnostics."""
 DIAGNOSTICS_TOPICS: Final = 2000
 """Topics and services beyond which /diagnostics leaves out those that nothing here uses: each second it would take
 0.03 ms for each of them, two thirds of a core with 20,000."""
-DIAGNOSTICS_QUEUE: Final = 10
-"""Messages that wait for a slow subscriber of /diagnostics; a newer one repeats all of an older one."""
 
 # --- doctor -----------------------------------------------------------------------------------------------------
 DOCTOR_HEAR: Final = 1.0
@@ -60,31 +48,14 @@ DOCTOR_PROGRAM: Final = 5.0
 """Time-out of a program of the system (nft, iptables)."""
 DOCTOR_NAME: Final = 5.0
 """Time-out of a name look-up: the resolver itself waits 5 s for a dead name server."""
-DOCTOR_OUTPUT_MAX: Final = 4 * MIB
-"""Bytes read of a program's output; the rules of a Kubernetes node have some 100 KB."""
-DOCTOR_FILES_LOW: Final = 4096
-"""A limit of open files that is too low for a large graph: each subscriber takes one, and a proxy two where proxies
-cannot share their sockets."""
 DOCTOR_PEERS_LISTED: Final = 16
 """Peers of an agent that are listed one by one; of more, those with a problem are, and the others are counted."""
 DOCTOR_CLOCK_LOOK: Final = 0.3
 """How long both clocks are watched, to notice that the wall clock is set."""
-DOCTOR_CLOCK_STEP: Final = 0.005
-"""How far the wall clock may move against the monotonic one meanwhile; slewing moves it by 0.15 ms."""
-DOCTOR_CLOCK_APART: Final = 0.02
-"""Offset between the clocks of two modules above which tf complains: two periods of a 100 Hz transform."""
 
 # --- why --------------------------------------------------------------------------------------------------------
 WHY_WINDOW: Final = 1.0
 """Time between the two counts that ``rmpa why`` compares: a topic of some messages a second has moved by then."""
-WHY_TIMEOUT: Final = 12.0
-"""Time-out of a diagnosis by a peer: its time window, and at most two requests to this agent of ASK_TIMEOUT each."""
-WHY_SILENT: Final = 2.0
-"""A topic that was silent for less than this does not count as silent, whatever its rate."""
-WHY_SILENT_PERIODS: Final = 10.0
-"""A topic that was silent for less than this many of its longest usual periods does not count as silent."""
-WHY_PROBE: Final = 2.0
-"""Time-out of a probe of a service's server, which is on the same machine as the agent that asks."""
 WHY_SOURCES_MAX: Final = 64
 """Publishers of one topic in one module that ``rmpa why`` reports."""
 DOCTOR_NODES_TIMEOUT: Final = 2.0

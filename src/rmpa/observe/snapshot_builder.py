@@ -18,7 +18,6 @@ import psutil
 import rmpa
 from rmpa.core.counters import SampleSummary
 from rmpa.discovery import limits as discovery_limits
-from rmpa.observe import limits
 from rmpa.observe.peer_info import FOREIGN, BoundInfo, LaneInfo, LinkInfo, PeerAgent, PeerInfo
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, SampleSpread, ServiceInfo, Snapshot
 from rmpa.observe.topics import TopicFacts, first_names
@@ -181,7 +180,7 @@ class SnapshotBuilder:
         proxies = sum(len(session.proxies) for session in bridge.sessions)
         now, rss = time.monotonic(), None
         with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
-            if now - self._cpu_known >= limits.CPU_INTERVAL:
+            if now - self._cpu_known >= 1.0:  # the kernel counts in ticks of 10 ms
                 self._cpu, self._cpu_known = self._process.cpu_percent(), now
             rss = self._process.memory_info().rss
         return AgentInfo(

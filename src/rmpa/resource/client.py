@@ -22,7 +22,6 @@ import time
 from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.resource import limits
 from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.resource.quality import EXPIRES, PRIORITY, RequirementAnswer
 from rmpa.resource.runtime import RuntimePart
@@ -83,7 +82,7 @@ class ResourceClient:
         *,
         priority: int = 0,
         expires: str = "",
-        timeout: float = limits.RESOURCE_ANSWER_TIMEOUT,  # noqa: ASYNC109 - the message names it
+        timeout: float = 10.0,  # noqa: ASYNC109 - the message names it; a route may have to be opened first
         **requests: QoSRequest,
     ) -> RequirementAnswer:
         """Request a quality, in place of the previous request, and wait for the answer.

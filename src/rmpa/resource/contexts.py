@@ -169,7 +169,7 @@ class Contexts(RuntimePart):
 
     async def _find_topics(self) -> None:
         """Look up the topics that rules refer to, and subscribe to them, until all are found."""
-        node, delay = self._runtime.node, limits.CONTEXT_LOOK
+        node, delay = self._runtime.node, 0.5
         while missing := [field for field in self._fields.values() if not field.topic]:
             try:
                 published = {topic for topic, _ in await node.get_published_topics()}

@@ -20,15 +20,11 @@ RESOURCE_HELD_MAX: Final = 64 * 1024 * 1024
 """Bytes of the messages that a resource queues while a profile or context is applied; drop-oldest."""
 TASK_END_TIMEOUT: Final = 2.0
 """An ending resource waits so long for the last run of a task; a stuck thread is left behind."""
-RESOURCE_ANSWER_TIMEOUT: Final = 10.0
-"""A client waits so long for the answer to a requirement: a route to another module may have to be opened first."""
 REQUIREMENT_BOUNDS_MAX: Final = 256
 """Attributes in the requirement of one client."""
 RESOURCE_CLIENT_GRACE: Final = 30.0
 """A restarted resource keeps the requirement of a client so long until the client connects again: master, agent and
 links may have to start first."""
-RESOURCE_REPORT_WINDOWS: Final = 3
-"""Number of quality windows for which the report of a client counts."""
 RESOURCE_STAMPS_MAX: Final = 1024
 """Number of stamps of expiring requests that are kept, so that a latched one that arrives again keeps its expiry."""
 STORE_TIMEOUT: Final = 5.0
@@ -43,5 +39,3 @@ CONTEXT_ENTER_TIMEOUT: Final = 5.0
 """The function of a context may take so long; tasks are paused meanwhile."""
 CONTEXT_RETRY: Final = 5.0
 """Seconds from a failed switch until the rules are evaluated again; also the longest between searches for topics."""
-CONTEXT_LOOK: Final = 0.5
-"""Seconds between the first searches for the topics of rules; a search is one call of the module's own master."""

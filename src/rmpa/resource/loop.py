@@ -234,9 +234,7 @@ class Adapter(RuntimePart):
         """Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first."""
         self.hung: HungError | None = None
         """The function for which the resource ends; ``None``: none hangs."""
-        self.observed = ObservedQualities(
-            self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * self._settings.window
-        )
+        self.observed = ObservedQualities(self._attributes, resource.name, 3 * self._settings.window)
         self._measuring: QualityMeasurement | None = None
         """``None`` before the start."""
         self._measured: dict[str, Value] = {}

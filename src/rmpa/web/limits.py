@@ -19,10 +19,8 @@ SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
 """Bytes that wait for one subscription of one client; its newest message always fits."""
 PAYLOAD_BUFFER_MIN: Final = 64 * KIB
 """Bytes from which on a received message is copied into a buffer that was used before; smaller ones cost little."""
-PAYLOAD_BUFFERS_BYTES: Final = 16 * MIB
-"""Bytes of these buffers that are kept, used and unused: what waits for one slow client."""
 PAYLOAD_BUFFERS_MAX: Final = 64
-"""Such buffers; each is looked at until one is unused."""
+"""Such buffers, used and unused; each is looked at until one is unused."""
 CLIENTS_MAX: Final = 224
 """WebSocket clients, pages of the monitor included. The rest of ``WEB_CONNECTIONS_MAX`` is for requests: further ones
 are told why they are refused, and the files of the pages and /metrics are still served."""
@@ -52,53 +50,23 @@ CALLS_AT_ONCE: Final = 8
 """Connections to one service's server; further calls wait. rospy serves each connection by a thread."""
 CALLS_WAITING: Final = 1000
 """Calls that wait for a free connection to one service's server."""
-CALL_IDLE: Final = 10.0
-"""Time that an unused connection to a service's server stays open."""
 SERVED_CALLS_MAX: Final = 1000
 """Calls of one service that a client serves and that wait for its answer."""
-SERVED_TIMEOUT: Final = 60.0
-"""Time for a client's answer to a call of its service."""
-GRAPH_PERIOD: Final = 0.08
-"""Shortest time from one look at the graph to the next while there are clients, so that a new topic shows within
-0.1 s."""
-GRAPH_TOLD_PERIOD: Final = 2.0
-"""The same while the agent tells each change: no look is needed then, and a lost word costs this long."""
 GRAPH_WAIT: Final = 20.0
 """Time of one question to the agent for the next change of the graph."""
-GRAPH_IDLE_PERIOD: Final = 1.0
-"""Time between two looks while no client follows the graph."""
 GRAPH_GATHER: Final = 0.01
 """Time in which changes that the hub itself makes are gathered before it looks at the graph."""
-GRAPH_SHARE: Final = 10.0
-"""A pause between two looks is so many times as long as a look takes: both ends spend a tenth on it."""
-GRAPH_CHANGED_SHARE: Final = 1.0
-"""The same after a look that found a change, which is parsed: that takes ten times as long as to compare."""
-PROBES_AT_ONCE: Final = 8
-"""Servers that are asked for their service's type at one time."""
 FIND_ALL_TIMEOUT: Final = 3.0
 """Time in which all servers that did not tell their service's type yet are asked, for one question of a client."""
 PROBE_RETRY: Final = 10.0
 """Time before a server that did not tell its service's type, or a type that was not found, is asked for again."""
-DESCRIBE_AT_ONCE: Final = 4
-"""Types whose definition is looked for at one time."""
-SEARCH_RATE: Final = 10.0
-"""Types a second, in the long run, that are searched for in this machine's packages at once, on the event loop."""
-SEARCH_BURST: Final = 500.0
-"""Such searches at once: the types of a large robot, each searched for once."""
 SEEN_TYPES_MAX: Final = 16
 """Types of one topic's publishers that are listed."""
 SEEN_PUBLISHERS_MAX: Final = 256
 """Publishers of one topic whose headers are kept."""
-EARLY_MESSAGES: Final = 100
-"""Messages of one topic that wait until it is registered and its first subscriber is connected."""
-EARLY_BYTES: Final = 4 * MIB
-"""Bytes of these; the oldest is dropped, the newest always fits."""
 EARLY_AGE: Final = 3.0
-"""Time that one of these waits at most, as while the core is away: an older one is dropped, if it is not latched."""
-EARLY_WAIT: Final = 1.0
-"""Time that they wait for the first subscriber to connect."""
-PACKAGES_WALKED: Final = 20_000
-"""Folders that are searched for a package's assets."""
+"""Time that a message waits at most for its topic to be registered, as while the core is away: an older one is
+dropped, if it is not latched."""
 
 # --- gateways -----------------------------------------------------------------------------------------------------
 SETTLE: Final = 2.0
@@ -110,17 +78,8 @@ PING_INTERVAL: Final = 20.0
 may have left the Wi-Fi."""
 MESSAGE_TIMEOUT: Final = 120.0
 """Time for a client's message to arrive, all its fragments: the largest one at 5 Mbit/s."""
-SEND_TIMEOUT: Final = 30.0
-"""Time in which the client's machine must acknowledge what was sent (TCP_USER_TIMEOUT)."""
 WRITE_BUFFER: Final = 64 * KIB
 """Bytes in the connection's own buffer above which nothing more is written to it."""
-UNSENT_BYTES: Final = 512 * KIB
-"""Bytes that the kernel holds beyond those on their way (TCP_NOTSENT_LOWAT): a ping behind them must pass in time,
-and commands overtake images in the queue, not there."""
-TIMER_RETRY: Final = 0.1
-"""Pause before a session's timer is looked at again while its client takes nothing."""
-JOINED_BYTES: Final = 32 * KIB
-"""Largest payload that is copied behind its header; a larger one is written by itself."""
 DROPS_SHOWN: Final = 1.0
 """Shortest time between two texts to a client on the messages that it misses."""
 
@@ -259,11 +218,6 @@ LOG_LINES: Final = 500
 """Lines of the log that are kept for a page that opens it."""
 LOG_CHARACTERS: Final = 1024
 """Characters of one line of the log; the rest is cut."""
-SILENT_AFTER: Final = 1.0
-"""Time without a word on a link after which its module is shown as silent. Keepalives come more often. For a
-link at rest it is half of its lease."""
-AWAY_AFTER: Final = 7.0
-"""Time without a beacon after which a module without a link is shown as away. Heartbeats come every 5 s."""
 AGENT_SETTLES: Final = 10.0
 """Time after the start of this module's agent in which peers that it has not found yet do not count as lost: beacons
 come every 5 s at the latest, and links take seconds where names or addresses are resolved."""

@@ -13,17 +13,18 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web import limits
-from rmpa.web.monitor.live import (
+from rmpa.web.monitor.messages import (
     IMAGE_HEADER,
     SampleBuffer,
     compressed_picture,
     cut,
+    difference,
     field_path,
     number_at,
     raw_picture,
     scan,
+    without_nulls,
 )
-from rmpa.web.monitor.messages import difference, without_nulls
 from tests.web.monitor.patches import apply
 
 

@@ -11,8 +11,7 @@ from rmpa.core.errors import LimitExceeded
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode
 from rmpa.web.hub.topics import ReceivedMessage
-from rmpa.web.rosbridge.delivery import Assembler, QueuedBytes, Throttle, split
-from rmpa.web.rosbridge.protocol import OpError
+from rmpa.web.rosbridge.protocol import Assembler, OpError, QueuedBytes, Throttle, split
 
 if TYPE_CHECKING:
     import random

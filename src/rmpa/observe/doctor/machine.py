@@ -25,7 +25,7 @@ from rmpa.config.read import load_settings
 from rmpa.config.settings import Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.core.limits import KIB
+from rmpa.core.limits import KIB, MIB
 from rmpa.discovery.network import choose, list_interfaces
 from rmpa.observe import limits
 from rmpa.observe.control_client import ControlClient, find_agents
@@ -155,7 +155,7 @@ def ask_program(*words: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout[: limits.DOCTOR_OUTPUT_MAX].decode("utf-8", "replace")
+    return done.stdout[: 4 * MIB].decode("utf-8", "replace")  # the rules of a Kubernetes node have some 100 KB
 
 
 def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -216,7 +216,7 @@ def judge_clock(stepped: float, synchronised: bool | None, error: float, year: i
     if year < 2020:  # without a battery a board starts in 1970, or at its image's date
         text = f"it is the year {year} here: this machine has no clock that outlives its power"
         yield clock(FAIL, text, "let chrony or systemd-timesyncd set it", where="date")
-    if abs(stepped) > limits.DOCTOR_CLOCK_STEP:
+    if abs(stepped) > 0.005:  # slewing moves it by 0.15 ms
         text = f"the wall clock was set by {stepped * 1e3:+.1f} ms while we looked"
         remedy = "is something setting it again and again? one of chrony, ntpd and timesyncd alone, please"
         yield clock(WARN, text, remedy, where="step")
@@ -271,7 +271,7 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
     """Whether two modules' clocks agree well enough for tf and message filters; both in seconds."""
     bound = f" ±{error * 1e3:.1f} ms" if error is not None else ""
     text = f"{peer}'s clock is {abs(offset) * 1e3:.1f} ms{bound} {'ahead of' if offset > 0 else 'behind'} ours"
-    if abs(offset) - (error or 0.0) <= limits.DOCTOR_CLOCK_APART:
+    if abs(offset) - (error or 0.0) <= 0.02:  # two periods of a 100 Hz transform
         return Check("clock", OK, text, where=f"{agent}-{peer}")
     remedy = "let both follow one clock (chrony); until then tf says 'extrapolation into the future'"
     return Check("clock", WARN, text, remedy, where=f"{agent}-{peer}")
@@ -330,7 +330,8 @@ def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: b
         yield Check("realtime", WARN, "; ".join(missing), REMEDY)
     else:
         yield Check("realtime", OK, f"{'; '.join(missing)}; not asked for (rmpa up --realtime)")
-    if files is not None and files < limits.DOCTOR_FILES_LOW:
+    # Each subscriber takes one, and a proxy two where proxies cannot share their sockets.
+    if files is not None and files < 4096:
         text = f"an agent started here may have {files} open: a graph of some hundred nodes takes more"
         remedy = "systemd: LimitNOFILE=65536; a log-in: 'USER - nofile 65536' in /etc/security/limits.d/rmpa.conf"
         yield Check("files", WARN, text, remedy)

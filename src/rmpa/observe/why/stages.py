@@ -473,7 +473,7 @@ def _arrived(way: Way) -> Check:
     age, usual = now.age or 0.0, now.period.p99 if now.period is not None else None
     text = f"{now.messages} messages, the last {age:.2f} s ago"
     text += f", {now.rate:.1f} Hz" if now.rate is not None else ""
-    silent = max(observe_limits.WHY_SILENT, observe_limits.WHY_SILENT_PERIODS * (usual or 0.0))
+    silent = max(2.0, 10.0 * (usual or 0.0))  # ten of its longest usual periods
     if usual is not None and not moved and age > silent:
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
         return Check("arrived", FAIL, text, f"its publisher {now.node} on {way.peer} has fallen silent: look at it")

@@ -300,7 +300,8 @@ class WhyService:
             return (Diagnosis.of(stages, name=topic, peer=self._name, to=to),)
         question = {"topic": self._bridge.context.names.wire_name(to, topic)}
         try:
-            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], observe_limits.WHY_TIMEOUT)
+            # Its time window, and at most two requests to this agent of ASK_TIMEOUT each.
+            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], 12.0)
             if not found:
                 raise RemoteProtocolError("it walked no way at all")
             return found[: observe_limits.WHY_SOURCES_MAX]
@@ -509,9 +510,7 @@ def _name_in(args: dict[str, Any], key: str) -> str:
 async def _probe(uri: str, service: str) -> tuple[str, str]:
     """A server's description of its service, and why there is none; asked as ``rospy.wait_for_service`` does."""
     try:
-        found = await ServiceConnection.open(
-            uri, service, OWN_NODE, probe=True, persistent=False, timeout=observe_limits.WHY_PROBE
-        )
+        found = await ServiceConnection.open(uri, service, OWN_NODE, probe=True, persistent=False, timeout=2.0)
     except RmpaError as error:
         return "", str(error)
     found.close()

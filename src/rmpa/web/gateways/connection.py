@@ -20,6 +20,7 @@ import msgspec
 from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
+from rmpa.core.limits import KIB
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
 from rmpa.web.hub.hub import HubClient
@@ -501,7 +502,7 @@ class ClientConnection:
         self._timer = None
         if self._session.timer_waits and self._waiting > limits.WRITE_BUFFER:
             # The client cannot take what the session holds back: it stays there, within its bounds.
-            self._timer = asyncio.get_running_loop().call_later(limits.TIMER_RETRY, self._due)
+            self._timer = asyncio.get_running_loop().call_later(0.1, self._due)
             return
         try:
             self._session.handle_timer(self.now())
@@ -524,8 +525,10 @@ def _tune(transport: asyncio.Transport) -> None:
     sock = transport.get_extra_info("socket")
     options = (
         ("TCP_NODELAY", 1),
-        ("TCP_USER_TIMEOUT", int(limits.SEND_TIMEOUT * 1000)),
-        ("TCP_NOTSENT_LOWAT", limits.UNSENT_BYTES),
+        ("TCP_USER_TIMEOUT", 30_000),  # ms in which the client's machine must acknowledge what was sent
+        # What the kernel holds beyond the bytes on their way: a ping behind them must pass in time, and commands
+        # overtake images in the queue, not there.
+        ("TCP_NOTSENT_LOWAT", 512 * KIB),
     )
     for name, value in options:
         option = getattr(socket, name, None)

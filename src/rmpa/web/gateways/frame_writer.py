@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from aiohttp import WSCloseCode, web
 
+from rmpa.core.limits import KIB
 from rmpa.runtime.tls import unsent
 from rmpa.web import limits
 
@@ -351,7 +352,7 @@ class FrameWriter:
     def _write_by_transport(self, header: bytes, parts: Sequence[Payload]) -> None:
         small: list[Payload] = [header]
         for part in parts:
-            if len(part) <= limits.JOINED_BYTES:
+            if len(part) <= 32 * KIB:  # a larger one is written by itself, and not copied
                 small.append(part)
                 continue
             self._transport.write(b"".join(small))

@@ -122,7 +122,7 @@ def _folders(package: str, environ: Mapping[str, str]) -> Iterator[Path]:
 def _walk(root: Path, package: str) -> Iterator[Path]:
     """The folders of this name below ``root`` that are packages, nearest first; none is within another package."""
     waiting = deque([root])
-    for _ in range(limits.PACKAGES_WALKED):
+    for _ in range(20_000):
         if not waiting:
             return
         folder = waiting.popleft()
@@ -216,9 +216,7 @@ class ServedServices:
 
     async def _register(self, served: ServedService, node: Node) -> Service:
         handler = functools.partial(self._call, served)
-        return await node.advertise_service(
-            served.name, served.kind, handler, timeout=limits.SERVED_TIMEOUT, raw=True
-        )
+        return await node.advertise_service(served.name, served.kind, handler, timeout=60.0, raw=True)
 
     async def _call(self, served: ServedService, request: bytes) -> Payload:
         if len(served.calls) >= limits.SERVED_CALLS_MAX:
@@ -257,7 +255,7 @@ class ServiceCalls:
         self._link = link
         self._servers: defaultdict[tuple[str, str], _Server] = defaultdict(_Server)
         self._finding: SharedTasks[str, tuple[str, str]] = SharedTasks()
-        self._probes = asyncio.Semaphore(limits.PROBES_AT_ONCE)
+        self._probes = asyncio.Semaphore(8)  # servers that are asked for their service's type at one time
         self.found: dict[str, tuple[str, str]] = {}
         """The types and URIs that servers have told, by the service's name."""
 
@@ -338,7 +336,8 @@ class ServiceCalls:
             else:
                 if not connection.closed:
                     loop = asyncio.get_running_loop()
-                    server.idle[connection] = loop.call_later(limits.CALL_IDLE, self._drop, key, connection)
+                    # An unused connection stays open for so long.
+                    server.idle[connection] = loop.call_later(10.0, self._drop, key, connection)
                 return result
 
     async def _take(self, server: _Server, key: tuple[str, str]) -> tuple[ServiceConnection, bool]:

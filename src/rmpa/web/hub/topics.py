@@ -16,6 +16,7 @@ import msgspec
 from rmpa.config.peer_rules import Access
 from rmpa.core.counters import logged_failure
 from rmpa.core.errors import PeerRefused
+from rmpa.core.limits import MIB
 from rmpa.ros.types.messages import HeaderNumbers
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
@@ -41,7 +42,7 @@ class PayloadBuffers:
         kept_bytes: Bytes of the buffers that are kept, used and unused.
     """
 
-    def __init__(self, kept_bytes: int = limits.PAYLOAD_BUFFERS_BYTES) -> None:
+    def __init__(self, kept_bytes: int = 16 * MIB) -> None:  # what waits for one slow client
         self._limit = kept_bytes
         self._kept: deque[bytearray] = deque()
         """Those used last are at the right."""
@@ -503,9 +504,7 @@ class Publishers:
             there.early, there.early_bytes = deque(), 0
         there.early.append((asyncio.get_running_loop().time(), payload))
         there.early_bytes += len(payload)
-        while len(there.early) > limits.EARLY_MESSAGES or (
-            len(there.early) > 1 and there.early_bytes > limits.EARLY_BYTES
-        ):
+        while len(there.early) > 100 or (len(there.early) > 1 and there.early_bytes > 4 * MIB):
             there.early_bytes -= len(there.early.popleft()[1])
 
     def _begin(self, topic: str, type_: str, users: set[ClientPublication], *, latch: bool) -> _Publisher:
@@ -534,7 +533,7 @@ class Publishers:
         if there.early is not None and not there.latch:
             # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(limits.EARLY_WAIT):
+                async with asyncio.timeout(1.0):
                     await publisher.wait_for_subscriber()
         early, there.early = there.early, None
         oldest = asyncio.get_running_loop().time() - limits.EARLY_AGE

@@ -21,8 +21,7 @@ from rmpa.core.identity import is_global_name
 from rmpa.web import limits
 from rmpa.web.gateways.connection import Session, struct_of
 from rmpa.web.gateways.frame_writer import Opcode
-from rmpa.web.monitor.live import WatchState
-from rmpa.web.monitor.messages import VERSION, Tree, difference
+from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
 from rmpa.web.monitor.questions import QUESTIONS
 
 if TYPE_CHECKING:

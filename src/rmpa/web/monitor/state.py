@@ -275,13 +275,14 @@ def module_state(peer: PeerInfo) -> str:
     if peer.state == "linked":
         if peer.link is None or peer.link.heard_ago is None:
             return "up"
-        after = peer.link.lease / 2 if peer.link.rests else limits.SILENT_AFTER
+        after = peer.link.lease / 2 if peer.link.rests else 1.0  # keepalives come more often
         return "silent" if peer.link.heard_ago > after else "up"
     if peer.state in ("refused", "conflict"):
         return "refused"
     if peer.state == "relayed":
         return "relayed"
-    return "linking" if peer.beacon_ago is not None and peer.beacon_ago <= limits.AWAY_AFTER else "away"
+    # Heartbeats come every 5 s.
+    return "linking" if peer.beacon_ago is not None and peer.beacon_ago <= 7.0 else "away"
 
 
 def _module(peer: PeerInfo, taken: float, rates: Sequence[float]) -> Tree:

@@ -11,13 +11,15 @@ from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.web import limits
 from rmpa.web.gateways.connection import ClientStream, Session, struct_of
-from rmpa.web.rosbridge.delivery import Assembler, QueuedBytes, Throttle, split
 from rmpa.web.rosbridge.protocol import (
+    Assembler,
     Compression,
     Id,
     OpError,
     Part,
     PublishFrames,
+    QueuedBytes,
+    Throttle,
     check_count,
     decode_png,
     encode,
@@ -26,6 +28,7 @@ from rmpa.web.rosbridge.protocol import (
     id_of,
     parse_frame,
     read_op,
+    split,
     type_name,
     whole,
 )
