@@ -88,8 +88,8 @@ def _asking_for_direct(settings: Settings) -> list[str]:
 
 
 _log = logging.getLogger(__name__)
+# Seconds in which a program that has the core's port says whether it is a ROS master.
 _ASKED: Final = 1.0
-"""Seconds in which a program that has the core's port says whether it is a ROS master."""
 
 
 async def start_core(core: Core, settings: Settings) -> None:
@@ -165,10 +165,10 @@ def make_core(settings: Settings) -> Core:
     return ExternalCore(uri, own_node=OWN_NODE, node_host=host, node_address=address)
 
 
+# The loggers that /rmpa/set_logger_level can set: the whole agent, or one room.
 _LOGGERS: Final = {
     name: name for name in ("rmpa", "rmpa.agent", "rmpa.bridge", "rmpa.discovery", "rmpa.mesh", "rmpa.ros")
 }
-"""The loggers that /rmpa/set_logger_level can set: the whole agent, or one room."""
 
 
 class Agent:
@@ -178,6 +178,12 @@ class Agent:
         settings: Complete: the name is filled in.
         realtime: The outcomes of ``--realtime``, ready to read.
         load: Reads the settings again, as they were read for this agent; it may block.
+
+    Attributes:
+        trust: This module's part in a secured mesh; ``None``: trust is off.
+        reloaded: Called when changed settings hold.
+        other_notes: What else the snapshot's notes tell: of parts that the agent does not make itself.
+        sites: Answers questions about other sites; a gateway answers them itself.
     """
 
     def __init__(
@@ -202,16 +208,13 @@ class Agent:
         for part in (self.params, self.services, nodes, twins):
             self.bridge.add(part)
         self.trust: AgentTrust | None = None
-        """This module's part in a secured mesh; ``None``: trust is off."""
         if membership is not None:
             self.trust = AgentTrust(settings, membership, self.bridge, clock)
             self.bridge.add(self.trust)
         self.network = Network(settings, self.bridge, self.trust)
         self.reloader = Reloader(settings, load, self.apply_settings)
         self.reloaded: Callable[[], None] = lambda: None
-        """Called when changed settings hold."""
         self.other_notes: list[Callable[[], Iterable[str]]] = []
-        """What else the snapshot's notes tell: of parts that the agent does not make itself."""
         counters = Counters()
         parts = AgentParts(
             core=self.core,
@@ -228,7 +231,6 @@ class Agent:
         needs = Needs((), "figures of the agent, none of the module's graph")
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.peer_agent(), needs)
         self.sites = SiteRequests(self.bridge)
-        """Answers questions about other sites; a gateway answers them itself."""
         self.why = WhyService(settings.name, parts, self.snapshots, self.sites)
         self.operations = ControlOperations(
             settings.name, self.bridge, self.params, self.snapshots, nodes, self.sites

@@ -155,6 +155,9 @@ class Network:
         settings: The agent's settings.
         bridge: Its bridge.
         trust: This module's part in a secured mesh; ``None``: trust is off.
+
+    Attributes:
+        endpoint: The place now; ``None`` before the start, and while the agent moves.
     """
 
     def __init__(self, settings: Settings, bridge: Bridge, trust: AgentTrust | None = None) -> None:
@@ -164,7 +167,6 @@ class Network:
         self._moving: asyncio.Task[None] | None = None
         self._over = asyncio.Event()
         self.endpoint: NetworkEndpoint | None = None
-        """The place now; ``None`` before the start, and while the agent moves."""
 
     async def start(self) -> None:
         """Join the network.

@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
 
+# Until rmpa web is started anew after it ended; each further time it is twice as long.
 WEB_RESTART_FIRST: Final = 0.5
-"""Until rmpa web is started anew after it ended; each further time it is twice as long."""
+# The longest such time.
 WEB_RESTART_CAP: Final = 30.0
-"""The longest such time."""
+# After a run of this length the next wait is the first one again.
 WEB_STEADY: Final = 60.0
-"""After a run of this length the next wait is the first one again."""
+# For rmpa web to end when the agent ends; then it is killed.
 WEB_END_TIMEOUT: Final = 5.0
-"""For rmpa web to end when the agent ends; then it is killed."""
 
 
 # Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``).
@@ -47,10 +47,10 @@ WEB_END_TIMEOUT: Final = 5.0
 
 _log = logging.getLogger(__name__)
 
+# The fields of ``Settings`` that a running agent takes; all others need a restart.
 LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
-"""The fields of ``Settings`` that a running agent takes; all others need a restart."""
+# The most characters of a value in a text for the user.
 _VALUE_SHOWN: Final = 60
-"""The most characters of a value in a text for the user."""
 
 
 class Reloader:
@@ -60,6 +60,9 @@ class Reloader:
         settings: Those that the agent runs with.
         load: Reads all sources again; may take long and raise ``ConfigError``.
         apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
+
+    Attributes:
+        waiting: The settings that need a restart to take effect, as of the last reload.
     """
 
     def __init__(
@@ -70,7 +73,6 @@ class Reloader:
         self._apply = apply
         self._one = asyncio.Lock()
         self.waiting: tuple[str, ...] = ()
-        """The settings that need a restart to take effect, as of the last reload."""
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
         """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
@@ -176,8 +178,8 @@ def _shown(value: object) -> str:
 # did.
 
 
+# The exit code of a command that cannot run as it is written: another start would end alike.
 _USAGE: Final = 2
-"""The exit code of a command that cannot run as it is written: another start would end alike."""
 
 
 def web_command(settings: Settings) -> list[str]:
@@ -205,6 +207,9 @@ class WebProcess:
         command: Its command line.
         rng: Uniform numbers in [0, 1), for the delays.
         environ: Its environment; ``None``: the agent's.
+
+    Attributes:
+        pid: The child's process id, while it runs.
     """
 
     def __init__(
@@ -219,7 +224,6 @@ class WebProcess:
         self._backoff = Backoff(WEB_RESTART_FIRST, WEB_RESTART_CAP, rng)
         self._task: asyncio.Task[None] | None = None
         self.pid: int | None = None
-        """The child's process id, while it runs."""
 
     def start(self) -> None:
         """Start the child, and look after it until ``close()``."""

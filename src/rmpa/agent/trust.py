@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
+# The request for a certificate, at the authority: ``{"request": BASE64}`` to ``{"certificate": BASE64}``.
 RENEW: Final = "trust.renew"
-"""The request for a certificate, at the authority: ``{"request": BASE64}`` to ``{"certificate": BASE64}``."""
 NOT_AUTHORITY: Final = "this module is not the authority of its mesh"
 
 
@@ -97,6 +97,11 @@ class AgentTrust(Part):
 
     Raises:
         StartError: A file of the authority is broken.
+
+    Attributes:
+        identity: This module's place in the network; ``None`` while it has none.
+        authority: What the authority has; ``None``: this module is not it.
+        joins: The joins at the authority.
     """
 
     # More than 12 fields: documents, renewals of others and the renewal of its own need all of the membership.
@@ -107,7 +112,6 @@ class AgentTrust(Part):
 
         self.membership = membership
         self.identity: Identity | None = None
-        """This module's place in the network; ``None`` while it has none."""
         self._settings = settings
         self._bridge = bridge
         self._clock = clock
@@ -116,9 +120,7 @@ class AgentTrust(Part):
         self._spreading = DocumentSpreading(membership.number)
         self._authority_peer: PeerSession | None = None
         self.authority: MeshAuthority | None = None
-        """What the authority has; ``None``: this module is not it."""
         self.joins: JoinServer | None = None
-        """The joins at the authority."""
         if membership.store.is_authority:
             self.authority = MeshAuthority(membership)
             self.joins = JoinServer(self.authority, clock, self.is_linked, bridge.counters)
@@ -359,8 +361,8 @@ def _read(raw: object, form: type[_T]) -> _T:
 # Answers ``rmpa trust …`` on the control socket of a secured agent.
 
 
+# Seconds for which ``rmpa trust invite`` is kept waiting for the next step of a join; then it asks again.
 _STEP_WAIT: Final = 5.0
-"""Seconds for which ``rmpa trust invite`` is kept waiting for the next step of a join; then it asks again."""
 Args = dict[str, object]
 
 

@@ -51,6 +51,10 @@ class Bridge(Shared):
         settings: What may cross, and how.
         rng: Uniform numbers in [0, 1) for back-off jitter.
         permissions: What each peer may do here; ``None``: the mesh is not secured.
+
+    Attributes:
+        gate: Decides what each peer may do.
+        proxy_nodes: Makes the nodes that stand for the nodes of peers.
     """
 
     def __init__(
@@ -65,7 +69,6 @@ class Bridge(Shared):
         self.rng = rng
         self.counters = Counters()
         self.gate = PermissionGate(permissions, self.counters)
-        """Decides what each peer may do."""
         self.context = BridgeContext.of(settings, self.gate)
         self.rpc = PeerRpc(self.counters)
         kills = ProxyKills(self.rpc)
@@ -80,7 +83,6 @@ class Bridge(Shared):
             taps=lambda: self.topics.outbound.connections,
         )
         self.proxy_nodes = ProxyNodes(core, self.counters)
-        """Makes the nodes that stand for the nodes of peers."""
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
@@ -190,22 +192,22 @@ class Bridge(Shared):
 # several modules a name is offered by one module, and taken by others.
 
 
+# Names in common that make two modules twins.
 _NAMES_MIN: Final = 3
-"""Names in common that make two modules twins."""
+# Of these, names that both offer: a driver and its driven have none, whatever passes between them.
 OFFERED_MIN: Final = 2
-"""Of these, names that both offer: a driver and its driven have none, whatever passes between them."""
 _NAMES_SHOWN: Final = 4
+# Names that modules of every kind may share: transforms, diagnostics, time, logs, and those of common tools.
 _COMMON: Final = frozenset({
     "/tf", "/tf_static", "/diagnostics", "/diagnostics_agg", "/diagnostics_toplevel_state", "/statistics",
     "/client_count", "/connected_clients", "/clock", "/rosout", "/rosout_agg",
 })  # fmt: skip
-"""Names that modules of every kind may share: transforms, diagnostics, time, logs, and those of common tools."""
+# Ends of names of nodes' own interfaces: dynamic_reconfigure, nodelets, Smart Resources.
 _COMMON_ENDINGS: Final = (
     "/parameter_updates", "/parameter_descriptions", "/bond",
     "/quality", "/requirements", "/responses", "/observed", "/alarms", "/profile", "/context", "/state", "/decision",
     "/descriptor", "/set_context",
 )  # fmt: skip
-"""Ends of names of nodes' own interfaces: dynamic_reconfigure, nodelets, Smart Resources."""
 
 
 def telling(names: Iterable[str]) -> frozenset[str]:
@@ -246,8 +248,8 @@ def twin_text(peer: str, names: tuple[str, ...]) -> str:
 # Finds twins among the peers, and tells each that may be one what this module's nodes take.
 
 
+# The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to.
 TAKEN: Final = "names.taken"
-"""The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to."""
 
 
 class TwinWatch(Part):
@@ -255,6 +257,10 @@ class TwinWatch(Part):
 
     Args:
         bridge: The local graph, the sessions, topics and requests.
+
+    Attributes:
+        _said: By peer: the names that it was told last.
+        _taken_there: By peer: what its nodes take, by wire names, as it said last.
     """
 
     def __init__(self, bridge: Bridge) -> None:
@@ -265,9 +271,7 @@ class TwinWatch(Part):
         self._offered: frozenset[str] = frozenset()
         self._taken: frozenset[str] = frozenset()
         self._said: dict[int, tuple[str, ...]] = {}
-        """By peer: the names that it was told last."""
         self._taken_there: dict[int, tuple[str, ...]] = {}
-        """By peer: what its nodes take, by wire names, as it said last."""
         self._twins: dict[int, tuple[str, ...]] = {}
         bridge.rpc.on_notification(TAKEN, self._told_by_peer, Needs((), "names of the peer's own graph"))
 

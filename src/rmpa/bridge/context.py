@@ -39,6 +39,9 @@ class PeerNames:
     Args:
         peer: The peer's name.
         rules: All ``[[peer]]`` tables, in the order of the file; those for other peers are ignored.
+
+    Attributes:
+        prefix: The prefix of the peer's names in the local graph, such as ``/robot1``, or empty.
     """
 
     def __init__(self, peer: str, rules: Iterable[PeerRule] = ()) -> None:
@@ -47,7 +50,6 @@ class PeerNames:
         self._in = [_filled(each, peer) for rule in mine for each in rule.remap_in]
         self._out = [_filled(each, peer) for rule in mine for each in rule.remap_out]
         self.prefix: Final = prefix
-        """The prefix of the peer's names in the local graph, such as ``/robot1``, or empty."""
 
     @property
     def plain(self) -> bool:
@@ -142,8 +144,8 @@ def _renamed(name: str, source: str, target: str) -> str | None:
 
 
 OWN_SERVICES: Final = "/rmpa/**"
+# Every node has these two services; if they crossed, they would double the graph for no use.
 LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
-"""Every node has these two services; if they crossed, they would double the graph for no use."""
 
 
 class ServiceRules:

@@ -46,18 +46,21 @@ class GraphPart(Part, Effects):
         shared: The core, the peers and the rules.
         exports: The class of ``exports``.
         imports: The class of ``imports``.
+
+    Attributes:
+        exports: What is offered.
+        imports: What peers offer.
+        direct_exports: Direct connections of peers' nodes to local ones.
+        direct_imports: Direct connections of local nodes to peers' ones.
+        verb: What a peer does with its entries, for the log.
+        refusals: Logs and counts warnings, and peers that break the protocol.
     """
 
     exports: OfferBook[Any, Any, Any]
-    """What is offered."""
     imports: ImportBook[Any, Any, Any]
-    """What peers offer."""
     direct_exports: Grants
-    """Direct connections of peers' nodes to local ones."""
     direct_imports: Paths[Any]
-    """Direct connections of local nodes to peers' ones."""
     verb: ClassVar[str]
-    """What a peer does with its entries, for the log."""
 
     def __init__(
         self, shared: Shared, exports: type[OfferBook[Any, Any, Any]], imports: type[ImportBook[Any, Any, Any]]
@@ -65,7 +68,6 @@ class GraphPart(Part, Effects):
         self._shared = shared
         self.rng = shared.rng
         self.refusals = RefusalLog(_log, shared.counters)
-        """Logs and counts warnings, and peers that break the protocol."""
         self.exports = exports(self)
         self.imports = imports(self)
         self._timer = MachineTimer(self.imports.next_timer, self.imports.handle_timer)

@@ -9,190 +9,189 @@ from typing import Final
 
 from rmpa.core.limits import KIB, MIB
 
+# Seconds that a peer has to answer a request to open a route. Then a topic's route is asked for again, and a
+# service's is given up: the calls that wait for it fail.
 ROUTE_OPEN_TIMEOUT: Final = 5.0
-"""Seconds that a peer has to answer a request to open a route. Then a topic's route is asked for again, and a
-service's is given up: the calls that wait for it fail."""
+# Seconds that a topic's route stays open after its last local subscriber left: a reconnecting node finds it open.
 ROUTE_LINGER: Final = 1.0
-"""Seconds that a topic's route stays open after its last local subscriber left: a reconnecting node finds it open."""
+# Entries that one advertisement of this module takes from the pending changes; the rest follows in later turns of the
+# event loop.
 ADVERTISED_AT_ONCE: Final = 64
-"""Entries that one advertisement of this module takes from the pending changes; the rest follows in later turns of
-the event loop."""
+# Seconds until the next attempt to advertise, while the portions sent before still wait on the lane.
 TELL_PAUSE: Final = 0.005
-"""Seconds until the next attempt to advertise, while the portions sent before still wait on the lane."""
+# Seconds after which a portion is sent although the lane is busy. On a lane that is never empty the graph still
+# advances, at some 0.5 Mbit/s.
 TELL_PATIENCE: Final = 0.1
-"""Seconds after which a portion is sent although the lane is busy. On a lane that is never empty the graph still
-advances, at some 0.5 Mbit/s."""
+# Bytes of one advertisement, which is parsed in one piece. This module's own take 200 KB with the longest names, and
+# 5 KB with usual ones.
 ADVERTISEMENT_MAX: Final = 1 * MIB
-"""Bytes of one advertisement, which is parsed in one piece. This module's own take 200 KB with the longest names, and
-5 KB with usual ones."""
+# Bytes of received advertisements, of all peers, that may wait to be parsed: some 40,000 topics. Beyond it the oldest
+# are parsed at once.
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
-"""Bytes of received advertisements, of all peers, that may wait to be parsed: some 40,000 topics. Beyond it the
-oldest are parsed at once."""
+# Sources of a received advertisement that are applied in one turn of the event loop, which takes some 100
+# microseconds; then data goes first.
 APPLIED_AT_ONCE: Final = 16
-"""Sources of a received advertisement that are applied in one turn of the event loop, which takes some 100
-microseconds; then data goes first."""
+# Names of the local graph that are examined in one turn of the event loop, after a change or to reconcile.
 RESCANNED_AT_ONCE: Final = 16
-"""Names of the local graph that are examined in one turn of the event loop, after a change or to reconcile."""
+# Topics, and likewise services, of one peer beyond ``[limits]`` that are remembered, some 400 B each; they are taken
+# when there is room. Further ones come with the peer's next link.
 REFUSED_MAX: Final = 32_768
-"""Topics, and likewise services, of one peer beyond ``[limits]`` that are remembered, some 400 B each; they are taken
-when there is room. Further ones come with the peer's next link."""
+# Topics or services in one advertisement of a peer, else it is refused; this module's have at most
+# ``ADVERTISED_AT_ONCE``.
 ADVERTISED_MAX: Final = 16_384
-"""Topics or services in one advertisement of a peer, else it is refused; this module's have at most
-``ADVERTISED_AT_ONCE``."""
+# Refused subscribers of one source that are remembered, to show them to the user.
 MISMATCHES_MAX: Final = 16
-"""Refused subscribers of one source that are remembered, to show them to the user."""
+# Relays between two modules: five networks in a row. Each adds a hop's delay, and longer rows are a mistake.
 RELAY_HOPS_MAX: Final = 4
-"""Relays between two modules: five networks in a row. Each adds a hop's delay, and longer rows are a mistake."""
+# The lowest route number of a service; topics' routes are counted from 1.
 SERVICE_ROUTES: Final = 1 << 31
-"""The lowest route number of a service; topics' routes are counted from 1."""
+# Seconds that the serving agent waits longer than the calling one, so that the calling agent's time-out, which has
+# the more useful error text, comes first.
 SERVICE_GRACE: Final = 1.0
-"""Seconds that the serving agent waits longer than the calling one, so that the calling agent's time-out, which has
-the more useful error text, comes first."""
+# Seconds without a call after which a service's route, and a connection to its server, is closed.
 SERVICE_IDLE: Final = 30.0
-"""Seconds without a call after which a service's route, and a connection to its server, is closed."""
+# Connections to the server of one service, and so the calls that it gets at once: each connection carries one call at
+# a time, and rospy runs a thread for each.
 SERVICE_POOL: Final = 32
-"""Connections to the server of one service, and so the calls that it gets at once: each connection carries one call
-at a time, and rospy runs a thread for each."""
+# Calls of one service that may wait for such a connection; further ones are refused at once.
 SERVICE_QUEUE: Final = 1024
-"""Calls of one service that may wait for such a connection; further ones are refused at once."""
+# Bytes of requests and responses on one link that are in transfer or being reassembled, each way: four of the largest
+# messages.
 SERVICE_BYTES: Final = 256 * MIB
-"""Bytes of requests and responses on one link that are in transfer or being reassembled, each way: four of the
-largest messages."""
+# Seconds between two checks that the servers of offered services still listen; a killed one is noticed within 1 s.
 SERVER_LOOK: Final = 0.5
-"""Seconds between two checks that the servers of offered services still listen; a killed one is noticed within 1
-s."""
+# The latest calls of a service from which its latency figures are computed.
 SERVICE_LATENCIES: Final = 512
-"""The latest calls of a service from which its latency figures are computed."""
+# Nodes subscribed to one topic that are named to the agent of its publisher.
 AUDIENCE_MAX: Final = 64
-"""Nodes subscribed to one topic that are named to the agent of its publisher."""
+# Connections that represent the subscribers of one peer (``bridge.topics.subscribers``): enough for 512 action
+# servers of one module.
 AUDIENCES_MAX: Final = 1024
-"""Connections that represent the subscribers of one peer (``bridge.topics.subscribers``): enough for 512 action
-servers of one module."""
+# Characters in the name of a request between agents.
 ASK_NAME_MAX: Final = 64
-"""Characters in the name of a request between agents."""
+# Requests of one peer that are being answered; further ones are refused at once.
 ASKS_AT_ONCE: Final = 64
-"""Requests of one peer that are being answered; further ones are refused at once."""
+# Seconds that another agent has to answer a request.
 ASK_TIMEOUT: Final = 5.0
-"""Seconds that another agent has to answer a request."""
+# Bytes of a request or response, or characters of the text in one, that take the control lane: a millisecond on a 100
+# Mbit/s link. Larger ones take the bulk lane, so commands do not wait for megabytes to pass.
 ASK_EXPRESS_MAX: Final = 16 * KIB
-"""Bytes of a request or response, or characters of the text in one, that take the control lane: a millisecond on a
-100 Mbit/s link. Larger ones take the bulk lane, so commands do not wait for megabytes to pass."""
+# Bytes of one request or response: the text of a parameter, and what is around it.
 ASK_BYTES_MAX: Final = 17 * MIB
-"""Bytes of one request or response: the text of a parameter, and what is around it."""
+# Bytes of large requests and responses on one link that wait, are reassembled or are answered, each way: four of the
+# largest parameters.
 ASK_BYTES: Final = 64 * MIB
-"""Bytes of large requests and responses on one link that wait, are reassembled or are answered, each way: four of the
-largest parameters."""
+# Characters of a parameter, as XML-RPC text, that may cross between modules; within one module ``HTTP_BODY_MAX``
+# holds.
 PARAM_TEXT_MAX: Final = 16 * MIB
-"""Characters of a parameter, as XML-RPC text, that may cross between modules; within one module ``HTTP_BODY_MAX``
-holds."""
+# Parameters in one value that a peer sets: each takes the core some 0.25 ms, between data; a large robot has some
+# thousand in all.
 PARAMS_SET_MAX: Final = 10_000
-"""Parameters in one value that a peer sets: each takes the core some 0.25 ms, between data; a large robot has some
-thousand in all."""
+# Modules of another site for which a gateway asks at once: as many as one mesh has.
 PARAM_ASKERS_MAX: Final = 256
-"""Modules of another site for which a gateway asks at once: as many as one mesh has."""
+# Seconds that a peer has to answer a request about a parameter: as data goes first, its core may need seconds for
+# megabytes of numbers. Less than CONTROL_HANDLER_TIMEOUT, so that the error names the agent that did not answer.
 PARAM_ASK_TIMEOUT: Final = 25.0
-"""Seconds that a peer has to answer a request about a parameter: as data goes first, its core may need seconds for
-megabytes of numbers. Less than CONTROL_HANDLER_TIMEOUT, so that the error names the agent that did not answer."""
+# Seconds for the agent, when it ends, to unsubscribe from all parameters at the local core.
 PARAM_LEAVE_TIMEOUT: Final = 1.0
-"""Seconds for the agent, when it ends, to unsubscribe from all parameters at the local core."""
+# Seconds over which changes of a followed parameter are gathered: a node that loads twenty keys of a namespace sets
+# each of them.
 PARAM_GATHER: Final = 0.05
-"""Seconds over which changes of a followed parameter are gathered: a node that loads twenty keys of a namespace sets
-each of them."""
+# Characters up to which a followed parameter is compared each RECONCILE_INTERVAL. For larger ones the core's own
+# notifications are relied on; they are compared when one has come, or the core was restarted.
 PARAM_SMALL: Final = 64 * KIB
-"""Characters up to which a followed parameter is compared each RECONCILE_INTERVAL. For larger ones the core's own
-notifications are relied on; they are compared when one has come, or the core was restarted."""
+# Characters of all followed parameters together, which are kept here so that they can be put back.
 FOLLOWED_BYTES_MAX: Final = 64 * MIB
-"""Characters of all followed parameters together, which are kept here so that they can be put back."""
+# Characters of a human-readable text in a control message.
 CONTROL_TEXT_MAX: Final = 16 * KIB
-"""Characters of a human-readable text in a control message."""
+# Seconds that a peer's agent has to end a node: the node's answer to the call, and the wait for its end.
 NODE_KILL_TIMEOUT: Final = 10.0
-"""Seconds that a peer's agent has to end a node: the node's answer to the call, and the wait for its end."""
+# Nodes of peers that are being ended on request at one time; further requests are refused.
 NODE_KILLS_AT_ONCE: Final = 16
-"""Nodes of peers that are being ended on request at one time; further requests are refused."""
+# Seconds in which a caller that asked the agent's own node to end can end no node of another module. Each further
+# call of it starts the time anew: `rosnode kill -a` asks all nodes of the graph, one after the other.
 NODE_KILL_ALL: Final = 2.0
-"""Seconds in which a caller that asked the agent's own node to end can end no node of another module. Each further
-call of it starts the time anew: `rosnode kill -a` asks all nodes of the graph, one after the other."""
+# Seconds after which a proxy whose subscribers were disconnected is registered again: at once, and once more for slow
+# subscribers.
 CALL_BACK_DELAYS: Final = (0.05, 1.0)
-"""Seconds after which a proxy whose subscribers were disconnected is registered again: at once, and once more for
-slow subscribers."""
+# Seconds from a change of the graph until peers are told of the nodes of which nothing crosses: a node that starts
+# registers in several steps.
 NODES_PAUSE: Final = 1.0
-"""Seconds from a change of the graph until peers are told of the nodes of which nothing crosses: a node that starts
-registers in several steps."""
+# Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck.
 RECONCILE_INTERVAL: Final = 5.0
-"""Seconds between two comparisons of the plan with what is really open, so that nothing stays stuck."""
+# Topics that a peer is told nodes here subscribe to, if it may be a twin: 30 KB at most, and a few are enough.
 TWIN_NAMES_MAX: Final = 128
-"""Topics that a peer is told nodes here subscribe to, if it may be a twin: 30 KB at most, and a few are enough."""
+# Comparisons in a row that leave out names while the local graph has not changed: all are compared once a minute.
 RECONCILE_SKIPS: Final = 11
-"""Comparisons in a row that leave out names while the local graph has not changed: all are compared once a minute."""
+# The latest events of a topic's contract that are remembered, to show them to the user; the counts include all
+# others.
 WATCH_RECENT: Final = 16
-"""The latest events of a topic's contract that are remembered, to show them to the user; the counts include all
-others."""
+# Seconds between two checks of a source whose liveliness is lost: its messages only store their arrival time and call
+# nothing, so its return is found by these checks.
 WATCH_LOOK: Final = 0.25
-"""Seconds between two checks of a source whose liveliness is lost: its messages only store their arrival time and
-call nothing, so its return is found by these checks."""
+# Losses of one kind that are at most this many seconds apart are remembered as one event.
 WATCH_RUN: Final = 1.0
-"""Losses of one kind that are at most this many seconds apart are remembered as one event."""
+# Messages of a remote source from which its figures are computed. They take 10 KB a route, and five of them lie above
+# the 99th percentile.
 QUALITY_WINDOW: Final = 512
-"""Messages of a remote source from which its figures are computed. They take 10 KB a route, and five
-of them lie above the 99th percentile."""
+# Seconds over which a rate is counted where ``QUALITY_WINDOW`` spans less: at 47 kHz it holds one burst of 11 ms.
 QUALITY_RATE_SPAN: Final = 1.0
-"""Seconds over which a rate is counted where ``QUALITY_WINDOW`` spans less: at 47 kHz it holds one burst of 11 ms."""
+# Seconds. A shorter silence is a pause of this agent between two reads, not one of the source, and does not lower the
+# rate.
 QUALITY_SILENCE: Final = 0.1
-"""Seconds. A shorter silence is a pause of this agent between two reads, not one of the source, and does not lower
-the rate."""
+# Seconds after which a message no longer counts for the figures of its source.
 QUALITY_SPAN: Final = 60.0
-"""Seconds after which a message no longer counts for the figures of its source."""
+# Estimates that are remembered of each link's clock: one or two a second over ``QUALITY_SPAN``.
 QUALITY_CLOCKS: Final = 128
-"""Estimates that are remembered of each link's clock: one or two a second over ``QUALITY_SPAN``."""
+# Seconds in which at most two of these estimates are remembered. An estimate comes once a second, and at each request
+# for it.
 QUALITY_CLOCK_STEP: Final = 0.9
-"""Seconds in which at most two of these estimates are remembered. An estimate comes once a second, and at each
-request for it."""
+# Seconds that a subscriber's `requestTopic` waits at most for the decision about direct transport; then it is
+# answered with the proxy's address, and moved when the decision is there. The decision takes one round trip between
+# the agents, one call of the publisher and one connection to it: a few milliseconds.
 DIRECT_HOLD: Final = 0.25
-"""Seconds that a subscriber's `requestTopic` waits at most for the decision about direct transport; then it is
-answered with the proxy's address, and moved when the decision is there. The decision takes one round trip between the
-agents, one call of the publisher and one connection to it: a few milliseconds."""
+# Seconds that a peer has to answer a request for a direct connection; its publisher may be slow.
 DIRECT_ASK_TIMEOUT: Final = 5.0
-"""Seconds that a peer has to answer a request for a direct connection; its publisher may be slow."""
+# Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others pass.
+# Services of one peer have as many places for themselves.
 DIRECT_ASKS: Final = 16
-"""Requests for direct connections that this agent sends at a time; less than `ASKS_AT_ONCE`, so that others
-pass. Services of one peer have as many places for themselves."""
+# Seconds that a local node has to answer a question about direct transport.
 DIRECT_NODE_TIMEOUT: Final = 2.0
-"""Seconds that a local node has to answer a question about direct transport."""
+# Seconds for which a node's TCPROS port is not asked for again; it changes only with the node's process.
 DIRECT_PORT_KNOWN: Final = 10.0
-"""Seconds for which a node's TCPROS port is not asked for again; it changes only with the node's process."""
+# Seconds that a peer's node has to answer a probe. A firewall that drops packets costs this once for each node.
 DIRECT_PROBE_TIMEOUT: Final = 1.0
-"""Seconds that a peer's node has to answer a probe. A firewall that drops packets costs this once for each node."""
+# Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot be
+# reached) is considered again.
 DIRECT_RETRY: Final = 30.0
-"""Seconds after which a subscriber that was refused for a passing reason (the node does not answer, the port cannot
-be reached) is considered again."""
+# Seconds between two requests for one subscriber that a peer's notifications cause.
 DIRECT_RETRY_PAUSE: Final = 1.0
-"""Seconds between two requests for one subscriber that a peer's notifications cause."""
+# Seconds between two looks at the kernel's table, whether direct connections still stand.
 DIRECT_CHECK: Final = 1.0
-"""Seconds between two looks at the kernel's table, whether direct connections still stand."""
+# Seconds that a subscriber has to connect after it was answered the publisher's address.
 DIRECT_SETTLE: Final = 2.0
-"""Seconds that a subscriber has to connect after it was answered the publisher's address."""
+# Direct connections that one peer may have to publishers of this module, and as many to its services.
 DIRECT_MAX: Final = 1024
-"""Direct connections that one peer may have to publishers of this module, and as many to its services."""
+# Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
+# direct connection from an earlier run of the agent.
 DIRECT_ADOPT: Final = 10.0
-"""Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
-direct connection from an earlier run of the agent."""
+# Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
+# (``core.limits.RESUME_WINDOW``).
 DIRECT_KEEP: Final = 30.0
-"""Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
-(``core.limits.RESUME_WINDOW``)."""
+# A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`.
 DIRECT_BREAKS: Final = 3
-"""A direct connection that broke so many times within `DIRECT_BREAKS_SPAN` seconds is relayed for `DIRECT_RETRY`."""
+# Seconds; see `DIRECT_BREAKS`.
 DIRECT_BREAKS_SPAN: Final = 10.0
-"""Seconds; see `DIRECT_BREAKS`."""
+# Seconds that a move waits until an ended connection is gone. Without CAP_NET_ADMIN a roscpp subscriber closes it by
+# itself in this time.
 DIRECT_MOVE_WAIT: Final = 0.5
-"""Seconds that a move waits until an ended connection is gone. Without CAP_NET_ADMIN a roscpp subscriber closes it by
-itself in this time."""
+# Seconds after which a subscriber that was made to hang up gets the list of publishers once more: a roscore's graph
+# is known up to 1.3 s late, and a call to a busy node may fail.
 DIRECT_LIST_AGAIN: Final = 3.0
-"""Seconds after which a subscriber that was made to hang up gets the list of publishers once more: a roscore's graph
-is known up to 1.3 s late, and a call to a busy node may fail."""
+# Seconds between two looks while a move waits.
 DIRECT_LOOK: Final = 0.02
-"""Seconds between two looks while a move waits."""
 
 # --- permissions ----------------------------------------------------------------------------------------------
+# Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
+# invented, are only counted until the rules change.
 REFUSALS_LOGGED: Final = 128
-"""Modules and sites that are logged as refused by one rule for one kind of access; further ones, whose names may be
-invented, are only counted until the rules change."""

@@ -21,8 +21,8 @@ from rmpa.core.identity import BASE_NAME, GLOBAL_NAME, TYPE_NAME, Guid, is_globa
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
+# A global ROS name. The types below are checked where a message of a peer is decoded, and nowhere else.
 Name = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{GLOBAL_NAME}\Z")]
-"""A global ROS name. The types below are checked where a message of a peer is decoded, and nowhere else."""
 PeerName = Annotated[str, Meta(max_length=core_limits.PEER_NAME_MAX, pattern=rf"\A{BASE_NAME}\Z")]
 NameOrNone = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A({GLOBAL_NAME})?\Z")]
 TypeName = Annotated[str, Meta(max_length=config_limits.CROSSING_NAME_MAX, pattern=rf"\A{TYPE_NAME}\Z")]

@@ -43,33 +43,31 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# The notification of the sender's nodes of which nothing crosses: ``nodes``, their names.
 NODES: Final = "nodes"
-"""The notification of the sender's nodes of which nothing crosses: ``nodes``, their names."""
+# The request for a module's own nodes.
 LIST: Final = "node.list"
-"""The request for a module's own nodes."""
+# The request for the facts about a ``node``: ``NodeFacts``.
 INFO: Final = "node.info"
-"""The request for the facts about a ``node``: ``NodeFacts``."""
+# The request to ping a ``node``.
 PING: Final = "node.ping"
-"""The request to ping a ``node``."""
+# The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``. The
+# response has ``gone``: whether nothing listens at the node's slave API any more.
 KILL: Final = "node.kill"
-"""The request to a node's agent to end the node, with ``node``, ``by`` (the caller's node) and ``reason``.
-
-The response has ``gone``: whether nothing listens at the node's slave API any more.
-"""
+# The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it.
 REPLIES: Final[dict[str, object]] = {
     LIST: tuple[NodeLine, ...],
     INFO: NodeFacts,
     PING: NodePing,
     KILL: dict[str, bool],
 }
-"""The type of each response; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
 _VISIBLE: Final = Needs(
     (Access.SUBSCRIBE, Access.PUBLISH, Access.CALL),
     "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
 )
 _HELD: Final = "node"
+# Every module has this node.
 _EVERYWHERE: Final = "/rosout"
-"""Every module has this node."""
 _NO_LOGGERS: Final = LENGTH.pack(0)
 _REFUSED: Final = 0
 
@@ -85,6 +83,10 @@ class Nodes(Part):
         shared: The core, the peers and the rules. ``limits.nodes`` bounds how many nodes a peer shows, and is told.
         topics: The part with the topics that cross.
         services: The part with the services that cross.
+
+    Attributes:
+        _told: What each linked peer was told, by the number of its session.
+        _shown: The nodes that each peer has told of.
     """
 
     def __init__(self, shared: Shared, topics: Topics, services: Services) -> None:
@@ -93,9 +95,7 @@ class Nodes(Part):
         self._topics = topics
         self._services = services
         self._told: dict[int, tuple[str, ...]] = {}
-        """What each linked peer was told, by the number of its session."""
         self._shown: dict[int, set[str]] = {}
-        """The nodes that each peer has told of."""
         self._soon: asyncio.TimerHandle | None = None
         rpc = shared.rpc
         rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
@@ -320,12 +320,14 @@ class ProxyKills:
 
     Args:
         rpc: Sends the requests.
+
+    Attributes:
+        _all: By caller of ``kill -a``: until when its further calls are taken for a part of that.
     """
 
     def __init__(self, rpc: PeerRpc) -> None:
         self._rpc = rpc
         self._all: dict[str, float] = {}
-        """By caller of ``kill -a``: until when its further calls are taken for a part of that."""
         self._under_way = 0
 
     async def own(self, caller: str, reason: str) -> RosReply:

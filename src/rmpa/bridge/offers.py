@@ -31,10 +31,13 @@ def wire_of(offer: Any) -> Any:
 
 
 class Effects:
-    """What a part of the bridge does for its books; for subclasses. An effect calls no book back in the same turn."""
+    """What a part of the bridge does for its books; for subclasses. An effect calls no book back in the same turn.
+
+    Attributes:
+        rng: Uniform numbers in [0, 1), for the jitter of a back-off.
+    """
 
     rng: Callable[[], float]
-    """Uniform numbers in [0, 1), for the jitter of a back-off."""
 
     @property
     def context(self) -> BridgeContext:
@@ -90,30 +93,32 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
 
     Args:
         out: Has the rules, sends messages and warns; the part itself, which also does what the kind of entry needs.
+
+    Attributes:
+        kind: The setting that limits the offered entries: ``topics`` or ``services``.
+        warning: The counter of entries beyond that limit.
+        access: What a peer does with an entry.
+        owner: What provides an entry, for texts.
+        renews: Whether a changed entry is told again although its offer is the same.
+        seen: What the local graph has, whether it crosses or not.
+        offered: What peers may have, within the limit; ``judge_for`` decides for each of them.
+        beyond: What is offered to no peer because there is more than the limit, the first one first.
+        peers: The linked peers; the one that has waited longest for its next portion comes first.
     """
 
     kind: ClassVar[str]
-    """The setting that limits the offered entries: ``topics`` or ``services``."""
     warning: ClassVar[str]
-    """The counter of entries beyond that limit."""
     access: ClassVar[Access]
-    """What a peer does with an entry."""
     owner: ClassVar[str]
-    """What provides an entry, for texts."""
     renews: ClassVar[bool] = False
-    """Whether a changed entry is told again although its offer is the same."""
 
     def __init__(self, out: Effects) -> None:
         self._out = out
         self._do: Any = out
         self.seen: dict[KeyT, LocalT] = {}
-        """What the local graph has, whether it crosses or not."""
         self.offered: dict[KeyT, LocalT] = {}
-        """What peers may have, within the limit; ``judge_for`` decides for each of them."""
         self.beyond: dict[KeyT, None] = {}
-        """What is offered to no peer because there is more than the limit, the first one first."""
         self.peers: dict[int, Told[KeyT, LocalT, OfferT]] = {}
-        """The linked peers; the one that has waited longest for its next portion comes first."""
 
     # --- what an entry is ----------------------------------------------------------------------------------------
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rmpa.bridge.offers import Effects
 
 
+# Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``.
 CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
-"""Causes for which an entry is hidden: another type here, a permission, ``limits.nodes``."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -164,17 +164,19 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
 
     Args:
         out: Has the rules, sends messages and warns; the part itself, which also changes the local graph.
+
+    Attributes:
+        kind: The setting that limits the entries of one peer: ``topics`` or ``services``.
+        ways: Selects the path to each module that relays offer.
     """
 
     kind: ClassVar[str]
-    """The setting that limits the entries of one peer: ``topics`` or ``services``."""
 
     def __init__(self, out: Effects) -> None:
         self._out = out
         self._do: Any = out
         self._peers: dict[int, Heard[KeyT, EntryT, OfferT]] = {}
         self.ways = RelayPaths(out.context.gate.may_relay)
-        """Selects the path to each module that relays offer."""
 
     @abstractmethod
     def next_timer(self) -> float | None:

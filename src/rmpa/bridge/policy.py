@@ -251,8 +251,8 @@ class PermissionGate:
         return "" if self.admits(access, module, name) else refusal(access, module, name)
 
 
+# Trust is off.
 OPEN_GATE: Final = PermissionGate()
-"""Trust is off."""
 
 
 # Relaying between two networks by a module that is in both, as the paper's proxies do. Pure.
@@ -269,12 +269,12 @@ OPEN_GATE: Final = PermissionGate()
 # show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
 
 
+# A topic and the proxy that publishes it, by their local names.
 Place = tuple[str, str]
-"""A topic and the proxy that publishes it, by their local names."""
 
 
+# The GUID of all origins outside the mesh: it is well-formed, but no module can have this address.
 OUTSIDE_GUID: Final = "0.0.0.0:0#1"
-"""The GUID of all origins outside the mesh: it is well-formed, but no module can have this address."""
 
 
 def is_outside(origin: Origin) -> bool:
@@ -292,12 +292,14 @@ class Relay:
 
     Args:
         enabled: Whether this module relays at all.
+
+    Attributes:
+        instance: Our own, as 32 hexadecimal digits.
     """
 
     def __init__(self, *, enabled: bool = False) -> None:
         self.enabled = enabled
         self.instance = ""
-        """Our own, as 32 hexadecimal digits."""
         self._origins: dict[Place, tuple[int, Source, Origin]] = {}
         self._places: dict[tuple[int, Source], Place] = {}
 
@@ -354,14 +356,17 @@ class Relay:
 
 
 class Local:
-    """What a node of this module, or a proxy that is relayed, has in the local graph; for subclasses."""
+    """What a node of this module, or a proxy that is relayed, has in the local graph; for subclasses.
+
+    Attributes:
+        type: Its message type; ``None`` for a service.
+        origin: Its module and node, if it is relayed.
+    """
 
     __slots__ = ()
 
     type: str | None
-    """Its message type; ``None`` for a service."""
     origin: Origin | None
-    """Its module and node, if it is relayed."""
 
 
 def may_have(instance: str, origin: Origin) -> bool:
@@ -376,18 +381,20 @@ class RelayPaths:
 
     Args:
         may_relay: Whether a peer, by its name, may be a relay at all.
+
+    Attributes:
+        instance: Our own, as 32 hexadecimal digits.
+        reached_here: Instances that this module reaches by itself, outside the mesh: a gateway's sites.
+        _linked: By number of a peer with a link of its own: its name, its instance, and its rank among relays.
+        _ways: By instance and relay: the origin as the relay offered it last, and the number of its sources there.
     """
 
     def __init__(self, may_relay: Callable[[str], bool] = lambda _: True) -> None:
         self._may_relay = may_relay
         self.instance = ""
-        """Our own, as 32 hexadecimal digits."""
         self.reached_here: set[str] = set()
-        """Instances that this module reaches by itself, outside the mesh: a gateway's sites."""
         self._linked: dict[int, tuple[str, str, int]] = {}
-        """By number of a peer with a link of its own: its name, its instance, and its rank among relays."""
         self._ways: dict[str, dict[int, tuple[Origin, int]]] = {}
-        """By instance and relay: the origin as the relay offered it last, and the number of its sources there."""
 
     def __iter__(self) -> Iterator[tuple[Origin, str]]:
         """Each module that is reached by a relay, and that relay's name."""

@@ -32,15 +32,18 @@ if TYPE_CHECKING:
 
 
 class ProxyNamespaces:
-    """The namespaces of peers and of relayed modules; no two modules share one."""
+    """The namespaces of peers and of relayed modules; no two modules share one.
+
+    Attributes:
+        _linked: The module's instance and its namespace, by the session's number.
+        _relayed: The namespace of each relayed module, by its instance.
+        _reserved: The instances whose namespaces are kept while they have no proxy.
+    """
 
     def __init__(self) -> None:
         self._linked: dict[int, tuple[str, str]] = {}
-        """The module's instance and its namespace, by the session's number."""
         self._relayed: dict[str, str] = {}
-        """The namespace of each relayed module, by its instance."""
         self._reserved: set[str] = set()
-        """The instances whose namespaces are kept while they have no proxy."""
 
     def add(self, peer: int, identity: Identity) -> str:
         """Return the namespace of a peer, which is reserved until ``remove``."""
@@ -86,8 +89,8 @@ class ProxyNamespaces:
 
 
 _log = logging.getLogger(__name__)
+# The listening sockets of one node: XML-RPC and TCPROS.
 _SOCKETS: Final = 2
-"""The listening sockets of one node: XML-RPC and TCPROS."""
 
 
 class ProxyNodes:
@@ -99,6 +102,10 @@ class ProxyNodes:
     Args:
         core: The local core.
         counters: Where refusals at the proxies' ports are counted.
+
+    Attributes:
+        _made: The last node of each name.
+        listening: How the proxies listen, as text: at which ports, or why each has two sockets of its own.
     """
 
     def __init__(self, core: Core, counters: Counters | None = None) -> None:
@@ -106,9 +113,7 @@ class ProxyNodes:
         self._counters = counters
         self._listener: SharedListener | None = None
         self._made: WeakValueDictionary[str, SlaveNode] = WeakValueDictionary()
-        """The last node of each name."""
         self.listening = ""
-        """How the proxies listen, as text: at which ports, or why each has two sockets of its own."""
 
     def sockets(self, proxies: int) -> int:
         """The number of listening sockets for a number of proxies."""
@@ -176,8 +181,8 @@ class ProxyNodes:
 # The nodes in the local graph that stand for the nodes of one peer.
 
 
+# What a topic or service does at its proxy: ``ready(proxy)`` registers it there, ``left(proxy)`` removes it.
 User = tuple[Callable[[SlaveNode], None], Callable[[SlaveNode], None]]
-"""What a topic or service does at its proxy: ``ready(proxy)`` registers it there, ``left(proxy)`` removes it."""
 
 
 async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
@@ -198,6 +203,15 @@ class PeerProxies:
         prefix: The namespace of this peer's proxies.
         nodes: Makes the proxies.
         on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this peer's node is asked to end.
+
+    Attributes:
+        _wanted: By the peer's node: the topics and services that hold its proxy, by key.
+        _held: What of them stands at the proxy.
+        _changed: The keys of which what is wanted, or what stands, has changed.
+        _failed: The nodes of which a change failed; ``reconcile`` tries again.
+        problems: Why the proxy of a node could not be made, as text by node.
+        names: Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``.
+        _task: Carries out the changes; ``None`` while there are none.
     """
 
     def __init__(
@@ -210,20 +224,13 @@ class PeerProxies:
         self._nodes = nodes
         self._on_kill = on_kill
         self._wanted: dict[str, dict[Hashable, User]] = {}
-        """By the peer's node: the topics and services that hold its proxy, by key."""
         self._held: dict[str, dict[Hashable, User]] = {}
-        """What of them stands at the proxy."""
         self._proxies: dict[str, SlaveNode] = {}
         self._changed: dict[str, dict[Hashable, None]] = {}
-        """The keys of which what is wanted, or what stands, has changed."""
         self._failed: set[str] = set()
-        """The nodes of which a change failed; ``reconcile`` tries again."""
         self.problems: dict[str, str] = {}
-        """Why the proxy of a node could not be made, as text by node."""
         self.names: dict[str, str] = {}
-        """Names of the proxies of relayed nodes, by the peer's node; all others are named with ``prefix``."""
         self._task: asyncio.Task[None] | None = None
-        """Carries out the changes; ``None`` while there are none."""
 
     def __len__(self) -> int:
         return len(self._proxies)

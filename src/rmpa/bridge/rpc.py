@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# In the response of an agent of an earlier release.
 UNKNOWN_QUESTION: Final = "does not know the question"
-"""In the response of an agent of an earlier release."""
+# The route of large messages; those of topics and services have numbers above it.
 _ROUTE: Final = 0
-"""The route of large messages; those of topics and services have numbers above it."""
 _UNTIL: Final = 8
 _LINK_ENDED: Final = "its link has just ended; try again"
 Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
@@ -134,6 +134,10 @@ class LinkRequests(BodyReceiver):
     Args:
         rpc: Has the handlers.
         session: The peer.
+
+    Attributes:
+        waiting: The requests to the peer that have no response yet, by number.
+        tasks: The handlers of the peer's requests.
     """
 
     def __init__(self, rpc: PeerRpc, session: PeerSession) -> None:
@@ -145,9 +149,7 @@ class LinkRequests(BodyReceiver):
         self._outgoing = Budget(limits.ASK_BYTES)
         self._numbers = itertools.cycle(range(1, UINT32_MAX + 1))
         self.waiting: dict[int, asyncio.Future[Any]] = {}
-        """The requests to the peer that have no response yet, by number."""
         self.tasks: set[asyncio.Task[None]] = set()
-        """The handlers of the peer's requests."""
 
     async def request(self, what: str, args: dict[str, Any], timeout: float) -> Any:  # noqa: ASYNC109 - as above
         """Send a request, and return the value of its response; errors as ``PeerRpc.request``."""

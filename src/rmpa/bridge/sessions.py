@@ -39,14 +39,16 @@ class PeerState(Enum):
     LINKED ──silence──► SILENT ──SILENT_GRACE► AWAY ──nothing waits any more──► (gone)
       ▲  ├──closed in order──────────────────►  │
       ├──┼────────────── a new link ────────────┘   (from SILENT, too)
+
+    Attributes:
+        LINKED: The peer has a link.
+        SILENT: Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``.
+        AWAY: It has no link, and a part of the bridge keeps something for it.
     """
 
     LINKED = auto()
-    """The peer has a link."""
     SILENT = auto()
-    """Its link ended by silence; most peers are back within ``mesh.limits.SILENT_GRACE``."""
     AWAY = auto()
-    """It has no link, and a part of the bridge keeps something for it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -137,10 +139,12 @@ class Part:
     """Ignores every event of the bridge; parts override the methods that they need.
 
     All methods are called from the event loop.
+
+    Attributes:
+        advertisement: The ``op`` of the control messages that ``advertised`` gets unparsed; empty: none.
     """
 
     advertisement = ""
-    """The ``op`` of the control messages that ``advertised`` gets unparsed; empty: none."""
 
     def start(self) -> None:
         """The bridge has started: the local core answers."""

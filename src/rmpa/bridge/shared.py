@@ -17,21 +17,24 @@ if TYPE_CHECKING:
 
 
 class Shared:
-    """What all parts of a bridge share; ``Bridge`` makes it."""
+    """What all parts of a bridge share; ``Bridge`` makes it.
+
+    Attributes:
+        core: The local core.
+        node: The agent's own node in the local graph.
+        sessions: The sessions of the peers.
+        rpc: The requests and notifications to and from the peers.
+        relay: Which sources of one peer are offered to others.
+        counters: Counts what happens, by name.
+        rng: Uniform numbers in [0, 1), for the jitter of a back-off.
+        context: The rules that hold now; each reading of the settings makes another one.
+    """
 
     core: Core
-    """The local core."""
     node: SlaveNode
-    """The agent's own node in the local graph."""
     sessions: PeerSessions
-    """The sessions of the peers."""
     rpc: PeerRpc
-    """The requests and notifications to and from the peers."""
     relay: Relay
-    """Which sources of one peer are offered to others."""
     counters: Counters
-    """Counts what happens, by name."""
     rng: Callable[[], float]
-    """Uniform numbers in [0, 1), for the jitter of a back-off."""
     context: BridgeContext
-    """The rules that hold now; each reading of the settings makes another one."""

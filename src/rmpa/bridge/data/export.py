@@ -44,6 +44,11 @@ class RouteSender:
         route: The route's id.
         contract: The route's contract.
         large: Whether the source is known to have large messages.
+
+    Attributes:
+        _held: Sequence, stamp and bytes of messages that wait until the lane has changed.
+        _newest: Stamp and bytes of the message that down-sampling sends next.
+        _direct: Whether ``message`` may take its short path for small messages.
     """
 
     reliable = False
@@ -55,14 +60,11 @@ class RouteSender:
         self._loop = asyncio.get_running_loop()
         self._switch = LaneSwitch(contract, large=large)
         self._held: deque[tuple[int, int, bytes]] = deque()
-        """Sequence, stamp and bytes of messages that wait until the lane has changed."""
         self._held_bytes = 0
         self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
-        """Stamp and bytes of the message that down-sampling sends next."""
         self._timer: asyncio.TimerHandle | None = None
         self._direct = False
-        """Whether ``message`` may take its short path for small messages."""
         self.link: PeerLink | None
         self._lane: LaneSender
         self._use(link, route)
@@ -301,31 +303,35 @@ class ReliableRouteSender(RouteSender):
 
 
 class ExportFlow:
-    """From one local publisher to the peers that want it, each by a route sender of its own."""
+    """From one local publisher to the peers that want it, each by a route sender of its own.
+
+    Attributes:
+        connection: To the publisher.
+        _history: Bytes and stamps of the last messages, for routes that are opened later.
+        _streaming: The senders that pass on the present message in parts, each with its lane.
+        _whole: The present message so far, where a sender or the history needs it whole.
+        latching: Whether the publisher latches: a route opened later gets its last message, whatever the contract.
+        large: Whether the publisher has sent a message that came in parts.
+        oversized, oversized_bytes: Messages that were left out because they are too long; size of the last one, in
+            bytes.
+    """
 
     connection: TopicConnection
-    """To the publisher."""
 
     def __init__(self) -> None:
         self.by_peer: dict[int, RouteSender] = {}
         self._senders: tuple[RouteSender, ...] = ()
         self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
-        """Bytes and stamps of the last messages, for routes that are opened later."""
         self._keeping = False
         self._streaming: dict[RouteSender, tuple[LaneSender, QueuedMessage]] = {}
-        """The senders that pass on the present message in parts, each with its lane."""
         self._whole: bytearray | None = None
-        """The present message so far, where a sender or the history needs it whole."""
         self._size = self._received = self._stamp = 0
         self.latching = False
-        """Whether the publisher latches: a route opened later gets its last message, whatever the contract."""
         self.large = False
-        """Whether the publisher has sent a message that came in parts."""
         self.messages = 0
         self.bytes = 0
         self.dropped = 0
         self.oversized = self.oversized_bytes = 0
-        """Messages that were left out because they are too long; size of the last one, in bytes."""
 
     def latch(self) -> None:
         """Keep the last message: the publisher latches."""

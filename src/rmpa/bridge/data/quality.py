@@ -28,14 +28,16 @@ class PeerClockHistory:
 
     An estimate that contradicts the one before shows that a clock was set: earlier estimates are void, and so are
     earlier latencies.
+
+    Attributes:
+        estimates: Oldest first: when it was made (monotonic seconds), the peer's wall clock less the local one, and
+            its error (± seconds).
+        trusted_from: Latencies of messages that came before this time (monotonic seconds) are unknown.
     """
 
     def __init__(self) -> None:
         self.estimates: deque[tuple[float, float, float]] = deque(maxlen=limits.QUALITY_CLOCKS)
-        """Oldest first: when it was made (monotonic seconds), the peer's wall clock less the local one, and its error
-        (± seconds)."""
         self.trusted_from = -math.inf
-        """Latencies of messages that came before this time (monotonic seconds) are unknown."""
 
     def add(self, offset: float, error: float, now: float) -> None:
         """Add the present estimate; see ``estimates``."""
@@ -93,16 +95,18 @@ class QosWatch:
         contract: The contract of the route.
         now: Monotonic seconds, as in all calls.
         past: The watch of the source's route before this one, whose events count on.
+
+    Attributes:
+        last: When the last message came (before the first one: the start), monotonic seconds; set by the data path.
+        counts: The sum of the counts of each kind of event since the start.
+        recent: The last events, oldest first; an event that repeats is kept once, with the sum of its counts.
     """
 
     def __init__(self, contract: Contract, now: float, past: QosWatch | None = None) -> None:
         self._contract = contract
         self.last = now
-        """When the last message came (before the first one: the start), monotonic seconds; set by the data path."""
         self.counts: Counter[QosEventKind] = Counter(past.counts if past is not None else ())
-        """The sum of the counts of each kind of event since the start."""
         self.recent: deque[QosEvent] = deque(past.recent if past is not None else (), maxlen=limits.WATCH_RECENT)
-        """The last events, oldest first; an event that repeats is kept once, with the sum of its counts."""
         self._seen = now  # the message from which the present deadline counts
         self._missed = 0  # deadlines since then
         self._due = now + (contract.deadline or 0)
@@ -227,8 +231,8 @@ def shown_seconds(seconds: float) -> str:
 
 
 _NS: Final = 1e-9
+# Marks in ``limits.QUALITY_RATE_SPAN``.
 _MARKS: Final = 16
-"""Marks in ``limits.QUALITY_RATE_SPAN``."""
 _Number = TypeVar("_Number", int, float)
 
 
@@ -271,6 +275,9 @@ class Quality:
 
     Args:
         window: How many messages the rings hold, at least 2.
+
+    Attributes:
+        bytes: Bytes of all messages that arrived.
     """
 
     __slots__ = ("_before", "_delays", "_marks", "_sizes", "_slot", "_times", "bytes")
@@ -285,7 +292,6 @@ class Quality:
         self._delays = array("d", bytes(8 * window))
         self._sizes = array("I", bytes(4 * window))
         self.bytes = 0
-        """Bytes of all messages that arrived."""
 
     @property
     def messages(self) -> int:

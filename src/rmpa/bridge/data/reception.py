@@ -36,18 +36,21 @@ if TYPE_CHECKING:
 
 
 class LinkTime:
-    """Offset of the peer's clock, and the end of the last silence; shared by all flows of a link."""
+    """Offset of the peer's clock, and the end of the last silence; shared by all flows of a link.
+
+    Attributes:
+        resumed_at: Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``.
+            Minus infinity: there was none yet.
+        ahead_ns: The peer's wall clock minus the local one, ns.
+        error_ns: The bound of the offset's error, ± ns; ``None`` while the offset is unknown.
+    """
 
     __slots__ = ("ahead_ns", "error_ns", "resumed_at")
 
     def __init__(self) -> None:
         self.resumed_at: Callable[[], float] = lambda: -math.inf
-        """Returns when the link's last silence was last seen, monotonic seconds; see ``runtime.stream``. Minus
-        infinity: there was none yet."""
         self.ahead_ns = 0
-        """The peer's wall clock minus the local one, ns."""
         self.error_ns: int | None = None
-        """The bound of the offset's error, ± ns; ``None`` while the offset is unknown."""
 
     def set(self, offset: float | None, error: float | None) -> None:
         """Set the offset and its error bound, in seconds."""
@@ -74,6 +77,18 @@ class ImportFlow(DataHandler):
         on_event: Called with what happened to the contract, and with losses of a reliable route.
         on_torn: Called when subscribers were disconnected in the middle of a message, so that they connect again.
         past: The watch of a reliable source from before this route.
+
+    Attributes:
+        _replay: Kept messages that the subscribers already have, and that the new route may repeat.
+        _sequence: The number of the message that comes in parts; ``None``: there is none.
+        _whole: The bytes so far of the message that comes in parts, if it must be delivered whole.
+        _held: The end of the wait, the stamp and the bytes of a stale message that waits for a newer one.
+        told: The local subscribers of which the publisher's agent was told on this route; see ``RemoteSubscribers``.
+        counts: Messages that were not delivered: ``lost`` in the sender's queue or on a link, ``late`` (behind newer
+            ones, or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their
+            lifespan).
+        oversized, oversized_bytes: Messages that the publisher's agent left out because they are too long; size of
+            the last one, in bytes.
     """
 
     def __init__(
@@ -98,16 +113,11 @@ class ImportFlow(DataHandler):
         self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
         self._plain = not self._reliable
         self._replay: deque[bytes] | None = None
-        """Kept messages that the subscribers already have, and that the new route may repeat."""
         self._sequence: int | None = None
-        """The number of the message that comes in parts; ``None``: there is none."""
         self._size = self._received = 0
         self._whole: bytearray | None = None
-        """The bytes so far of the message that comes in parts, if it must be delivered whole."""
         self._held: tuple[asyncio.TimerHandle, int, bytes] | None = None
-        """The end of the wait, the stamp and the bytes of a stale message that waits for a newer one."""
         self.told: tuple[str, ...] = ()
-        """The local subscribers of which the publisher's agent was told on this route; see ``RemoteSubscribers``."""
         self._link: PeerLink
         self.route = self._epoch = 0
         self._ack_timer: asyncio.TimerHandle | None = None
@@ -115,10 +125,7 @@ class ImportFlow(DataHandler):
         self.watch = QosWatch(contract, self._loop.time(), past)
         self._watch_timer = MachineTimer(self.watch.next_timer, lambda now: self._tell(self.watch.handle_timer(now)))
         self.counts: Counter[str] = Counter()
-        """Messages that were not delivered: ``lost`` in the sender's queue or on a link, ``late`` (behind newer ones,
-        or twice), ``stale`` (delayed by an outage, dropped for newer ones), ``expired`` (after their lifespan)."""
         self.oversized = self.oversized_bytes = 0
-        """Messages that the publisher's agent left out because they are too long; size of the last one, in bytes."""
 
     @property
     def lane(self) -> str:

@@ -35,6 +35,10 @@ class LaneSwitch:
     Args:
         contract: The contract of the route; only its priority is used.
         large: Whether the source is known to have large messages.
+
+    Attributes:
+        lane: The present lane; while fencing, the lane of the last messages.
+        target: The lane that messages should use.
     """
 
     def __init__(self, contract: Contract, *, large: bool = False) -> None:
@@ -44,9 +48,7 @@ class LaneSwitch:
         self._numbers = 0
         self._fence = 0
         self.lane = EXPRESS
-        """The present lane; while fencing, the lane of the last messages."""
         self.target = BULK if self._fixed is BULK or (large and self._fixed is None) else EXPRESS
-        """The lane that messages should use."""
 
     @property
     def fencing(self) -> bool:
@@ -104,12 +106,14 @@ class Downsampler:
 
     Args:
         rate: Messages a second.
+
+    Attributes:
+        due: When the next message may be sent, monotonic seconds.
     """
 
     def __init__(self, rate: float) -> None:
         self._period = 1 / rate
         self.due = 0.0
-        """When the next message may be sent, monotonic seconds."""
 
     def admit(self, now: float) -> bool:
         """Whether a message may be sent now; if so, the next one is due a period later."""

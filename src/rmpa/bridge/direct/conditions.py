@@ -24,51 +24,56 @@ if TYPE_CHECKING:
     from rmpa.bridge.shared import Shared
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
+# Characters of a peer's text that are kept.
 _TEXT_MAX: Final = 300
-"""Characters of a peer's text that are kept."""
 
 
 class Condition(StrEnum):
-    """A condition of direct transport; its value is the word in ``--json`` and between agents."""
+    """A condition of direct transport; its value is the word in ``--json`` and between agents.
+
+    Attributes:
+        TRANSPORT: The transport of the contract, or of the service's rule, is not ``relay``.
+        CONTRACT: The contract asks for nothing that only agents do.
+        NAME: The topic or service has the same name in both modules: TCPROS headers carry it.
+        OWN_SOURCE: The source is the peer's own, and does not come by a relay.
+        ACTION: It is no topic whose publisher compares the names of its subscribers.
+        RELEASE: The peer's agent knows direct transport.
+        AGENT: The peer's agent answers in time.
+        OFFERED: The peer offers the topic or service now.
+        NODE: The publisher's node answers its agent.
+        LISTENING: The publisher's node listens where the subscriber's module can reach it, not only on loopback.
+        REACHABLE: A connection from the subscriber's module to the publisher's node works.
+        CALLER_ID: No other subscriber of the same name is connected to the publisher.
+        SUBSCRIBER: The subscriber's node connects to other machines (ROS_IP and ROS_HOSTNAME do not bind it to
+            loopback).
+        MEASURES: The subscriber is no tool that measures by the agents.
+        LATCHED: No latched message would be delivered twice by the move.
+        STABLE: Direct connections of this subscriber have not broken repeatedly.
+        LIMIT: The peer's direct connections are within ``limits.DIRECT_MAX``.
+        TRUST: The mesh is not secured, or both modules let plain connections cross (``trust.direct``), or share a
+            machine.
+        CORE: The local core can answer each node by itself: services only.
+    """
 
     TRANSPORT = "transport"
-    """The transport of the contract, or of the service's rule, is not ``relay``."""
     CONTRACT = "contract"
-    """The contract asks for nothing that only agents do."""
     NAME = "name"
-    """The topic or service has the same name in both modules: TCPROS headers carry it."""
     OWN_SOURCE = "own_source"
-    """The source is the peer's own, and does not come by a relay."""
     ACTION = "action"
-    """It is no topic whose publisher compares the names of its subscribers."""
     RELEASE = "release"
-    """The peer's agent knows direct transport."""
     AGENT = "agent"
-    """The peer's agent answers in time."""
     OFFERED = "offered"
-    """The peer offers the topic or service now."""
     NODE = "node"
-    """The publisher's node answers its agent."""
     LISTENING = "listening"
-    """The publisher's node listens where the subscriber's module can reach it, not only on loopback."""
     REACHABLE = "reachable"
-    """A connection from the subscriber's module to the publisher's node works."""
     CALLER_ID = "caller_id"
-    """No other subscriber of the same name is connected to the publisher."""
     SUBSCRIBER = "subscriber"
-    """The subscriber's node connects to other machines (ROS_IP and ROS_HOSTNAME do not bind it to loopback)."""
     MEASURES = "measures"
-    """The subscriber is no tool that measures by the agents."""
     LATCHED = "latched"
-    """No latched message would be delivered twice by the move."""
     STABLE = "stable"
-    """Direct connections of this subscriber have not broken repeatedly."""
     LIMIT = "limit"
-    """The peer's direct connections are within ``limits.DIRECT_MAX``."""
     TRUST = "trust"
-    """The mesh is not secured, or both modules let plain connections cross (``trust.direct``), or share a machine."""
     CORE = "core"
-    """The local core can answer each node by itself: services only."""
 
 
 _PASSING: Final = frozenset({Condition.AGENT, Condition.NODE, Condition.REACHABLE, Condition.STABLE, Condition.LIMIT})
@@ -87,8 +92,8 @@ class Unmet:
         return self.condition not in _PASSING
 
 
+# What holds while there is no link.
 NO_LINK: Final = Unmet(Condition.OFFERED, "its module has no link")
-"""What holds while there is no link."""
 
 
 class Grant(NamedTuple):
@@ -236,10 +241,10 @@ def _read(value: object, kind: type[StructT]) -> StructT:
 # --- what was lost -------------------------------------------------------------------------------------------------
 
 
+# When a subscriber was without its direct path, by the peer's name and what is reached: how often, when the last time
+# began, and when it ended (``None``: it lasts), monotonic seconds. It outlasts links. What was published meanwhile is
+# lost to it, and not counted.
 Interruptions = dict[tuple[str, Want], tuple[int, float, float | None]]
-"""When a subscriber was without its direct path, by the peer's name and what is reached: how often, when the last
-time began, and when it ended (``None``: it lasts), monotonic seconds. It outlasts links. What was published meanwhile
-is lost to it, and not counted."""
 
 
 def interrupted(known: Interruptions, peer: str, want: Want, now: float, *, lasts: bool) -> None:

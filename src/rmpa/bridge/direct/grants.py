@@ -64,18 +64,20 @@ class Grants:
 
     Args:
         shared: The core, the peers and the rules.
+
+    Attributes:
+        kind: The middle of the names of the messages.
+        _asked: By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked
+            for. A peer may ask for thousands, so nothing here passes over those of all peers for one of them.
+        _by_node: What ``of`` returns; ``None``: grants have changed since it was made.
     """
 
     kind = ""
-    """The middle of the names of the messages."""
 
     def __init__(self, shared: Shared) -> None:
         self._shared = shared
         self._asked: dict[int, dict[Want, _Entry]] = {}
-        """By peer and what it wants: its session, its question, and the answer; ``None`` while that is looked for.
-        A peer may ask for thousands, so nothing here passes over those of all peers for one of them."""
         self._by_node: dict[tuple[str, str], list[tuple[int, str, Grant]]] | None = None
-        """What ``of`` returns; ``None``: grants have changed since it was made."""
 
     def __iter__(self) -> Iterator[tuple[int, Want, Grant]]:
         """Every grant: peer, what is granted, and where; changes during the iteration are allowed."""
@@ -332,6 +334,9 @@ class TopicGrants(Grants):
     Args:
         shared: As of ``Grants``.
         exports: Knows what is offered to each peer.
+
+    Attributes:
+        interruptions: When peers' subscribers were without a grant because their link was lost.
     """
 
     kind = "topic"
@@ -344,7 +349,6 @@ class TopicGrants(Grants):
         self._exports = exports
         self.ports = NodePorts()
         self.interruptions: Interruptions = {}
-        """When peers' subscribers were without a grant because their link was lost."""
 
     def graph_changed(self, change: GraphChange) -> None:
         """Have peers ask again for what a registration that came or went touches."""

@@ -35,10 +35,10 @@ _UNSTABLE: Final = Unmet(
     Condition.STABLE,
     f"its direct connection broke {limits.DIRECT_BREAKS} times in {limits.DIRECT_BREAKS_SPAN:g} s",
 )
+# The place of a subscriber that is connected to the proxy.
 AGENTS: Final = ("", 0)
-"""The place of a subscriber that is connected to the proxy."""
+# The place of a subscriber that has lost its connection, and is called back.
 LOST: Final = ("", -1)
-"""The place of a subscriber that has lost its connection, and is called back."""
 
 
 @dataclass(slots=True, eq=False)
@@ -110,16 +110,18 @@ class Paths(Generic[EntryT]):
     Args:
         shared: The core, the peers and the rules.
         on_warning: ``(kind, subject, text)``: logs and counts a warning.
+
+    Attributes:
+        kind: The middle of the names of the messages.
+        _paths: By peer, name and node; then by user.
     """
 
     kind = ""
-    """The middle of the names of the messages."""
 
     def __init__(self, shared: Shared, on_warning: Callable[[str, str, str], None]) -> None:
         self._shared = shared
         self._on_warning = on_warning
         self._paths: dict[tuple[int, str, str], dict[str, Path[EntryT]]] = {}
-        """By peer, name and node; then by user."""
         self._probes: dict[tuple[int, int, str], asyncio.Task[str]] = {}
         self._asks: dict[int, asyncio.Semaphore] = {}
         self._tasks: set[asyncio.Task[Any]] = set()

@@ -71,18 +71,20 @@ class Params(Part):
 
     Args:
         shared: The core, the peers and the rules.
+
+    Attributes:
+        owner: This module's own parameters, for peers.
+        followed: The parameters that this module follows, in the order of the rules.
+        _time_before: What ``/use_sim_time`` was here before it was followed; empty if it was not followed.
     """
 
     def __init__(self, shared: Shared) -> None:
         self._shared = shared
         self._core = ParamCore(shared.core, shared.node)
         self.owner = ParamOwner(self._core, shared)
-        """This module's own parameters, for peers."""
         self.followed = [Followed(rule) for rule in follow_rules(shared.context.settings)]
-        """The parameters that this module follows, in the order of the rules."""
         self._refusals = RefusalLog(_log, shared.counters)
         self._time_before: list[str | None] = []
-        """What ``/use_sim_time`` was here before it was followed; empty if it was not followed."""
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._working: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None

@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import PermissionDecision
 
+# The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
+# agent's node has to be notified of these.
 PEERS: Final = f"{OWN_NODE}/peers"
-"""The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
-agent's node has to be notified of these."""
+# The globs that every parameter fits.
 _ALL: Final = frozenset({"/**", "**"})
-"""The globs that every parameter fits."""
+# Pieces, of some KiB each, that are written before the event loop goes on with other tasks.
 _PIECES: Final = 16
-"""Pieces, of some KiB each, that are written before the event loop goes on with other tasks."""
 
 
 async def write_text(what: str, value: XmlRpcValue) -> str:
@@ -96,13 +96,15 @@ class ParamCore:
     Args:
         core: The local core, embedded or external.
         node: The agent's own node, which the core notifies of changes.
+
+    Attributes:
+        subscribed: The keys of which the core notifies the agent's node.
     """
 
     def __init__(self, core: Core, node: SlaveNode) -> None:
         self.ask = core.ask
         self._node = node
         self.subscribed: set[str] = set()
-        """The keys of which the core notifies the agent's node."""
 
     async def get(self, key: str) -> tuple[bool, XmlRpcValue]:
         """Whether a parameter or namespace exists, and its value, which must not be modified."""

@@ -121,8 +121,8 @@ SET: Final = "param.set"
 DELETE: Final = "param.delete"
 FOLLOW: Final = "param.follow"
 VALUE: Final = "param.value"
+# The requests that the command line may have its agent send.
 QUESTIONS: Final = (GET, NAMES, SET, DELETE)
-"""The requests that the command line may have its agent send."""
 
 
 def text_of(fields: object) -> str:

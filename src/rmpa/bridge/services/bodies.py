@@ -38,16 +38,16 @@ if TYPE_CHECKING:
     from rmpa.runtime.tls import Buffer
 
 _LENGTH: Final = 4
+# Bytes in front of a reply that state whether the call succeeded.
 _HEAD_MAX: Final = 1
-"""Bytes in front of a reply that state whether the call succeeded."""
+# Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run.
 _PORTION: Final = 256 * KIB
-"""Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run."""
+# Bytes waiting on the bulk lane above which no further portion is copied to it.
 _AHEAD: Final = 4 * MIB
-"""Bytes waiting on the bulk lane above which no further portion is copied to it."""
+# Bytes of a body, head included, up to which it is sent in one frame.
 _WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
-"""Bytes of a body, head included, up to which it is sent in one frame."""
+# Seconds between two checks of how much waits on the bulk lane.
 _PAUSE: Final = 0.005
-"""Seconds between two checks of how much waits on the bulk lane."""
 
 
 class Budget:
@@ -165,6 +165,9 @@ class BodyReceiver(DataHandler):
     Args:
         budget: Bounds the bytes of the peer's bodies while they are reassembled.
         most: Bytes that a body may have.
+
+    Attributes:
+        _stamp_ns: When the present body was sent, by the peer's clock.
     """
 
     def __init__(self, budget: Budget, most: int = ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX) -> None:
@@ -174,7 +177,6 @@ class BodyReceiver(DataHandler):
         self._buffer = bytearray()
         self._size = 0
         self._stamp_ns = 0
-        """When the present body was sent, by the peer's clock."""
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Handle a complete body, which belongs to the callee; it no longer counts in the budget."""
@@ -262,8 +264,8 @@ class LocalService(Local):
 
 _log = logging.getLogger(__name__)
 
+# Called with ``(ok, body)``: the response, or the text of the error.
 Done = Callable[[bool, "Buffer"], None]
-"""Called with ``(ok, body)``: the response, or the text of the error."""
 
 
 class ServicePool:
@@ -273,6 +275,9 @@ class ServicePool:
         service: The service's name in the local graph.
         server: Its server.
         on_lost: Called when the server closed a connection, or does not answer at its address: it may be dead.
+
+    Attributes:
+        _queue: The calls that wait: request, until when, and the callback.
     """
 
     def __init__(self, service: str, server: LocalService, on_lost: Callable[[], None]) -> None:
@@ -284,7 +289,6 @@ class ServicePool:
         self._busy: set[ServiceConnection] = set()
         self._opening: set[asyncio.Task[None]] = set()
         self._queue: deque[tuple[Buffer, float, Done]] = deque()
-        """The calls that wait: request, until when, and the callback."""
         self._closed = False
 
     @property

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
+# How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave within
+# a link's lease, so only the latest can be lost.
 _RECENT: Final = 64
-"""How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave
-within a link's lease, so only the latest can be lost."""
 
 
 def _text(body: Buffer) -> str:
@@ -60,16 +60,19 @@ class Budgets:
 
 
 class CallStats:
-    """Counts and latencies of the calls of one service, shared by all sessions."""
+    """Counts and latencies of the calls of one service, shared by all sessions.
+
+    Attributes:
+        problem: The error of the last call that failed, or empty.
+        latencies: Seconds from request to reply, of calls that succeeded.
+    """
 
     def __init__(self) -> None:
         self.calls = 0
         self.failed = 0
         self.active = 0
         self.problem = ""
-        """The error of the last call that failed, or empty."""
         self.latencies: deque[float] = deque(maxlen=limits.SERVICE_LATENCIES)
-        """Seconds from request to reply, of calls that succeeded."""
 
     def fail(self, problem: str) -> None:
         """Count a failed call, and store its error."""
@@ -87,6 +90,9 @@ class Caller(BodyReceiver):
         budgets: The budgets of the peer's link.
         stats: The counts of the service.
         description: Its types, as its server told them when it was opened.
+
+    Attributes:
+        used_at: When a call was last begun or answered, in the event loop's seconds.
     """
 
     def __init__(
@@ -108,7 +114,6 @@ class Caller(BodyReceiver):
         self._serial = 0
         self._pending: dict[int, tuple[ServiceCall, float, bool]] = {}
         self.used_at = self._loop.time()
-        """When a call was last begun or answered, in the event loop's seconds."""
 
     @property
     def active(self) -> int:
@@ -289,8 +294,8 @@ class Server(BodyReceiver):
 
 
 _MD5_LENGTH: Final = 32
+# The checks of the servers' ports take at most one in this many seconds of processor time.
 _LOOK_SHARE: Final = 50
-"""The checks of the servers' ports take at most one in this many seconds of processor time."""
 
 
 class Serving:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     ServicePath = Path[RemoteService]
 
 _log = logging.getLogger(__name__)
+# The names of the nodes of ``rmpa service`` begin so: their calls are relayed, so that the agents measure them.
 _OWN_TOOLS: Final = "/rmpa_service"
-"""The names of the nodes of ``rmpa service`` begin so: their calls are relayed, so that the agents measure them."""
 
 
 class ServicePaths(Paths["RemoteService"]):
@@ -41,6 +41,13 @@ class ServicePaths(Paths["RemoteService"]):
         shared: As of ``Paths``.
         on_warning: As of ``Paths``.
         proxy_uri: ``(peer, service)``: the proxy's address for a service; empty if there is none.
+
+    Attributes:
+        answers: The services whose lookups are answered with the server's address, by their names here.
+        lookups: How many lookups of each were answered so.
+        _looked: Those looked up since ``_look``, or to whose servers clients were connecting then.
+        _waiting: The sockets that were connecting then, by their cookies.
+        _used: By the peer's name: the addresses to which clients may have connections.
     """
 
     kind = "service"
@@ -53,16 +60,11 @@ class ServicePaths(Paths["RemoteService"]):
         shared.rpc.on_notification("direct.service_again", self._asked_again, own)
         self._proxy_uri = proxy_uri
         self.answers: dict[str, ServicePath] = {}
-        """The services whose lookups are answered with the server's address, by their names here."""
         self.lookups: Counter[str] = Counter()
-        """How many lookups of each were answered so."""
         self._looked: set[str] = set()
-        """Those looked up since ``_look``, or to whose servers clients were connecting then."""
         self._waiting: set[bytes] = set()
-        """The sockets that were connecting then, by their cookies."""
         self._looking: asyncio.TimerHandle | None = None
         self._used: dict[str, set[tuple[str, int]]] = {}
-        """By the peer's name: the addresses to which clients may have connections."""
         self._able = shared.core.on_lookup(self._lookup)
 
     # --- lookups -------------------------------------------------------------------------------------------------

@@ -51,7 +51,14 @@ class ServiceRoute:
 
 
 class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
-    """The outbound half: services of this module, called by peers."""
+    """The outbound half: services of this module, called by peers.
+
+    Attributes:
+        about: What the servers of services have said of them.
+        _routes: The routes that each linked peer has asked for, by the peer's own route numbers.
+        _serial: Counts the routes of requests. They are even; the odd ones are for replies to this module's own
+            calls.
+    """
 
     kind, warning, access, owner = "services", "services.too_many", Access.CALL, "its server"
     renews = True  # behind another server what peers know of a service may not be true any more
@@ -59,11 +66,8 @@ class ServiceExports(OfferBook[str, LocalService, ServiceOffer]):
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
         self.about: dict[str, ServiceDescription] = {}
-        """What the servers of services have said of them."""
         self._routes: dict[int, dict[int, ServiceRoute]] = {}
-        """The routes that each linked peer has asked for, by the peer's own route numbers."""
         self._serial = 0
-        """Counts the routes of requests. They are even; the odd ones are for replies to this module's own calls."""
 
     def callers(self, service: str) -> tuple[int, ...]:
         """The numbers of the peers that have a service open."""

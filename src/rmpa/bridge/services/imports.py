@@ -64,16 +64,19 @@ class RemoteService(Remote[str]):
 
 
 class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
-    """The inbound half: services of the peers, called from this module."""
+    """The inbound half: services of the peers, called from this module.
+
+    Attributes:
+        _local: The node of this module that provides a service.
+        _claims: The services that have a name here.
+    """
 
     kind = "services"
 
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
         self._local: dict[str, str] = {}
-        """The node of this module that provides a service."""
         self._claims: dict[str, dict[RemoteService, None]] = {}
-        """The services that have a name here."""
         self._shown: dict[str, RemoteService] = {}
         self._opening: dict[RemoteService, None] = {}
 

@@ -83,6 +83,10 @@ class Services(GraphPart):
 
     Args:
         shared: The core, the peers and the rules.
+
+    Attributes:
+        make_room: Called with a service whose name a node has already: a gateway's node of another site leaves it.
+        serving: The servers of this module that peers call.
     """
 
     advertisement = "services"
@@ -96,11 +100,9 @@ class Services(GraphPart):
         super().__init__(shared, ServiceExports, ServiceImports)
         self._core = shared.core
         self.make_room: Callable[[str], None] = lambda _: None
-        """Called with a service whose name a node has already: a gateway's node of another site leaves it."""
         self._budgets: dict[int, Budgets] = {}
         self._shown: dict[RemoteService, ShownService] = {}
         self.serving = Serving(shared, self.exports, self._budgets)
-        """The servers of this module that peers call."""
         self.direct_exports = ServiceGrants(shared, self.exports, self.warn)
         self.direct_imports = ServicePaths(shared, self.warn, self._proxy_uri)
         shared.rpc.on_notification(_MISMATCH, self._told_of_mismatch, Needs((), "a text for the log"))

@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 
     TopicPath = Path[RemoteTopic]
 
+# The caller id of ``publisherUpdate``, as rosmaster has it.
 MASTER: Final = "/master"
-"""The caller id of ``publisherUpdate``, as rosmaster has it."""
 _STANDING: Final = frozenset({"ESTABLISHED", "SYN_SENT", "CLOSE_WAIT"})
+# Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure.
 MEASURING: Final = "/rmpa_topic_"
-"""Names of nodes of ``rmpa topic hz|bw|delay|echo`` begin so; they are relayed, so that the agents measure."""
 _TWICE: Final = Unmet(
     Condition.LATCHED, "it latches, and a move would deliver its last message twice: subscribe again"
 )
@@ -158,6 +158,11 @@ class TopicPaths(Paths["RemoteTopic"]):
         on_warning: As of ``Paths``.
         imports: The remote sources.
         topics: The peers' topics in the local graph, by the numbers of their sessions.
+
+    Attributes:
+        interruptions: When subscribers were without their path.
+        _left: The names of modules to which direct connections were left when their agents crashed.
+        _started: Subscribers may have direct connections from before this moment, of an earlier run of this agent.
     """
 
     kind = "topic"
@@ -175,13 +180,10 @@ class TopicPaths(Paths["RemoteTopic"]):
         self._imports = imports
         self._topics = topics
         self.interruptions: Interruptions = {}
-        """When subscribers were without their path."""
         self._checking: asyncio.TimerHandle | None = None
         self._kernel_tells = kernel_tells()
         self._left: set[str] = set()
-        """The names of modules to which direct connections were left when their agents crashed."""
         self._started = self._now()
-        """Subscribers may have direct connections from before this moment, of an earlier run of this agent."""
 
     # --- the local graph --------------------------------------------------------------------------------------------
 

@@ -92,18 +92,21 @@ class _Flow:
 
 
 class Exports(OfferBook[Source, LocalSource, TopicOffer]):
-    """The outbound half of topics."""
+    """The outbound half of topics.
+
+    Attributes:
+        _routes: The open source of each route id, for each linked peer.
+        _cut: The run of each named peer that had no link when a route of it ended, so that it may miss messages.
+    """
 
     kind, warning, access, owner = "topics", "sources.too_many", Access.SUBSCRIBE, "the node"
 
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
         self._routes: dict[int, dict[int, Source]] = {}
-        """The open source of each route id, for each linked peer."""
         self._flows: dict[Source, _Flow] = {}
         self._epochs = 0
         self._cut: OrderedDict[tuple[str, Source], str] = OrderedDict()
-        """The run of each named peer that had no link when a route of it ended, so that it may miss messages."""
 
     # --- for others ----------------------------------------------------------------------------------------------
 

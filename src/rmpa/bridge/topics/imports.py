@@ -117,17 +117,20 @@ class RemoteTopic(Remote[Source]):
 
 
 class Imports(ImportBook[Source, RemoteTopic, TopicOffer]):
-    """The inbound half of topics."""
+    """The inbound half of topics.
+
+    Attributes:
+        _topics: The sources of each peer by their local topic (dicts, for their order).
+        _timers: A heap; an item that is not its source's time any more is skipped.
+    """
 
     kind = "topics"
 
     def __init__(self, out: Effects) -> None:
         super().__init__(out)
         self._topics: dict[int, dict[str, dict[Source, None]]] = {}
-        """The sources of each peer by their local topic (dicts, for their order)."""
         self._local_types: dict[str, str] = {}
         self._timers: list[tuple[float, int, RemoteTopic]] = []
-        """A heap; an item that is not its source's time any more is skipped."""
         self._serials = itertools.count()
 
     def __iter__(self) -> Iterator[tuple[int, Source, RemoteTopic]]:

@@ -100,6 +100,10 @@ class LocalSubscriptions:
         out: Warns of publishers that break TCPROS.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process, which is subscribed to without a
             socket; ``None`` for others.
+
+    Attributes:
+        flows: The flow of each source that the agent is connected to, for snapshots.
+        senders: The sender of each open route, by its peer and its id.
     """
 
     def __init__(
@@ -115,9 +119,7 @@ class LocalSubscriptions:
         self._exports, self._losses, self._out = exports, losses, out
         self._find = find
         self.flows: dict[Source, ExportFlow] = {}
-        """The flow of each source that the agent is connected to, for snapshots."""
         self.senders: dict[tuple[int, int], RouteSender] = {}
-        """The sender of each open route, by its peer and its id."""
         self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
         # Kept messages are dropped when their outage is over.
         self._timer = MachineTimer(self._parked.next_timer, lambda now: self._give_up(self._parked.expire(now)))

@@ -51,6 +51,13 @@ class Topics(GraphPart, TopicEvents):
     Args:
         shared: The core, the peers and the rules.
         find: ``(node, slave API, topic)``: the topic of a proxy of this process; see ``LocalSubscriptions``.
+
+    Attributes:
+        peers: The topics of each peer in the local graph, by the number of its session.
+        _pasts: By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``.
+        losses: Reports messages that do not reach their listeners.
+        outbound: The subscriptions to local publishers, and the routes to the peers.
+        _nodes: By topic: the nodes that publish it, as it was looked at last.
     """
 
     advertisement = "advertise"
@@ -63,20 +70,15 @@ class Topics(GraphPart, TopicEvents):
     def __init__(self, shared: Shared, find: Callable[[str, str, str], Publication | None]) -> None:
         super().__init__(shared, Exports, Imports)
         self.peers: dict[int, PeerTopics] = {}
-        """The topics of each peer in the local graph, by the number of its session."""
         self._pasts: OrderedDict[str, dict[Source, tuple[QosWatch, str]]] = OrderedDict()
-        """By the name of a module: what is remembered of its reliable sources; see ``PeerTopics``."""
         self.losses = LossReports(shared, self.exports, self.peers, self)
-        """Reports messages that do not reach their listeners."""
         self.outbound = LocalSubscriptions(shared, self.exports, self.losses, self, find)
-        """The subscriptions to local publishers, and the routes to the peers."""
         self._mismatches = Mismatches(self, self.exports, self.imports)
         self._subscribers = RemoteSubscribers(shared, self, self.exports, self.imports, self.peers)
         self.direct_exports = TopicGrants(shared, self.exports)
         self.direct_imports = TopicPaths(shared, self.warn, self.imports, self.peers)
         self._local = LocalSources(shared.core, shared.relay, lambda s: self.exports.description(s) is not None)
         self._nodes: dict[str, tuple[str, ...]] = {}
-        """By topic: the nodes that publish it, as it was looked at last."""
         self._ticker: asyncio.TimerHandle | None = None
 
     def of(self, session: PeerSession) -> PeerTopics:

@@ -70,6 +70,10 @@ class PeerTopic(PublicationEvents):
     Args:
         peer: All topics of the peer.
         entry: The source.
+
+    Attributes:
+        topic: The name in the local graph.
+        flow: The flow of its route: the open one, or the one that outlived its link.
     """
 
     __slots__ = ("_peer", "flow", "node", "publication", "source", "topic", "type")
@@ -78,11 +82,9 @@ class PeerTopic(PublicationEvents):
         self._peer = peer
         self.source, self.type = entry.wire, entry.type
         self.topic = entry.name
-        """The name in the local graph."""
         self.node: SlaveNode
         self.publication: Publication
         self.flow: ImportFlow | None = None
-        """The flow of its route: the open one, or the one that outlived its link."""
 
     # --- at the proxy ------------------------------------------------------------------------------------------
 
@@ -211,6 +213,10 @@ class PeerTopics:
         session: The peer: its proxies, its link with the handlers of its routes, and its time.
         pasts: Of each reliable source of the module that had a flow and has none now: its watch, for its next flow,
             and its topic while a local node listens, so that messages are missed. It outlives the session.
+
+    Attributes:
+        topics: Those that are registered.
+        flows: The flow of each open route, by its id.
     """
 
     def __init__(
@@ -221,9 +227,7 @@ class PeerTopics:
         self.session = session
         self.pasts = pasts
         self.topics: dict[Source, PeerTopic] = {}
-        """Those that are registered."""
         self.flows: dict[int, ImportFlow] = {}
-        """The flow of each open route, by its id."""
 
     def publication(self, source: Source) -> Publication | None:
         """The publication of a source, if it is in the local graph."""
@@ -295,10 +299,10 @@ class PeerTopics:
         self.flows.clear()
 
 
+# The notification that a publisher sends messages that are too long.
 OVERSIZED: Final = "message.oversized"
-"""The notification that a publisher sends messages that are too long."""
+# Sources that one line of the log names; further ones are only counted.
 _NAMED: Final = 3
-"""Sources that one line of the log names; further ones are only counted."""
 
 
 class LossReports:

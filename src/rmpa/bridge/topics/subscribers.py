@@ -136,6 +136,9 @@ class RemoteSubscribers:
         exports: Finds the source of a peer's route.
         imports: Finds the route of a peer's source.
         peers: The peers' topics in the local graph, by the numbers of their sessions.
+
+    Attributes:
+        _shown: The connections that stand for a peer's listeners, by the listeners' local names.
     """
 
     def __init__(
@@ -146,7 +149,6 @@ class RemoteSubscribers:
         self._changed: dict[tuple[int, Source], None] = {}
         self._soon: asyncio.Handle | None = None
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
-        """The connections that stand for a peer's listeners, by the listeners' local names."""
 
     # --- our listeners, to the peer that publishes ------------------------------------------------------------------
 
