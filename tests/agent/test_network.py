@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.agent import network
-from rmpa.agent.network import Network, is_displaced
+from rmpa.agent.agent import Network, is_displaced
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
 from rmpa.discovery.network import Interface

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.messages import Description, Message, Origin, RouteOpened
     from rmpa.bridge.services.bodies import LocalService
-    from rmpa.bridge.services.exports import ServiceRoute
-    from rmpa.bridge.services.imports import RemoteService
+    from rmpa.bridge.services.books import RemoteService, ServiceRoute
     from rmpa.bridge.topics.exports import ExportRoute, LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.ros.wire.tcpros import ServiceDescription

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge, TwinWatch
     from rmpa.bridge.services.bodies import LocalService
+    from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.services.calls import CallStats
-    from rmpa.bridge.services.imports import RemoteService
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings

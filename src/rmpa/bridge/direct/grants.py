@@ -44,7 +44,7 @@ from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addr
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.services.exports import ServiceExports
+    from rmpa.bridge.services.books import ServiceExports
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.bridge.topics.exports import Exports

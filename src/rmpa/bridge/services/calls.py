@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Coroutine, Mapping
 
     from rmpa.bridge.data.reception import LinkTime
-    from rmpa.bridge.services.exports import ServiceExports, ServiceRoute
+    from rmpa.bridge.services.books import ServiceExports, ServiceRoute
     from rmpa.bridge.shared import Shared
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.service_server import ServiceCall

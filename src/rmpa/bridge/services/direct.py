@@ -23,7 +23,7 @@ from rmpa.runtime.kernel_tcp import connections
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.services.imports import RemoteService
+    from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
 

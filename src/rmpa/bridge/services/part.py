@@ -1,6 +1,6 @@
 """Services across modules: peers call the services of this module, and their services appear in the local graph.
 
-``services.exports`` and ``services.imports`` decide; this part carries out what they decide. A call takes this way::
+``services.books`` decides; this part carries out what they decide. A call takes this way::
 
     client → proxy's ServiceEndpoint → Caller ⇢ link ⇢ Server → ServicePool → server
                                               ⇠      ⇠
@@ -20,10 +20,9 @@ from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, Servi
 from rmpa.bridge.peer_offers import DENIED
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
+from rmpa.bridge.services.books import ServiceExports, ServiceImports
 from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
 from rmpa.bridge.services.direct import ServicePaths
-from rmpa.bridge.services.exports import ServiceExports
-from rmpa.bridge.services.imports import ServiceImports
 from rmpa.bridge.sessions import PeerState
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.services.imports import RemoteService
+    from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
     from rmpa.ros.node.slave_node import SlaveNode
