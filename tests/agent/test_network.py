@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.agent import network
+from rmpa.agent import agent
 from rmpa.agent.agent import Network, is_displaced
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
@@ -82,7 +82,7 @@ made: list[Endpoint] = []
 @pytest.fixture
 def joined(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Network]:
     made.clear()
-    monkeypatch.setattr(network, "NetworkEndpoint", Endpoint)
+    monkeypatch.setattr(agent, "NetworkEndpoint", Endpoint)
     monkeypatch.setattr(Endpoint, "failing", 0)
     return lambda: Network(Settings(), cast("Any", None), trust=cast("Any", SimpleNamespace()))
 

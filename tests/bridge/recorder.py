@@ -9,8 +9,7 @@ from rmpa.bridge.context import BridgeContext, Names, ServiceRules
 from rmpa.bridge.messages import Source
 from rmpa.bridge.offers import Effects
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
-from rmpa.bridge.services import exports as service_exports
-from rmpa.bridge.services import imports as service_imports
+from rmpa.bridge.services import books
 from rmpa.bridge.topics import exports as topic_exports
 from rmpa.bridge.topics import imports as topic_imports
 from rmpa.config.peer_rules import PolicySettings
@@ -256,6 +255,14 @@ class Out(Effects):
         self.done.append(ForgetAbout(remote.peer, remote.name))
 
 
+class PeerServiceRules(ServiceRules):
+    """Rules of services, with those that hold for peers."""
+
+    def __init__(self, settings: ServiceSettings, policy: Policy, names: Names) -> None:
+        super().__init__(settings)
+        self.policy, self.names = policy, names
+
+
 def context(
     policy: Policy | None = None,
     contracts: Contracts | None = None,
@@ -265,9 +272,9 @@ def context(
     services: ServiceRules | None = None,
 ) -> BridgeContext:
     """Rules of a module; those that are left out allow everything."""
-    policy = policy or (services._policy if services is not None else Policy(PolicySettings()))
-    names = names or (services._names if services is not None else Names())
-    rules = services or ServiceRules(ServiceSettings(), policy, names)
+    policy = policy or getattr(services, "policy", None) or Policy(PolicySettings())
+    names = names or getattr(services, "names", None) or Names()
+    rules = services or ServiceRules(ServiceSettings())
     settings = Settings(limits=limits or LimitSettings())
     return BridgeContext(settings, policy, rules, names, contracts or Contracts(), gate)
 
@@ -354,7 +361,7 @@ class Exports(Recorded):
         """What is done, and whether a route waits."""
         for _ in self.book.link_away(peer):
             pass
-        return self.out.take(), self.book.waits_for(peer)
+        return self.out.take(), self.book.outage(peer) > 0
 
     def apply_rules(
         self,
@@ -409,7 +416,7 @@ class ServiceExports(Recorded):
         self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
     ) -> None:
         out = Out(context(limits=limit_settings, gate=gate, services=rules))
-        super().__init__(service_exports.ServiceExports(out), out)
+        super().__init__(books.ServiceExports(out), out)
 
     def apply_rules(self, rules: ServiceRules, limits: LimitSettings | None = None) -> Iterator[list[Any]]:
         return self.rejudge(context(limits=limits, gate=self.out.context.gate, services=rules))
@@ -425,7 +432,7 @@ class ServiceImports(Recorded):
         self, rules: ServiceRules, limit_settings: LimitSettings | None = None, gate: PermissionGate = OPEN_GATE
     ) -> None:
         out = Out(context(limits=limit_settings, gate=gate, services=rules))
-        super().__init__(service_imports.ServiceImports(out), out)
+        super().__init__(books.ServiceImports(out), out)
 
     def hidden(self, remote: RemoteService) -> str:
         """Why a service is not shown."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from itertools import islice
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
-from rmpa.bridge.peer_offers import CROWDED, Heard
+from rmpa.bridge.peer_offers import CROWDED, Heard, ImportBook
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.config.peer_rules import PeerRule, PolicySettings
@@ -153,7 +154,9 @@ def heard(*entries: str) -> Heard[str, Any, str]:
 def changes(
     made: Heard[str, Any, str], *added: str, removed: tuple[str, ...] = (), full: bool = False, more: bool = False
 ) -> list[tuple[str, str | None]]:
-    return list(made.changes(added, removed, str, full=full, more=more))
+    message = AdvertiseServices(tuple(ServiceOffer(name, "/n") for name in added), removed, full, more)
+    book: Any = SimpleNamespace(_peers={1: made})
+    return [(wire, offer and offer.service) for wire, offer in ImportBook.changes(book, 1, message)]
 
 
 def test_removals_go_first() -> None:

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import Names, ServiceRules
+from rmpa.bridge.context import Names
 from rmpa.bridge.messages import (
     Advertise,
     Description,
@@ -39,6 +39,7 @@ from tests.bridge.recorder import (
     EndRoute,
     Exports,
     Imports,
+    PeerServiceRules,
     RemoveRoute,
     Send,
     ServiceExports,
@@ -77,7 +78,7 @@ class Secured:
         self.counters = Counters()
         self.gate = PermissionGate(Permissions(self.trust), self.counters)
         self.policy, self.names = Policy(PolicySettings(), peers, TimeSettings("arm")), Names(peers)
-        self.rules = ServiceRules(ServiceSettings(), self.policy, self.names)
+        self.rules = PeerServiceRules(ServiceSettings(), self.policy, self.names)
         self.exports = Exports(self.policy, Contracts(), self.names, gate=self.gate)
         self.imports = Imports(self.policy, lambda: 0.5, names=self.names, gate=self.gate)
         self.service_exports = ServiceExports(self.rules, gate=self.gate)
@@ -111,7 +112,7 @@ class Secured:
         return self.exports.offer(peer, Source(topic, "/n")) is not None
 
     def shown(self) -> list[tuple[int, str]]:
-        return sorted((peer, entry.topic) for peer, _, entry in self.imports if entry.shown)
+        return sorted((peer, entry.name) for peer, _, entry in self.imports if entry.shown)
 
     def reload(self, *rules: PermissionRule, relays: tuple[str, ...] = ()) -> list[Any]:
         self.gate.reload(TrustSettings(rules=rules, relays=relays))
@@ -282,7 +283,7 @@ class SecuredMap(Map):
         self.trust[here] = trust
         module = self.modules[here]
         policy = Policy(PolicySettings())
-        rules = ServiceRules(ServiceSettings(), policy)
+        rules = PeerServiceRules(ServiceSettings(), policy, Names())
         module.gate.reload(trust)
         self.act(here, module.exports.apply_rules(policy, Contracts(), Names()))
         for actions in module.imports.apply_rules(policy, Contracts(), Names(), 0.0):

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.context import ServiceRules
+from rmpa.bridge.context import Names
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy, Relay, RelayPaths, may_have
 from rmpa.bridge.services.bodies import LocalService
@@ -22,6 +22,7 @@ from rmpa.config.settings import ServiceSettings
 from tests.bridge.recorder import (
     Exports,
     Imports,
+    PeerServiceRules,
     Provide,
     Publish,
     Retract,
@@ -72,7 +73,7 @@ class Module:
         self.exports = Exports(policy, gate=self.gate)
         self.imports = Imports(policy, rng=lambda: 0.5, gate=self.gate)
         self.relay = Relay(enabled=self.relays)
-        rules = ServiceRules(ServiceSettings(), policy)
+        rules = PeerServiceRules(ServiceSettings(), policy, Names())
         self.service_exports = ServiceExports(rules, gate=self.gate)
         self.service_imports = ServiceImports(rules, gate=self.gate)
         self.relay.instance = self.imports.ways.instance = instance(self.number)

@@ -78,13 +78,13 @@ class PeerNames:
 
     def wires_of(self, local: str) -> tuple[str, ...]:
         """The wire names that become this local name, best first."""
-        names = [old for source, target in self._in if (old := _undone(local, source, target)) is not None]
+        names = [old for source, target in self._in if (old := _renamed(local, target, source)) is not None]
         names.append(local if not self.prefix else local.removeprefix(self.prefix))
         return tuple(n for n in dict.fromkeys(names) if n and self.local_name(n) == local)
 
     def locals_of(self, wire: str) -> tuple[str, ...]:
         """The local names that become this wire name, best first."""
-        names = [old for source, target in self._out if (old := _undone(wire, source, target)) is not None]
+        names = [old for source, target in self._out if (old := _renamed(wire, target, source)) is not None]
         names += [self.prefix + wire, wire]
         return tuple(n for n in dict.fromkeys(names) if self.wire_name(n) == wire)
 
@@ -123,18 +123,8 @@ def _filled(renaming: tuple[str, str], peer: str) -> tuple[str, str]:
     return source.replace(PEER, peer), target.replace(PEER, peer)
 
 
-def _undone(name: str, source: str, target: str) -> str | None:
-    """The name that a rule turns into ``name``; ``None`` if there is none."""
-    if not target.endswith("/**"):
-        return source if name == target and not source.endswith("/**") else None
-    stem = target[:-3]
-    if name != stem and not name.startswith(stem + "/"):
-        return None
-    return source[:-3] + name[len(stem) :] or None
-
-
 def _renamed(name: str, source: str, target: str) -> str | None:
-    """The name as one rule renames it; ``None`` if the rule does not fit."""
+    """The name as one rule renames it, or with the two exchanged, undoes it; ``None`` if the rule does not fit."""
     if not source.endswith("/**"):
         return target if name == source else None
     stem = source[:-3]
@@ -149,18 +139,14 @@ LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
 
 
 class ServiceRules:
-    """Judges and names services.
+    """Judges services, and says how they are called; the rules of topics do not apply to them.
 
     Args:
         settings: ``[services]`` and ``[[service]]``.
-        policy: For what ``[[peer]]`` allows; the rules of topics do not apply to services.
-        names: For what ``[[peer]]`` renames.
     """
 
-    def __init__(self, settings: ServiceSettings, policy: Policy, names: Names | None = None) -> None:
+    def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
-        self._policy = policy
-        self._names = names if names is not None else Names()
 
     def judge(self, service: str, node: str) -> PolicyDecision:
         """Decide whether a service may cross at all.
@@ -187,28 +173,6 @@ class ServiceRules:
             if matches(pattern, service):
                 return PolicyDecision(True, f"services.allow has {pattern!r}")
         return PolicyDecision(False, f"no glob of services.allow fits {service}")
-
-    def judge_for(self, peer: str, service: str, wire: str) -> PolicyDecision:
-        """Decide whether a service that ``judge`` allows may cross between this module and one peer.
-
-        Args:
-            peer: The peer's name.
-            service: The service's name in the local graph.
-            wire: Its name on the wire.
-        """
-        return self._policy.judge_for(peer, service, wire=wire)
-
-    def local_name(self, peer: str, wire: str) -> str:
-        """The name in the local graph of a service that a peer offers as ``wire``."""
-        return self._names.local_name(peer, wire)
-
-    def wire_name(self, peer: str, service: str) -> str:
-        """The name on the wire, to this peer, of a service of this module."""
-        return self._names.wire_name(peer, service)
-
-    def own_name(self, peer: str, wire: str) -> str:
-        """The name in the local graph of a service of this module that this peer knows as ``wire``."""
-        return next(iter(self._names.of(peer).locals_of(wire)), wire)
 
     def timeout(self, service: str) -> float:
         """The time-out of a call of a service, in seconds.
@@ -265,5 +229,5 @@ class BridgeContext:
         """The rules of these settings; without any, those of a module that sets nothing."""
         settings = settings if settings is not None else Settings()
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
-        services = ServiceRules(settings.services, policy, names)
+        services = ServiceRules(settings.services)
         return cls(settings, policy, services, names, settings.make_contracts(), gate)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, decode, encode
 from rmpa.bridge.offers import Effects
-from rmpa.bridge.sessions import Part, UnchangedGraph
+from rmpa.bridge.sessions import Part
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.runtime.loop import MachineTimer, yield_to_data
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer_offers import ImportBook
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
+    from rmpa.ros.master.parameters import GraphState
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +79,8 @@ class GraphPart(Part, Effects):
         self._rejudging: Iterator[None] = iter(())
         self._freeing: deque[Iterator[None]] = deque()
         self._scan_handle: asyncio.Handle | None = None
-        self._unchanged = UnchangedGraph()
+        self._compared: GraphState | None = None
+        self._skipped = 0
         self._closed = False
 
     @property
@@ -219,11 +221,19 @@ class GraphPart(Part, Effects):
         self.schedule()
 
     def look_again(self) -> bool:
-        """Queue all names, unless nothing can have changed since they were; return whether it was done."""
-        due = self._unchanged.is_due(self._shared.core.state(), steady=not self._shared.core.unreachable())
-        if due:
-            self.look(self._names())
-        return due
+        """Queue all names, unless nothing can have changed since they were; return whether it was done.
+
+        A graph of 1,000 modules has tens of thousands of names, and comparing them takes half a second of processor
+        time. A core returns the same object until something is registered, so an idle agent compares seldom. Whether
+        a node is reachable decides, too.
+        """
+        state = self._shared.core.state()
+        if self._skipped < limits.RECONCILE_SKIPS and state is self._compared and not self._shared.core.unreachable():
+            self._skipped += 1
+            return False
+        self._compared, self._skipped = state, 0
+        self.look(self._names())
+        return True
 
     def reload(self) -> None:
         """Judge by new rules; entries and routes that they do not change go on untouched."""

@@ -355,7 +355,8 @@ TopicMessage = Advertise | OpenRoute | RouteOpened | CloseRoute | RouteClosed | 
 ServiceMessage = AdvertiseServices | OpenService | ServiceOpened | CloseService | ServiceClosed
 Message = TopicMessage | ServiceMessage | Request | Response | Notification
 
-_ENCODER: Final = msgspec.json.Encoder()
+# Encodes a message as the payload of a control frame.
+encode: Final = msgspec.json.Encoder().encode
 _DECODER: Final = msgspec.json.Decoder(Message)
 _MD5: Final = re.compile(r"[0-9a-f]{32}")
 
@@ -371,11 +372,6 @@ def is_crossing_name(name: str) -> bool:
 def is_crossing_type(name: str) -> bool:
     """Whether a type may be in a message: its name is valid and at most ``CROSSING_NAME_MAX`` characters long."""
     return len(name) <= config_limits.CROSSING_NAME_MAX and is_type_name(name)
-
-
-def encode(message: Message) -> bytes:
-    """Encode a message as the payload of a control frame."""
-    return _ENCODER.encode(message)
 
 
 def without_text(fields: Any) -> tuple[Any, bytes]:

@@ -12,7 +12,7 @@ from rmpa.bridge.offers import KeyT, OfferT, wire_of
 from rmpa.bridge.policy import RelayPaths
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin
     from rmpa.bridge.offers import Effects
@@ -124,35 +124,6 @@ class Heard(Generic[KeyT, EntryT, OfferT]):
         self.crowded.clear()
         self.refused.clear()
 
-    def changes(
-        self,
-        added: tuple[OfferT, ...],
-        removed: tuple[KeyT, ...],
-        wire: Callable[[OfferT], KeyT],
-        *,
-        full: bool,
-        more: bool,
-    ) -> Iterator[tuple[KeyT, OfferT | None]]:
-        """The changes that an advertisement makes, each with its name on the wire; removals, ``None``, go first.
-
-        Args:
-            added: The offers that the advertisement adds.
-            removed: The names on the wire that it removes.
-            wire: ``(offer)``: the offer's name on the wire.
-            full: Whether it begins a complete catalogue: entries that the catalogue does not contain are removed at
-                its end.
-            more: Whether the complete catalogue goes on with the next advertisement.
-        """
-        if full:
-            self.doubtful = set(self.entries)
-            self.refused.clear()
-        self.doubtful.difference_update(map(wire, added))
-        if self.doubtful and not more:
-            removed += tuple(sorted(self.doubtful))  # type: ignore[type-var] # names are in order
-            self.doubtful = set()
-        yield from ((name, None) for name in removed)
-        yield from ((wire(offer), offer) for offer in added)
-
 
 def _is_same(entry: Remote[Any], offer: Any) -> bool:
     """Whether an offer is what an entry was made of."""
@@ -239,11 +210,22 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
             self._ways_changed(self.ways.linked(peer, name, instance, rank))
 
     def changes(self, peer: int, message: Advertise | AdvertiseServices) -> Iterator[tuple[KeyT, OfferT | None]]:
-        """The changes of an advertisement, one by one, for ``take_in``."""
+        """The changes of an advertisement, each with its name on the wire; removals, ``None``, go first.
+
+        Entries that a complete catalogue does not contain are removed at its end.
+        """
         known, added, removed = self._peers.get(peer), cast("Any", message.added), cast("Any", message.removed)
         if known is None:
-            return iter(())
-        return known.changes(added, removed, wire_of, full=message.full, more=message.more)
+            return
+        if message.full:
+            known.doubtful = set(known.entries)
+            known.refused.clear()
+        known.doubtful.difference_update(map(wire_of, added))
+        if known.doubtful and not message.more:
+            removed += tuple(sorted(known.doubtful))  # type: ignore[type-var] # names are in order
+            known.doubtful = set()
+        yield from ((name, None) for name in removed)
+        yield from ((wire_of(offer), offer) for offer in added)
 
     def take_in(self, peer: int, wire: KeyT, offer: OfferT | None, now: float) -> None:
         """Apply one change of an advertisement: an offer, or ``None`` for what is offered no more."""

@@ -189,10 +189,6 @@ async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
     return RosReply(0, f"{node} is a node of another module", 0)
 
 
-def _nothing(_node: SlaveNode) -> None:
-    """Does nothing: the user has nothing to remove from the proxy."""
-
-
 class PeerProxies:
     """The proxies of one peer; each exists while a topic or service holds it.
 
@@ -252,7 +248,7 @@ class PeerProxies:
         node: str,
         key: Hashable,
         ready: Callable[[SlaveNode], None],
-        left: Callable[[SlaveNode], None] = _nothing,
+        left: Callable[[SlaveNode], None] = lambda _: None,
     ) -> None:
         """Keep a proxy for a node because of one topic or service, until ``release``.
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
-from rmpa.bridge import limits
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Message, Origin
     from rmpa.bridge.proxies import ProxyNodes
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.master.parameters import GraphChange, GraphState
+    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import RosReply
 
 
@@ -97,36 +96,6 @@ class PeerSession:
     def due(self) -> float | None:
         """When something kept for the absent peer expires next, monotonic seconds; ``None``: nothing does."""
         return None if self.wait is None else self.away_since + self.wait
-
-
-# Whether a comparison of all names with the local graph would find anything.
-
-
-class UnchangedGraph:
-    """Remembers the graph of the last comparison; pure.
-
-    A graph of 1,000 modules has tens of thousands of names, and comparing them takes half a second of processor time.
-    A core returns the same object until something is registered, so an idle agent compares seldom.
-    """
-
-    __slots__ = ("_seen", "_skipped")
-
-    def __init__(self) -> None:
-        self._seen: GraphState | None = None
-        self._skipped = 0
-
-    def is_due(self, state: GraphState, *, steady: bool) -> bool:
-        """Whether to compare now: the graph is another one, or the last comparison is long ago.
-
-        Args:
-            state: The local graph.
-            steady: Whether nothing outside the graph, as a node's reachability, decides what a comparison finds.
-        """
-        if steady and state is self._seen and self._skipped < limits.RECONCILE_SKIPS:
-            self._skipped += 1
-            return False
-        self._seen, self._skipped = state, 0
-        return True
 
 
 # The base class of the bridge's parts: topics, services, parameters and others.

@@ -221,7 +221,7 @@ class SnapshotBuilder:
             yield_to_data()
             infos.append(self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now))
         shown = {
-            (entry.origin.instance, entry.topic)
+            (entry.origin.instance, entry.name)
             for _, _, entry in yielding_to_data(list(imports))
             if entry.origin is not None and entry.shown
         }

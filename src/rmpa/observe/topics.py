@@ -139,11 +139,11 @@ class TopicFacts:
         first, problems = set(state.subscribers), set()
         for _, source, entry in yielding_to_data(list(topics.imports)):
             if entry.state != "idle" or entry.direct:
-                first.add(entry.topic)
+                first.add(entry.name)
             elif not entry.shown or entry.problem or topics.mismatches(source):
-                problems.add(entry.topic)
+                problems.add(entry.name)
             else:
-                idle.add(entry.topic)
+                idle.add(entry.name)
         first.update(source.topic for source in yielding_to_data(topics.exports.offered))
         others = idle | problems
         first.update(name for name in yielding_to_data(state.publishers) if name not in others)
@@ -162,12 +162,12 @@ class TopicFacts:
         """The topic of each source of a peer with its route, and its mismatches."""
         sessions = {session.peer: session for session in self._bridge.sessions}
         for peer, source, entry in yielding_to_data(list(self._bridge.topics.imports)):
-            if wanted is not None and entry.topic not in wanted:
+            if wanted is not None and entry.name not in wanted:
                 continue
             yield_to_data()
             texts = [f"{sessions[peer].link.name}: {entry.hidden}"] if entry.cause == CONFLICT else []
             texts += self._bridge.topics.mismatches(source)
-            yield entry.topic, self.incoming(sessions[peer], source, entry), texts
+            yield entry.name, self.incoming(sessions[peer], source, entry), texts
 
     def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
         """The route of a peer's source; ``source`` has its wire name."""
@@ -193,7 +193,7 @@ class TopicFacts:
             peer=session.link.name,
             node=source.node,
             direction="in",
-            wire=source.topic if source.topic != entry.topic else "",
+            wire=source.topic if source.topic != entry.name else "",
             state="hidden" if not entry.shown else entry.state,
             type=entry.type,
             md5=about.md5 if about is not None else "",
@@ -203,7 +203,7 @@ class TopicFacts:
             problem=entry.hidden or problem,
             limit="nodes" if entry.cause == CROWDED else "",
             **_events(topics.watch(source), now),
-            **self._transport(session, source, contracts.of(entry.topic, entry.type), now),
+            **self._transport(session, source, contracts.of(entry.name, entry.type), now),
             **figures,
         )
 

@@ -301,9 +301,9 @@ def test_what_is_kept_for_a_peer_that_is_back_and_has_no_use_for_it_goes() -> No
         world.link()
         await world.rest(mesh_limits.RESUME_CLAIM - 1.0, step=0.1)
         (attached,) = a.attached
-        assert a.bridge.topics.exports.waits_for(attached.peer)
+        assert a.bridge.topics.exports.outage(attached.peer)
         await world.rest(2.0, step=0.1)
-        assert not a.bridge.topics.exports.waits_for(attached.peer)
+        assert not a.bridge.topics.exports.outage(attached.peer)
         assert not speaker.connections
 
     play(12, scene, outage=6000.0, depth=100_000)

@@ -11,10 +11,11 @@ from rmpa.bridge.policy import Policy
 from rmpa.config.peer_rules import PeerRule, PolicySettings, ServiceRule
 from rmpa.config.settings import ServiceSettings
 from rmpa.core.contract import Transport
+from tests.bridge.recorder import PeerServiceRules
 
 
 def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] = ()) -> ServiceRules:
-    return ServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
+    return PeerServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
 
 
 def apply_rules(plan: Any, changed: ServiceRules) -> list[Any]:
@@ -47,12 +48,12 @@ def test_each_decision_names_its_rule(
 
 def test_rules_of_one_peer_come_on_top() -> None:
     peers = (PeerRule("robot*", prefix="/robot1", policy=PolicySettings(deny=("/robot1/stop",))),)
-    made = rules(peers=peers)
-    assert made.local_name("robot_7", "/stop") == "/robot1/stop"
-    assert made.wire_name("robot_7", "/robot1/go") == "/go"
-    assert made.local_name("base", "/stop") == "/stop"
-    assert not made.judge_for("robot_7", "/robot1/stop", "/stop").allowed
-    assert made.judge_for("base", "/robot1/stop", "/robot1/stop").allowed
+    names, policy = Names(peers), Policy(PolicySettings(), peers)
+    assert names.local_name("robot_7", "/stop") == "/robot1/stop"
+    assert names.wire_name("robot_7", "/robot1/go") == "/go"
+    assert names.local_name("base", "/stop") == "/stop"
+    assert not policy.judge_for("robot_7", "/robot1/stop", wire="/stop").allowed
+    assert policy.judge_for("base", "/robot1/stop", wire="/robot1/stop").allowed
 
 
 def test_the_first_rule_that_fits_says_how_long_a_call_may_take() -> None:

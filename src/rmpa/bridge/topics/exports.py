@@ -210,10 +210,6 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                 self._remove(source, peer, flow)
                 yield
 
-    def waits_for(self, peer: int) -> bool:
-        """Whether a reliable route waits for a peer without a link."""
-        return self.outage(peer) > 0
-
     def outage(self, peer: int) -> float:
         """The longest time, in seconds, for which messages are kept for a peer without a link; 0 if none are."""
         away = (route for flow in self._flows.values() if (route := flow.routes.get(peer)) and not route.number)

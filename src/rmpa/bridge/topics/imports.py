@@ -79,11 +79,6 @@ class RemoteTopic(Remote[Source]):
     direct: bool = False
 
     @property
-    def topic(self) -> str:
-        """The topic in the local graph."""
-        return self.name
-
-    @property
     def state(self) -> str:
         """The state of the route, as in the figure above."""
         if not self.route:

@@ -137,7 +137,7 @@ class Topics(GraphPart, TopicEvents):
     def grace_over(self, session: PeerSession) -> bool:
         """Drop the peer's sources that do not outlive their link; return whether any route waits for the peer."""
         peer = session.peer
-        if not self.exports.waits_for(peer) and not self.imports.waits_for(peer):
+        if not self.exports.outage(peer) and not self.imports.waits_for(peer):
             self.imports.detached(peer)
             return False
         deque(self.imports.link_away(peer), 0)  # without a pause, as in ``link_down``

@@ -284,7 +284,7 @@ class WhyService:
         if not self._bridge.gate.on:
             return ""
         module, relay = (peer, "") if entry.origin is None else (entry.origin.name, peer)
-        return self._bridge.gate.judge(Access.PUBLISH, module, entry.topic, relay=relay).rule
+        return self._bridge.gate.judge(Access.PUBLISH, module, entry.name, relay=relay).rule
 
     # --- topics of this module -------------------------------------------------------------------------------
 
@@ -345,9 +345,8 @@ class WhyService:
     async def _similar(self, asker: str, access: Access, wire: str, names: Iterable[str]) -> str:
         """Which of the names of this module, of those that a peer may know, is most like one on the wire."""
         context, gate = self._bridge.context, self._bridge.gate
-        wire_name = context.services.wire_name if access is Access.CALL else context.names.wire_name
         allowed = (name for name in yielding_to_data(list(names)) if gate.judge(access, asker, name).allowed)
-        known = {wire_name(asker, name) for name in allowed}
+        known = {context.names.wire_name(asker, name) for name in allowed}
         # In a thread: comparing thousands of names takes longer than a message may wait.
         return await asyncio.to_thread(did_you_mean, wire, known) or ""
 
