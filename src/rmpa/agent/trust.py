@@ -13,10 +13,11 @@ import socket
 import time
 from functools import partial
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa.bridge.messages import convert
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import state_dir
@@ -48,11 +49,11 @@ if TYPE_CHECKING:
     from rmpa.trust.joining import JoinServer
     from rmpa.trust.membership import Membership
 
-_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 # The request for a certificate, at the authority: ``{"request": BASE64}`` to ``{"certificate": BASE64}``.
 RENEW: Final = "trust.renew"
+_ABOUT: Final = "a message about trust"
 NOT_AUTHORITY: Final = "this module is not the authority of its mesh"
 
 
@@ -189,7 +190,7 @@ class AgentTrust(Part):
             self._authority_peer = None
 
     def _have(self, session: PeerSession, args: dict[str, Any]) -> None:
-        have, name = _read(args, Have), session.link.name
+        have, name = convert(_ABOUT, args, Have), session.link.name
         if have.authority and self.authority is None:
             if name == self.membership.keys.authority:
                 self._authority_found(session)
@@ -199,7 +200,7 @@ class AgentTrust(Part):
         self.spread()
 
     def _document(self, kind: Document, session: PeerSession, args: dict[str, Any]) -> None:
-        data, name = _read(args.get("document"), str).encode(), session.link.name
+        data, name = convert(_ABOUT, args.get("document"), str).encode(), session.link.name
         try:
             newer = self.membership.accept_document(kind, data)
         except RemoteProtocolError as error:
@@ -299,7 +300,7 @@ class AgentTrust(Part):
         hosts = self.page_hosts()
         request = {"request": base64.b64encode(self.membership.request(hosts)).decode()}
         reply = await self._bridge.rpc.request(session, RENEW, request, limits.JOIN_STEP_TIMEOUT)
-        self.membership.renewed(_read(reply.get("certificate") if isinstance(reply, dict) else None, bytes))
+        self.membership.renewed(convert(_ABOUT, reply.get("certificate") if isinstance(reply, dict) else None, bytes))
         self._hosts_asked = hosts
 
     async def _renew_by_dial(self) -> None:
@@ -324,7 +325,7 @@ class AgentTrust(Part):
         bucket = self._renewals.setdefault(name, TokenBucket(limits.RENEWALS_RATE, limits.RENEWALS_BURST))
         if not bucket.take(self._clock.now()):
             raise RmpaError(f"{name} asks for certificates too often: once a minute is allowed")
-        _, certificate = self.authority.issue(_read(args.get("request"), bytes), name)
+        _, certificate = self.authority.issue(convert(_ABOUT, args.get("request"), bytes), name)
         _log.info("= %s has a new certificate", session.link.name)
         return {"certificate": base64.b64encode(certificate).decode()}
 
@@ -344,18 +345,6 @@ class AgentTrust(Part):
     def is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
         return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
-
-
-def _read(raw: object, form: type[_T]) -> _T:
-    """The arguments of a peer's message, or one of them; bytes are in base64.
-
-    Raises:
-        RemoteProtocolError: It is missing or malformed.
-    """
-    try:
-        return msgspec.convert(raw, form)
-    except msgspec.ValidationError as error:
-        raise RemoteProtocolError(f"a message about trust: {error}") from None
 
 
 # Answers ``rmpa trust …`` on the control socket of a secured agent.

@@ -15,7 +15,7 @@ from rmpa.bridge.nodes import ProxyKills
 from rmpa.bridge.policy import Needs, PermissionGate, Relay
 from rmpa.bridge.proxies import ProxyNodes
 from rmpa.bridge.rpc import PeerRpc
-from rmpa.bridge.sessions import Part, PeerSessions, guarded
+from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.shared import Shared
 from rmpa.bridge.topics.part import Topics
 from rmpa.config.peer_rules import Access
@@ -105,9 +105,7 @@ class Bridge(Shared):
         """Take new settings; unchanged sources and routes go on, changes follow in later turns of the loop."""
         self.gate.reload(settings.trust)
         self.context = BridgeContext.of(settings, self.gate)
-        for part in self._parts:
-            with guarded(part):
-                part.reload()
+        call_each(self._parts, lambda part: part.reload())
 
     async def start(self) -> None:
         """Start the agent's node, the parts and the following of the local graph."""
@@ -164,9 +162,7 @@ class Bridge(Shared):
     # --- the local graph's side --------------------------------------------------------------------------------
 
     def _graph_changed(self, change: GraphChange) -> None:
-        for part in self._parts:
-            with guarded(part):
-                part.graph_changed(change)
+        call_each(self._parts, lambda part: part.graph_changed(change))
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
         return sum(part.param_update(key) for part in self._parts) > 0  # a sum, because every part must be called

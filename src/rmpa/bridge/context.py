@@ -15,9 +15,10 @@ other modules, and never to the module that they came from, so no rule can make 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.policy import OPEN_GATE, Policy, PolicyDecision
+from rmpa.bridge.policy import OPEN_GATE, Policy, PolicyDecision, judge_globs
 from rmpa.config import limits as config_limits
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import Settings
@@ -60,21 +61,16 @@ class PeerNames:
         """The local name of a peer's topic or service."""
         if wire == CLOCK:
             return wire  # nodes read the time from no other topic
-        for source, target in self._in:
-            if (new := _renamed(wire, source, target)) is not None:
-                return new
-        return self.prefix + wire
+        renamed = (_renamed(wire, source, target) for source, target in self._in)
+        return next((new for new in renamed if new is not None), self.prefix + wire)
 
     def wire_name(self, local: str) -> str:
         """The wire name, for this peer, of a local topic or service."""
         if local == CLOCK:
             return local
-        for source, target in self._out:
-            if (new := _renamed(local, source, target)) is not None:
-                return new
-        if self.prefix and local.startswith(self.prefix + "/"):
-            return local[len(self.prefix) :]
-        return local
+        renamed = (_renamed(local, source, target) for source, target in self._out)
+        plain = local[len(self.prefix) :] if local.startswith(self.prefix + "/") else local
+        return next((new for new in renamed if new is not None), plain)
 
     def wires_of(self, local: str) -> tuple[str, ...]:
         """The wire names that become this local name, best first."""
@@ -94,20 +90,13 @@ class Names:
 
     Args:
         rules: All ``[[peer]]`` tables, in the order of the file.
+
+    Attributes:
+        of: ``(peer)``: the names of one peer, by the peer's name.
     """
 
     def __init__(self, rules: tuple[PeerRule, ...] = ()) -> None:
-        self._rules = rules
-        self._known: dict[str, PeerNames] = {}
-
-    def of(self, peer: str) -> PeerNames:
-        """The names of one peer, by the peer's name."""
-        known = self._known.get(peer)
-        if known is None:
-            if len(self._known) >= config_limits.NAMES_REMEMBERED:
-                self._known.clear()
-            known = self._known[peer] = PeerNames(peer, self._rules)
-        return known
+        self.of = lru_cache(config_limits.NAMES_REMEMBERED)(lambda peer: PeerNames(peer, rules))
 
     def local_name(self, peer: str, wire: str) -> str:
         """The local name of a peer's topic or service."""
@@ -166,13 +155,7 @@ class ServiceRules:
             return PolicyDecision(
                 False, "built in: a node's log is set at home; services.loggers = true lets it cross"
             )
-        for pattern in settings.deny:
-            if matches(pattern, service):
-                return PolicyDecision(False, f"services.deny has {pattern!r}")
-        for pattern in settings.allow:
-            if matches(pattern, service):
-                return PolicyDecision(True, f"services.allow has {pattern!r}")
-        return PolicyDecision(False, f"no glob of services.allow fits {service}")
+        return judge_globs(settings, "services", service)
 
     def timeout(self, service: str) -> float:
         """The time-out of a call of a service, in seconds.

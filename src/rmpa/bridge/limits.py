@@ -64,7 +64,7 @@ SERVER_LOOK: Final = 0.5
 SERVICE_LATENCIES: Final = 512
 # Nodes subscribed to one topic that are named to the agent of its publisher.
 AUDIENCE_MAX: Final = 64
-# Connections that represent the subscribers of one peer (``bridge.topics.subscribers``): enough for 512 action
+# Connections that represent the subscribers of one peer (``bridge.topics.local``): enough for 512 action
 # servers of one module.
 AUDIENCES_MAX: Final = 1024
 # Characters in the name of a request between agents.

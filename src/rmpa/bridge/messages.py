@@ -7,7 +7,7 @@ readable in a packet capture. ``docs/design/protocol.md`` lists the messages wit
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -360,6 +360,7 @@ encode: Final = msgspec.json.Encoder().encode
 _DECODER: Final = msgspec.json.Decoder(Message)
 _MD5: Final = re.compile(r"[0-9a-f]{32}")
 
+FormT = TypeVar("FormT")
 _OP: Final = b'{"op":"'
 _OP_MAX: Final = 32
 
@@ -392,6 +393,18 @@ def with_text(fields: Any, text: bytes | memoryview) -> None:
         fields["text"] = str(text, "utf-8")
     except (UnicodeDecodeError, TypeError) as error:
         raise RemoteProtocolError(f"a text behind its message: {error}") from None
+
+
+def convert(what: str, value: object, form: type[FormT]) -> FormT:
+    """Read and validate what is in a message; bytes are in base64.
+
+    Raises:
+        RemoteProtocolError: It is missing or malformed; ``what`` names it.
+    """
+    try:
+        return msgspec.convert(value, form)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise RemoteProtocolError(f"{what}: {error}") from error
 
 
 def op_of(payload: bytes | bytearray | memoryview) -> str:

@@ -13,6 +13,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Origin
 from rmpa.config import limits as config_limits
+from rmpa.config.peer_rules import PolicySettings
 from rmpa.config.rules import CLOCK
 from rmpa.config.settings import TimeSettings
 from rmpa.config.values import PEER
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.bridge.messages import Source
-    from rmpa.config.peer_rules import Access, PeerRule, PolicySettings
-    from rmpa.config.settings import TrustSettings
+    from rmpa.config.peer_rules import Access, PeerRule
+    from rmpa.config.settings import ServiceSettings, TrustSettings
     from rmpa.core.identity import Identity
     from rmpa.trust.permissions import Permissions
 
@@ -68,7 +69,7 @@ class Policy:
             return PolicyDecision(True, "time.share = true: peers may follow this module's time")
         if why := never_crosses(topic):
             return PolicyDecision(False, f"built in: {why}")
-        return _judge(self._settings, "bridge", topic, type_name)
+        return judge_globs(self._settings, "bridge", topic, type_name)
 
     def judge_clock(self, peer: str) -> PolicyDecision:
         """Decide whether a peer's ``/clock`` may come here."""
@@ -105,7 +106,7 @@ class Policy:
         if wire and wire != name and (why := never_crosses(wire)):
             return PolicyDecision(False, f"built in: {why} (it is {wire} there)")
         for where, settings in self._rules_for(peer):
-            decision = _judge(settings, where, name, type_name)
+            decision = judge_globs(settings, where, name, type_name)
             if not decision.allowed:
                 return decision
         return PolicyDecision(True, "")
@@ -116,12 +117,21 @@ def never_crosses(topic: str) -> str:
     return next((why for pattern, why in NEVER_CROSSING.items() if matches(pattern, topic)), "")
 
 
-def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> PolicyDecision:
-    """Decides by one set of globs; ``where`` is its place in the file, as text."""
+def judge_globs(
+    settings: PolicySettings | ServiceSettings, where: str, name: str, type_name: str | None = None
+) -> PolicyDecision:
+    """Decide by one set of globs.
+
+    Args:
+        settings: It.
+        where: Its place in the file, as text.
+        name: The local name of the topic or service.
+        type_name: A topic's message type; ``None`` for a service, or if the type is unknown.
+    """
     for pattern in settings.deny:
         if matches(pattern, name):
             return PolicyDecision(False, f"{where}.deny has {pattern!r}")
-    if type_name is not None:
+    if type_name is not None and isinstance(settings, PolicySettings):
         for pattern in settings.deny_types:
             if matches(pattern, type_name):
                 return PolicyDecision(False, f"{where}.deny_types has {pattern!r}")

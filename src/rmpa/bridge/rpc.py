@@ -230,15 +230,10 @@ class LinkRequests(BodyReceiver):
             self._refuse(message.number, "too many large questions at once")
         else:
             name = f"answer {message.what} of {self._link.name}"
-            task = asyncio.create_task(self._answer(message, size), name=name)
+            task = asyncio.create_task(self._respond(message), name=name)
             self.tasks.add(task)
             task.add_done_callback(self.tasks.discard)
-
-    async def _answer(self, ask: Request, size: int) -> None:
-        try:
-            await self._respond(ask)
-        finally:
-            self._budget.give(size)
+            task.add_done_callback(lambda _: self._budget.give(size))
 
     async def _respond(self, ask: Request) -> None:
         handler = self._rpc.handlers.get(ask.what)

@@ -17,7 +17,7 @@ from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime.loop import MachineTimer, yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from rmpa.bridge.messages import Message, Origin
@@ -207,6 +207,13 @@ def guarded(part: Part) -> AbstractContextManager[None]:
     return logged_failure(_log, "%s failed; the other parts go on", type(part).__name__)
 
 
+def call_each(parts: Iterable[Part], call: Callable[[Part], object]) -> None:
+    """Call all parts, one after the other; see ``guarded``."""
+    for part in parts:
+        with guarded(part):
+            call(part)
+
+
 class PeerSessions:
     """The sessions of all peers; notifies the parts of the bridge when one begins, ends, or loses or gets a link.
 
@@ -273,9 +280,7 @@ class PeerSessions:
             session = self._begin(link)
         session.time.resumed_at = lambda: link.resumed_at
         self._by_link[link] = session
-        for part in self._parts:
-            with guarded(part):
-                part.link_up(session)
+        call_each(self._parts, lambda part: part.link_up(session))
 
     def _begin(self, link: PeerLink) -> PeerSession:
         peer = next(self._numbers)
@@ -304,9 +309,7 @@ class PeerSessions:
             return
         session.away_since = asyncio.get_running_loop().time()
         session.state = PeerState.SILENT
-        for part in self._parts:
-            with guarded(part):
-                part.link_down(session)
+        call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
         if link.silent:
             session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
@@ -317,11 +320,9 @@ class PeerSessions:
     def _grace_over(self, session: PeerSession) -> None:
         """Asks the parts what they keep for a peer that is not back; ends the session if they keep nothing."""
         session.state, session.wait = PeerState.AWAY, 0.0
-        waits = False
-        for part in self._parts:
-            with guarded(part):
-                waits |= part.grace_over(session)
-        if waits:
+        waits: list[bool] = []
+        call_each(self._parts, lambda part: waits.append(part.grace_over(session)))
+        if any(waits):
             self._outlasted(session, asyncio.get_running_loop().time())
         else:
             self._end(session)
@@ -330,9 +331,7 @@ class PeerSessions:
         """Lets the parts drop what has expired for an absent peer; ends the session if nothing is left."""
         seconds = max(now - session.away_since, session.wait or 0.0)
         waits: list[float | None] = []
-        for part in self._parts:
-            with guarded(part):
-                waits.append(part.outlasted(session, seconds))
+        call_each(self._parts, lambda part: waits.append(part.outlasted(session, seconds)))
         session.wait = min((wait for wait in waits if wait is not None), default=None)
         if session.wait is None:
             self._end(session)
@@ -359,12 +358,8 @@ class PeerSessions:
         self._timer.arm()
         self._by_number.pop(session.peer, None)
         if self._by_link.pop(session.link, None) is not None:
-            for part in self._parts:
-                with guarded(part):
-                    part.link_down(session)
-        for part in self._parts:
-            with guarded(part):
-                part.gone(session)
+            call_each(self._parts, lambda part: part.link_down(session))
+        call_each(self._parts, lambda part: part.gone(session))
         self._namespaces.remove(session.peer)
         task = asyncio.create_task(session.proxies.close(), name=f"retract {session.proxies.prefix}")
         self._closing.add(task)
@@ -384,9 +379,7 @@ class PeerSessions:
         """Notify the parts that a link lost its bulk lane, perhaps in the middle of a message."""
         session = self._by_link.get(link)
         if session is not None:
-            for part in self._parts:
-                with guarded(part):
-                    part.lane_lost(session)
+            call_each(self._parts, lambda part: part.lane_lost(session))
 
     def clock(self, link: PeerLink) -> None:
         """Take a link's new estimate of its peer's clock."""

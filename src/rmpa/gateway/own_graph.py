@@ -243,7 +243,7 @@ class AgentGraph(Part):
     def attend(self, source: MeshSource, listener: ForeignSource) -> TopicTap:
         """Listen under the name that a foreign node has here, and drop what comes.
 
-        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.subscribers``.
+        Publishers of actions accept a server by the name of its connections; see ``bridge.topics.local``.
 
         Args:
             source: The topic.

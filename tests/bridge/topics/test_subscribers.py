@@ -23,10 +23,16 @@ from rmpa.bridge.messages import (
     decode,
 )
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate, Policy
-from rmpa.bridge.topics import subscribers as module
+from rmpa.bridge.topics import local as module
 from rmpa.bridge.topics.exports import ExportRoute, LocalSource
-from rmpa.bridge.topics.local import LocalSubscriptions
-from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers, audience, compares_names, is_watched
+from rmpa.bridge.topics.local import (
+    LocalSubscriptions,
+    Mismatches,
+    RemoteSubscribers,
+    audience,
+    compares_names,
+    is_watched,
+)
 from rmpa.config.peer_rules import PermissionRule, PolicySettings
 from rmpa.config.settings import TrustSettings
 from rmpa.core.contract import Contract

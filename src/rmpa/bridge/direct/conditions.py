@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Name, NameOrNone, is_crossing_name
+from rmpa.bridge.messages import Name, NameOrNone, convert, is_crossing_name
 from rmpa.core.contract import Contract, Transport, needs_agents
 from rmpa.core.errors import RemoteProtocolError
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
 
-StructT = TypeVar("StructT", bound=msgspec.Struct)
 # Characters of a peer's text that are kept.
 _TEXT_MAX: Final = 300
 
@@ -193,7 +192,7 @@ def read_ask(args: dict[str, Any]) -> DirectAsk:
     Raises:
         RemoteProtocolError: A name or a value is invalid.
     """
-    return _read(args, DirectAsk)
+    return convert("direct transport", args, DirectAsk)
 
 
 class _Reply(msgspec.Struct, frozen=True):
@@ -215,7 +214,7 @@ def read_reply(value: object, node: str) -> Grant | Unmet:
     Raises:
         RemoteProtocolError: It is neither a port nor a reason.
     """
-    reply = _read(value, _Reply)
+    reply = convert("direct transport", value, _Reply)
     if reply.port is not None:
         return Grant(reply.port, node, reply.probe if is_crossing_name(reply.probe) else "")
     if reply.why is None:
@@ -229,13 +228,6 @@ def reply_of(found: Grant | Unmet) -> dict[str, object]:
     if isinstance(found, Grant):
         return {"port": found.port, "probe": found.probe}
     return {"why": found.condition.value, "text": found.text}
-
-
-def _read(value: object, kind: type[StructT]) -> StructT:
-    try:
-        return msgspec.convert(value, kind)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise RemoteProtocolError(f"direct transport: {error}") from error
 
 
 # --- what was lost -------------------------------------------------------------------------------------------------

@@ -51,7 +51,7 @@ class ShownService:
 
     Args:
         remote: The service.
-        peer_name: The peer's name.
+        session: The peer.
         stats: Counts and latencies of its calls.
         proxy: The proxy of its node; ``None`` until that exists.
         endpoint: The endpoint that clients connect to; ``None`` until the proxy exists.
@@ -62,7 +62,7 @@ class ShownService:
     """
 
     remote: RemoteService
-    peer_name: str
+    session: PeerSession
     stats: CallStats = field(default_factory=CallStats)
     proxy: SlaveNode | None = None
     endpoint: ServiceEndpoint | None = None
@@ -74,7 +74,7 @@ class ShownService:
     @property
     def text(self) -> str:
         """The service and its peer, for texts."""
-        return f"service [{self.remote.name}] of {self.peer_name}"
+        return f"service [{self.remote.name}] of {self.session.link.name}"
 
 
 class Services(GraphPart):
@@ -255,7 +255,7 @@ class Services(GraphPart):
         name = self._shared.sessions.proxy_name(session, node, remote.origin)
         source, place = Source(f"service {service}", node), service_place(service, name)
         self._shared.relay.pass_on(session.peer, session.link.identity, source, place, remote.origin)
-        shown = self._shown[remote] = ShownService(remote, self.imports.peer_name(peer))
+        shown = self._shown[remote] = ShownService(remote, session)
         session.proxies.hold(node, f"service {service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(remote)
 
@@ -306,9 +306,7 @@ class Services(GraphPart):
         if (proxy := shown.proxy) is not None:
             self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
             proxy.remove_service(remote.name, text)
-        session = self._shared.sessions.get(remote.peer)
-        if session is not None:
-            session.proxies.release(remote.node, f"service {remote.name}")
+        shown.session.proxies.release(remote.node, f"service {remote.name}")
 
     def forget_about(self, remote: RemoteService) -> None:
         """What is known of a shown service may no longer be true."""
@@ -341,22 +339,21 @@ class Services(GraphPart):
 
     def _want(self, shown: ShownService) -> None:
         """Open a service, unless its peer has no link now: then the next ``link_up``, or ``gone``, ends the wait."""
-        remote, session = shown.remote, self._shared.sessions.get(shown.remote.peer)
+        remote, session = shown.remote, shown.session
         if not remote.shown:
             self._fail_waiting(shown, f"{shown.text} has just gone")
-        elif session is not None and session.state is PeerState.AWAY:
-            text = f"service [{remote.name}]: the agent of {shown.peer_name} has crashed, only direct calls work"
+        elif session.state is PeerState.AWAY:
+            text = f"service [{remote.name}]: the agent of {session.link.name} has crashed, only direct calls work"
             self._fail_waiting(shown, text)
-        elif session is not None and session.linked:
+        elif session.linked:
             self.imports.want(remote, self.now())
 
     def opened(self, remote: RemoteService) -> None:
         """A service can be called: requests go out on ``remote.requests``, replies come in on ``remote.route``."""
         shown = self._shown.get(remote)
-        session = self._shared.sessions.get(remote.peer)
-        if shown is None or session is None or not session.linked or remote.about is None:
+        if shown is None or not shown.session.linked or remote.about is None:
             return
-        budgets = self._budgets[remote.peer]
+        session, budgets = shown.session, self._budgets[remote.peer]
         caller = Caller(session.link, remote.requests, shown.text, budgets, shown.stats, remote.about)
         shown.caller = session.link.routes[remote.route] = caller
         asking, shown.asking = shown.asking, []
@@ -397,10 +394,9 @@ class Services(GraphPart):
         shown.stats.calls += 1
         shown.stats.fail(text)
         self.warn(_MISMATCH, f"{shown.remote.name}{caller_id}", text)
-        session = self._shared.sessions.get(shown.remote.peer)
-        if session is not None and session.linked:
+        if shown.session.linked:
             args: dict[str, Any] = {"service": shown.remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
-            self._shared.rpc.notify(session, _MISMATCH, args)
+            self._shared.rpc.notify(shown.session, _MISMATCH, args)
 
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])

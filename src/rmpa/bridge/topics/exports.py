@@ -198,16 +198,15 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
                 route.number = 0
                 self._do.suspend_route(source, peer, route.contract.outage)
             else:
-                self._remove(source, peer, flow)
+                self.end_route(source, peer)
             yield
 
     def link_down(self, peer: int) -> Iterator[None]:  # type: ignore[override] # ends routes too
         """End a peer's open and suspended routes, one with each item."""
         self.peers.pop(peer, None)
         self._routes.pop(peer, None)
-        for source, flow in list(self._flows.items()):
-            if peer in flow.routes:
-                self._remove(source, peer, flow)
+        for source in list(self._flows):
+            if self.end_route(source, peer) is not None:
                 yield
 
     def outage(self, peer: int) -> float:
@@ -217,9 +216,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def given_up(self, source: Source, peer: int) -> None:
         """End a suspended route, whose messages are not kept any more."""
-        flow = self._flows.get(source)
-        if flow is not None and (route := flow.routes.get(peer)) is not None and not route.number:
-            self._remove(source, peer, flow)
+        if (route := self.routes(source).get(peer)) is not None and not route.number:
+            self.end_route(source, peer)
 
     # --- routes --------------------------------------------------------------------------------------------------
 
@@ -267,16 +265,8 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
 
     def closed(self, peer: int, message: CloseRoute) -> None:
         """End a route that a peer closes; one that is not open is ignored, since both ends may close it at once."""
-        source = self._routes[peer].pop(message.route, None)
-        flow = self._flows.get(source) if source is not None else None
-        if source is not None and flow is not None:
-            self._remove(source, peer, flow)
-
-    def broken(self, source: Source, peer: int) -> None:
-        """End the route of a peer that has broken the protocol of it."""
-        flow = self._flows.get(source)
-        if flow is not None and peer in flow.routes:
-            self._remove(source, peer, flow)
+        if (source := self._routes[peer].pop(message.route, None)) is not None:
+            self.end_route(source, peer)
 
     def described(self, source: Source, description: Description) -> None:
         """Start the routes of a source whose publisher has answered with its header."""
@@ -315,13 +305,16 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             self._out.send(peer, opened)
             self._do.add_route(source, peer, route)
 
-    def _remove(self, source: Source, peer: int, flow: _Flow) -> None:
-        """End a route to one peer; a source without any is disconnected."""
-        route = flow.routes.pop(peer)
+    def end_route(self, source: Source, peer: int) -> ExportRoute | None:
+        """End the route to one peer, if there is one; a source without any is disconnected."""
+        flow = self._flows.get(source)
+        if flow is None or (route := flow.routes.pop(peer, None)) is None:
+            return None
         self._forget(source, peer, route)
         if not flow.routes:
             del self._flows[source]
             self._do.outbound.disconnect(source)
+        return route
 
     def _forget(self, source: Source, peer: int, route: ExportRoute) -> None:
         if route.number:
@@ -334,12 +327,9 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
             self._do.remove_route(source, peer, route.number)
 
     def _ended_for(self, peer: int, key: Source, why: str = "") -> None:
-        flow = self._flows.get(key)
-        if flow is not None and (route := flow.routes.get(peer)) is not None:
-            self._remove(key, peer, flow)
-            if route.number:
-                why = why or "it is not offered here any more, or by another name"
-                self._out.send(peer, RouteClosed(route.number, why))
+        if (route := self.end_route(key, peer)) is not None and route.number:
+            why = why or "it is not offered here any more, or by another name"
+            self._out.send(peer, RouteClosed(route.number, why))
 
     def _ended(self, key: Source, reason: str) -> None:
         flow, local = self._flows.get(key), self.offered.get(key)

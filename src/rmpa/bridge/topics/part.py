@@ -20,9 +20,8 @@ from rmpa.bridge.messages import CloseRoute, Mismatch, OpenRoute, RouteClosed, R
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports
 from rmpa.bridge.topics.imports import Imports
-from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions
+from rmpa.bridge.topics.local import LocalSources, LocalSubscriptions, Mismatches, RemoteSubscribers
 from rmpa.bridge.topics.peer_topics import LossReports, PeerTopic, PeerTopics, TopicEvents
-from rmpa.bridge.topics.subscribers import Mismatches, RemoteSubscribers
 from rmpa.core.contract import Priority
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_own
@@ -274,7 +273,7 @@ class Topics(GraphPart, TopicEvents):
         except RemoteProtocolError as error:
             # Caught here: the caller may be handling another peer's event. The next link gets a new numbering.
             self.refuse(session, error)
-            asyncio.get_running_loop().call_soon(self.exports.broken, source, peer)
+            asyncio.get_running_loop().call_soon(self.exports.end_route, source, peer)
 
     def suspend_route(self, source: Source, peer: int, outage: float) -> None:
         """Keep the unacknowledged and all further messages of a route for an absent peer, for a time in seconds."""
