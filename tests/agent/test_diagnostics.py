@@ -81,7 +81,7 @@ async def test_figures_of_a_topic_that_crosses(tmp_path: Path) -> None:
             lambda: all(
                 flow.quality.messages == 20
                 for at in b.bridge.sessions.linked()
-                for flow in b.bridge.topics.of(at).flows.values()
+                for flow in b.bridge.topics.peers[at.peer].flows.values()
             )
         )
         route = await shown("b", tmp_path, "/chatter")

@@ -264,7 +264,7 @@ async def plans_are_reconciled(world: World) -> None:
             assert agent.bridge._reconciler is not None
             agent.bridge._reconciler.cancel()
             agent.bridge._reconcile()
-        await world.until(lambda: world.near.bridge.topics.idle and world.far.bridge.topics.idle)
+        await world.until(lambda: not (world.near.bridge.topics._changed or world.far.bridge.topics._changed))
 
 
 async def other_rules_hold(world: World) -> None:

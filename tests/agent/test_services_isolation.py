@@ -57,7 +57,7 @@ async def plans_are_reconciled(world: World) -> None:
     for _ in range(4):
         for agent in (world.near, world.far):
             agent.services.reconcile()
-        await world.until(lambda: world.near.services.idle and world.far.services.idle)
+        await world.until(lambda: not (world.near.services._changed or world.far.services._changed))
 
 
 async def somebody_looks_at_everything(world: World) -> None:

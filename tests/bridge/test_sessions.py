@@ -466,7 +466,7 @@ async def test_names_are_looked_at_and_told_in_slices_and_a_failing_one_holds_up
     names = [f"/t{number}" for number in range(3 * limits.RESCANNED_AT_ONCE)]
     part.failing = {names[3]}
     part.look(names)
-    assert not part.idle
+    assert part._changed
     await until_settled(part)
     told = [offer.topic for message in part.sent for offer in message.added]
     assert told == [name for name in names if name != names[3]]

@@ -68,8 +68,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_INCARNATIONS: Final = 1 << 16
-
 
 class NetworkEndpoint:
     """Discovery and mesh under one identity, feeding the bridge.
@@ -91,7 +89,7 @@ class NetworkEndpoint:
         usable = choose(list_interfaces(), settings.interfaces)
         address = pick_address(usable)
         # Seconds modulo 18 hours, so that a restart gets a higher number; the random instance id decides in doubt.
-        incarnation = clock.wall_ns() // 1_000_000_000 % _INCARNATIONS
+        incarnation = clock.wall_ns() // 1_000_000_000 % (1 << 16)
         self.identity = Identity(
             Guid.of(address, self.port, incarnation),
             os.urandom(limits.INSTANCE_ID_BYTES),

@@ -350,8 +350,6 @@ class AgentTrust(Part):
 # Answers ``rmpa trust …`` on the control socket of a secured agent.
 
 
-# Seconds for which ``rmpa trust invite`` is kept waiting for the next step of a join; then it asks again.
-_STEP_WAIT: Final = 5.0
 Args = dict[str, object]
 
 
@@ -428,7 +426,7 @@ class TrustCommands:
         joins, token_id, after = self._trust.joins, _token_id(args), args.get("after")
         assert joins is not None  # noqa: S101 - the authority has one
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_STEP_WAIT):
+            async with asyncio.timeout(5.0):  # then ``rmpa trust invite`` asks again
                 while isinstance(after, int) and joins.step(token_id).step <= after:
                     await joins.changed.wait()
         return joins.step(token_id)

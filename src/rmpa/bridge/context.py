@@ -214,3 +214,7 @@ class BridgeContext:
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.naming)
         services = ServiceRules(settings.services)
         return cls(settings, policy, services, names, settings.make_contracts(), gate)
+
+    def limit(self, kind: str) -> int:
+        """The most ``topics`` or ``services`` of a module that cross."""
+        return self.settings.limits.topics if kind == "topics" else self.settings.limits.services

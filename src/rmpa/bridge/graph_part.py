@@ -88,11 +88,6 @@ class GraphPart(Part, Effects):
         """The rules that hold now."""
         return self._shared.context
 
-    @property
-    def idle(self) -> bool:
-        """Whether all changes of the local graph were looked at."""
-        return not self._changed
-
     async def close(self) -> None:
         """Stop all slices and the timer."""
         self._closed = True

@@ -362,7 +362,6 @@ _MD5: Final = re.compile(r"[0-9a-f]{32}")
 
 FormT = TypeVar("FormT")
 _OP: Final = b'{"op":"'
-_OP_MAX: Final = 32
 
 
 def is_crossing_name(name: str) -> bool:
@@ -412,7 +411,7 @@ def op_of(payload: bytes | bytearray | memoryview) -> str:
 
     The messages of ``encode`` begin with it. Others are parsed at once, which only takes time.
     """
-    head = bytes(payload[:_OP_MAX])
+    head = bytes(payload[:32])
     return head[len(_OP) :].partition(b'"')[0].decode("ascii", "replace") if head.startswith(_OP) else ""
 
 

@@ -66,9 +66,6 @@ _VISIBLE: Final = Needs(
     "what the node publishes, subscribes to and provides: the rest is left out, and nodes of which nothing is left",
 )
 _HELD: Final = "node"
-# Every module has this node.
-_EVERYWHERE: Final = "/rosout"
-_NO_LOGGERS: Final = LENGTH.pack(0)
 _REFUSED: Final = 0
 
 
@@ -148,7 +145,7 @@ class Nodes(Part):
             node
             for node in self._core.state().nodes
             if node not in crossing
-            and node != _EVERYWHERE
+            and node != "/rosout"  # every module has it
             and not is_own(node)
             and not node.startswith(MEASURING)
             and is_crossing_name(node)
@@ -309,7 +306,7 @@ def _service(proxy: SlaveNode) -> str:
 
 def _answer(call: ServiceCall) -> None:
     """No logger of a node of another module is set from here."""
-    call.reply(True, _NO_LOGGERS)
+    call.reply(True, LENGTH.pack(0))
 
 
 class ProxyKills:

@@ -175,8 +175,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
     @property
     def limit(self) -> int:
         """How many entries are offered."""
-        most = self._out.context.settings.limits
-        return most.topics if self.kind == "topics" else most.services
+        return self._out.context.limit(self.kind)
 
     # --- entries -------------------------------------------------------------------------------------------------
 

@@ -180,8 +180,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     @property
     def limit(self) -> int:
         """How many entries of one peer are taken."""
-        most = self._out.context.settings.limits
-        return most.topics if self.kind == "topics" else most.services
+        return self._out.context.limit(self.kind)
 
     def refused(self, peer: int) -> int:
         """How much a peer offers beyond the limit."""

@@ -144,7 +144,6 @@ def judge_globs(
 
 
 _WITHOUT_TRUST: Final = PermissionDecision(True, "trust is off")
-_RELAY: Final = "relay"
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +246,7 @@ class PermissionGate:
         Names of sites may be invented, so further modules and sites of one rule are only counted.
         """
         by_relay = bool(relay) and not self.may_relay(relay)
-        kind, whose = (_RELAY, relay) if by_relay else (str(access), module)
+        kind, whose = ("relay", relay) if by_relay else (str(access), module)
         self._counters.add(f"permission.{kind}")
         logged = self._logged[kind, decision.number]
         if whose in logged or len(logged) >= limits.REFUSALS_LOGGED:

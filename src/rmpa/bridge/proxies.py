@@ -6,7 +6,7 @@ import asyncio
 import logging
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 from rmpa.core.counters import remedy
@@ -89,8 +89,6 @@ class ProxyNamespaces:
 
 
 _log = logging.getLogger(__name__)
-# The listening sockets of one node: XML-RPC and TCPROS.
-_SOCKETS: Final = 2
 
 
 class ProxyNodes:
@@ -117,7 +115,7 @@ class ProxyNodes:
 
     def sockets(self, proxies: int) -> int:
         """The number of listening sockets for a number of proxies."""
-        return _SOCKETS if self._listener is not None else _SOCKETS * proxies
+        return 2 * (proxies if self._listener is None else 1)  # XML-RPC and TCPROS
 
     async def start(self) -> None:
         """Open the shared listener, if this host allows it."""

@@ -171,7 +171,7 @@ class TopicFacts:
 
     def incoming(self, session: PeerSession, source: Source, entry: RemoteTopic) -> RouteInfo:
         """The route of a peer's source; ``source`` has its wire name."""
-        topics, contracts = self._bridge.topics.of(session), self._bridge.context.contracts
+        topics, contracts = self._bridge.topics.peers[session.peer], self._bridge.context.contracts
         flow, publication = topics.flow(source), topics.publication(source)
         about, now = entry.description, self._clock.now()
         latched = about.latching if about is not None else False
@@ -236,7 +236,7 @@ class TopicFacts:
         relayed = [one for one in subscribers if one.state == "relayed"]
         reason = min(relayed, key=lambda one: one.condition == Condition.MEASURES, default=None)
         condition, text = (reason.condition, reason.text) if reason is not None else ("", "")
-        publication = self._bridge.topics.of(session).publication(source)
+        publication = self._bridge.topics.peers[session.peer].publication(source)
         carried = publication is not None and publication.subscribers > 0
         if (
             carried

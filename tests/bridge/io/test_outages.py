@@ -42,14 +42,14 @@ def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], *
 def lost_at_receiver(side: Side) -> int:
     """What the receiving module says is lost."""
     (attached,) = side.attached
-    watch = side.bridge.topics.of(attached).watch(SURE)
+    watch = side.bridge.topics.peers[attached.peer].watch(SURE)
     return watch.counts[QosEventKind.MESSAGES_LOST] if watch is not None else 0
 
 
 def unknown_at_receiver(side: Side) -> int:
     """How often it says that nobody knows how many."""
     (attached,) = side.attached
-    flow = side.bridge.topics.of(attached).flow(SURE)
+    flow = side.bridge.topics.peers[attached.peer].flow(SURE)
     return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
 
 

@@ -23,7 +23,7 @@ def there(world: World) -> ImportFlow:
     """The flow at the receiver."""
     side = world.sides[1]
     (attached,) = side.attached
-    flow = side.bridge.topics.of(attached).flow(BIG)
+    flow = side.bridge.topics.peers[attached.peer].flow(BIG)
     assert flow is not None
     return flow
 

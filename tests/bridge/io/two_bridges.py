@@ -84,7 +84,7 @@ class Side:
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
         for attached in self.attached:
-            for published in self.bridge.topics.of(attached).topics.values():
+            for published in self.bridge.topics.peers[attached.peer].topics.values():
                 if published.publication.topic == topic and self.core.publishers(topic).get(published.node.name):
                     yield published.publication
 
@@ -298,7 +298,7 @@ class World:
             assert not bridge.topics.outbound.senders
             assert not bridge.topics.outbound._parked
             for attached in side.attached:
-                topics = bridge.topics.of(attached)
+                topics = bridge.topics.peers[attached.peer]
                 assert not topics.flows
                 assert not any(topic.flow for topic in topics.topics.values())
                 assert not any(attached.link.routes), "but route 0, which every link has"

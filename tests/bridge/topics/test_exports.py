@@ -292,14 +292,14 @@ def test_a_route_resumes_with_another_transport(flowing: Exports) -> None:
 
 def test_a_reliable_route_outlives_its_link_and_resumes(flowing: Exports) -> None:
     assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
-    assert flowing.waits_for(1)
+    assert flowing.outage(1)
     assert flowing.flowing(CMD) == ()
     flowing.link_up(1)
     assert flowing.opened(1, OpenRoute(2, "/cmd", "/joy", RELIABLE, epoch=1, after=41)) == [
         Send(1, RouteOpened(2, ABOUT, RELIABLE, 1)),
         AddRoute(CMD, 1, 2, RELIABLE, 1, 41),
     ]
-    assert not flowing.waits_for(1)
+    assert not flowing.outage(1)
     assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
     flowing.link_up(1)
     flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
@@ -314,7 +314,7 @@ def test_who_knows_nothing_of_the_old_numbering_gets_a_new_one(flowing: Exports,
         Send(1, RouteOpened(7, ABOUT, RELIABLE, 2)),
         AddRoute(CMD, 1, 7, RELIABLE, 2),
     ]
-    assert not flowing.waits_for(1)
+    assert not flowing.outage(1)
 
 
 def test_what_is_not_reliable_or_does_not_flow_yet_ends_with_its_link(exports: Exports) -> None:
@@ -334,7 +334,7 @@ def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, ho
     ended = flowing.link_down(1) if how == "link_down" else flowing.given_up(CMD, 1)
     assert ended == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
     assert flowing.given_up(CMD, 1) == []
-    assert not flowing.waits_for(1)
+    assert not flowing.outage(1)
     assert flowing.link_down(1) == []
 
 

@@ -230,7 +230,6 @@ def shown_seconds(seconds: float) -> str:
     return f"{round(seconds, 2):.10g} s"
 
 
-_NS: Final = 1e-9
 # Marks in ``limits.QUALITY_RATE_SPAN``.
 _MARKS: Final = 16
 _Number = TypeVar("_Number", int, float)
@@ -390,7 +389,7 @@ class Quality:
         for number, (made, offset, error) in enumerate(clock.estimates, 1):
             end = len(times) if number == len(clock.estimates) else bisect_right(times, made)
             if begin < end:
-                found += [delay * _NS + offset for delay in delays[begin:end]]
+                found += [delay * 1e-9 + offset for delay in delays[begin:end]]
                 apart = max(abs(made - times[begin]), abs(made - times[end - 1]))
                 worst = max(worst, error + mesh_limits.CLOCK_DRIFT * apart)
                 begin = end

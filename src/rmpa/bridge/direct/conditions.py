@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.shared import Shared
 
-# Characters of a peer's text that are kept.
-_TEXT_MAX: Final = 300
-
 
 class Condition(StrEnum):
     """A condition of direct transport; its value is the word in ``--json`` and between agents.
@@ -220,7 +217,7 @@ def read_reply(value: object, node: str) -> Grant | Unmet:
     if reply.why is None:
         raise RemoteProtocolError("direct transport: an answer has neither a port nor a reason")
     condition = Condition(reply.why) if reply.why in set(Condition) else Condition.RELEASE
-    return Unmet(condition, "".join(one if one.isprintable() else "�" for one in reply.text[:_TEXT_MAX]))
+    return Unmet(condition, "".join(one if one.isprintable() else "�" for one in reply.text[:300]))
 
 
 def reply_of(found: Grant | Unmet) -> dict[str, object]:

@@ -54,7 +54,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _EVERY_ADDRESS: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104 - recognised, not bound
 _REMEDY: Final = "start it without ROS_IP and ROS_HOSTNAME, or with an address of the network"
-_GIVEN_UP: Final = Unmet(Condition.AGENT, "it was given up meanwhile")
 _Entry = tuple["PeerSession", DirectAsk, Grant | Unmet | None]
 _RELEASED: Final = Needs((), "what was granted to the peer itself")
 
@@ -130,7 +129,7 @@ class Grants:
             found = self._judge(session, asked) or found  # the graph may have changed meanwhile
             entry = self._asked.get(session.peer, {}).get(asked.want)
             if entry is None or entry[1] is not asked:
-                return reply_of(_GIVEN_UP)  # released, or asked again
+                return reply_of(Unmet(Condition.AGENT, "it was given up meanwhile"))  # released, or asked again
         self._set(session, asked, found)
         if isinstance(found, Grant):
             self._shared.counters.add("direct.granted")

@@ -152,8 +152,6 @@ class ParamCore:
 _log = logging.getLogger(__name__)
 
 _EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
-_LISTED: Final = Needs((Access.PARAM,), "each parameter; others are left out")
-_FOLLOWED: Final = Needs((Access.PARAM,), "each parameter, and again at each change")
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,10 +221,11 @@ class ParamOwner:
         self._followers: dict[int, _Follower] = {}
         rpc = shared.rpc
         rpc.on_request(transfer.GET, self._get, _EACH)
-        rpc.on_request(transfer.NAMES, self._names, _LISTED)
+        rpc.on_request(transfer.NAMES, self._names, Needs((Access.PARAM,), "each parameter; others are left out"))
         rpc.on_request(transfer.SET, self._set, _EACH)
         rpc.on_request(transfer.DELETE, self._delete, _EACH)
-        rpc.on_request(transfer.FOLLOW, self._follow, _FOLLOWED)
+        again = Needs((Access.PARAM,), "each parameter, and again at each change")
+        rpc.on_request(transfer.FOLLOW, self._follow, again)
 
     @property
     def _settings(self) -> Settings:

@@ -38,16 +38,12 @@ if TYPE_CHECKING:
     from rmpa.runtime.tls import Buffer
 
 _LENGTH: Final = 4
-# Bytes in front of a reply that state whether the call succeeded.
-_HEAD_MAX: Final = 1
 # Bytes of a large body that are copied at once, in some 50 microseconds; then other tasks run.
 _PORTION: Final = 256 * KIB
 # Bytes waiting on the bulk lane above which no further portion is copied to it.
 _AHEAD: Final = 4 * MIB
 # Bytes of a body, head included, up to which it is sent in one frame.
 _WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
-# Seconds between two checks of how much waits on the bulk lane.
-_PAUSE: Final = 0.005
 
 
 class Budget:
@@ -146,7 +142,7 @@ class BodySender:
             yield_to_data()
             await asyncio.sleep(0)
             while lane.outbox.pending_bytes > _AHEAD and not (lane.ended or parcel.dropped):  # noqa: ASYNC110
-                await asyncio.sleep(_PAUSE)
+                await asyncio.sleep(0.005)
             lane.extend(parcel, view[start : start + _PORTION])
         self._left()
         self._task = None
@@ -164,13 +160,13 @@ class BodyReceiver(DataHandler):
 
     Args:
         budget: Bounds the bytes of the peer's bodies while they are reassembled.
-        most: Bytes that a body may have.
+        most: Bytes that a body may have; a reply's first byte states whether the call succeeded.
 
     Attributes:
         _stamp_ns: When the present body was sent, by the peer's clock.
     """
 
-    def __init__(self, budget: Budget, most: int = ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX) -> None:
+    def __init__(self, budget: Budget, most: int = ros_limits.SERVICE_MESSAGE_MAX + 1) -> None:
         self._budget = budget
         self._most = most
         self._sequence: int | None = None

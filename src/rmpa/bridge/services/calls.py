@@ -37,9 +37,6 @@ if TYPE_CHECKING:
 
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
-# How many of the latest replies by the bulk lane are reported as lost if its connection is lost. Replies leave within
-# a link's lease, so only the latest can be lost.
-_RECENT: Final = 64
 
 
 def _text(body: Buffer) -> str:
@@ -228,7 +225,8 @@ class Server(BodyReceiver):
         self._outgoing = budgets.outgoing
         self._stats = stats
         self._loop = asyncio.get_running_loop()
-        self._recent: deque[int] = deque(maxlen=_RECENT)
+        # The latest replies by the bulk lane. They leave within a link's lease, so only these can be lost with it.
+        self._recent: deque[int] = deque(maxlen=64)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Pass a request to the server, unless its caller has given it up: it must not act then."""
@@ -294,8 +292,6 @@ class Server(BodyReceiver):
 
 
 _MD5_LENGTH: Final = 32
-# The checks of the servers' ports take at most one in this many seconds of processor time.
-_LOOK_SHARE: Final = 50
 
 
 class Serving:
@@ -415,7 +411,7 @@ class Serving:
                 for service, server in yielding_to_data(servers):
                     if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
                         self._core.suspect(server.node)
-            await sleep_to_tick(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
+            await sleep_to_tick(max(limits.SERVER_LOOK, 50 * cost))  # at most 2 % of the processor's time
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:

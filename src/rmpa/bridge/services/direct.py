@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import Condition, Grant, Unmet, Want, unmet_by_contract, unmet_by_rules
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     ServicePath = Path[RemoteService]
 
 _log = logging.getLogger(__name__)
-# The names of the nodes of ``rmpa service`` begin so: their calls are relayed, so that the agents measure them.
-_OWN_TOOLS: Final = "/rmpa_service"
 
 
 class ServicePaths(Paths["RemoteService"]):
@@ -76,7 +74,8 @@ class ServicePaths(Paths["RemoteService"]):
             return ""
         nearby = path.session.same_machine  # clients that are bound to loopback reach it too
         local_only = not nearby and is_loopback(host_of(api))
-        if not api or local_only or is_own(caller) or caller.startswith(_OWN_TOOLS):
+        # Calls of the nodes of ``rmpa service`` are relayed, so that the agents measure them.
+        if not api or local_only or is_own(caller) or caller.startswith("/rmpa_service"):
             self._shared.counters.add("direct.lookup_relayed")
             return ""
         self.lookups[service] += 1

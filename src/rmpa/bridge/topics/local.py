@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender
@@ -297,15 +297,9 @@ class LocalSubscriptions:
             self._core.suspect(source.node)
 
 
-_GOAL: Final = "ActionGoal"
-_CANCEL: Final = "actionlib_msgs/GoalID"
-_STATUS: Final = "actionlib_msgs/GoalStatusArray"
-_ANSWERS: Final = ("ActionResult", "ActionFeedback")
-
-
 def is_watched(type_name: str) -> bool:
     """Whether publishers of this type check their listeners' names; judged by type, as topics can be remapped."""
-    return type_name.endswith(_GOAL) or type_name == _CANCEL
+    return type_name.endswith("ActionGoal") or type_name == "actionlib_msgs/GoalID"
 
 
 def compares_names(type_name: str) -> bool:
@@ -314,7 +308,8 @@ def compares_names(type_name: str) -> bool:
     rospy's client wants one name as listener of goals and cancellations, and as publisher of status, result and
     feedback; roscpp's leaves the last two out. So all have to come by the agents, which give a remote node one name.
     """
-    return is_watched(type_name) or type_name == _STATUS or type_name.endswith(_ANSWERS)
+    answers = type_name.endswith(("ActionResult", "ActionFeedback"))
+    return is_watched(type_name) or type_name == "actionlib_msgs/GoalStatusArray" or answers
 
 
 def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:

@@ -80,10 +80,6 @@ class Topics(GraphPart, TopicEvents):
         self._nodes: dict[str, tuple[str, ...]] = {}
         self._ticker: asyncio.TimerHandle | None = None
 
-    def of(self, session: PeerSession) -> PeerTopics:
-        """The topics of a peer in the local graph."""
-        return self.peers[session.peer]
-
     def mismatches(self, source: Source) -> tuple[str, ...]:
         """Texts about subscribers, here or at peers, whose definition does not fit a source's."""
         return self._mismatches.texts(source)

@@ -263,7 +263,7 @@ class WhyService:
             entry = topics.imports.get(number, source)
             if number != session.peer or entry is None or _instance(session, entry.origin) != peer.instance:
                 continue
-            node, publication = source.node, topics.of(session).publication(source)
+            node, publication = source.node, topics.peers[session.peer].publication(source)
             name = session.proxies.name(node)
             links = publication.connections() if publication is not None else ()
             yield (
