@@ -26,7 +26,7 @@ NAMES: Final = ("/viewer", "/logger", "/planner")
 _TICK: Final = 0.1
 _GRACE: Final = 3.0
 """Seconds for which a session outlives its link here."""
-_SETTLED: Final = 2 * limits.DIRECT_RETRY + limits.DIRECT_BREAKS_SPAN
+_SETTLED: Final = 2 * limits.DIRECT_RETRY + limits.DIRECT_BREAKS_SPAN + 2 * limits.DIRECT_ADOPT
 """Seconds after which every retry has been made."""
 
 

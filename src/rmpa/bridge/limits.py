@@ -172,6 +172,9 @@ DIRECT_CHECK: Final = 1.0
 DIRECT_SETTLE: Final = 2.0
 # Direct connections that one peer may have to publishers of this module, and as many to its services.
 DIRECT_MAX: Final = 1024
+# Seconds after the start of an agent within which each subscriber that asks for a topic is looked at: it may have a
+# direct connection from an earlier run of the agent.
+DIRECT_ADOPT: Final = 10.0
 # Seconds that services which are called directly stay in the graph after their agent has crashed, as topics do
 # (``core.limits.RESUME_WINDOW``).
 DIRECT_KEEP: Final = 30.0

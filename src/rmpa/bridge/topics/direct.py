@@ -161,6 +161,8 @@ class TopicPaths(Paths["RemoteTopic"]):
 
     Attributes:
         interruptions: When subscribers were without their path.
+        _left: The names of modules to which direct connections were left when their agents crashed.
+        _started: Subscribers may have direct connections from before this moment, of an earlier run of this agent.
     """
 
     kind = "topic"
@@ -180,6 +182,8 @@ class TopicPaths(Paths["RemoteTopic"]):
         self.interruptions: Interruptions = {}
         self._checking: asyncio.TimerHandle | None = None
         self._kernel_tells = kernel_tells()
+        self._left: set[str] = set()
+        self._started = self._now()
 
     # --- the local graph --------------------------------------------------------------------------------------------
 
@@ -271,7 +275,11 @@ class TopicPaths(Paths["RemoteTopic"]):
     def request(self, peer: int, source: Source, subscriber: str) -> Awaitable[RosReply | None] | None:
         """Answer a subscriber's ``requestTopic`` at the proxy of a source; see ``PublicationEvents``."""
         want = Want(source.topic, source.node, subscriber)
-        path = self.get(peer, want)
+        path, session = self.get(peer, want), self._shared.sessions.get(peer)
+        recent = self._now() < self._started + limits.DIRECT_ADOPT
+        entry = self._imports.get(peer, source)
+        if path is None and session is not None and entry and (recent or session.link.name in self._left):
+            path = Path(session, want, entry, Contract())
         return self._answer(path) if path is not None else None
 
     async def _answer(self, path: TopicPath) -> RosReply | None:
@@ -327,6 +335,8 @@ class TopicPaths(Paths["RemoteTopic"]):
     def gone(self, session: PeerSession) -> None:
         """As of ``Paths``; what is direct goes on if only the peer's agent has died."""
         direct = [path for path in self._of_peer(session) if path.endpoint is not None]
+        if direct and session.link.crashed:
+            self._left.add(session.link.name)
         super().gone(session)
         for path in direct if not session.link.crashed else ():
             self._hang_up(path)
