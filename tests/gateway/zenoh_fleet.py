@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.gateway.zenoh.access import open_trusted_session
@@ -16,15 +14,8 @@ from tests.trust.io.member_files import SecuredMesh
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.config.peer_rules import PermissionRule
     from rmpa.gateway.zenoh.session import OpenSession
-
-
-def allow(*modules: str, **names: str) -> PermissionRule:
-    return PermissionRule(modules, names={key: tuple(globs.split()) for key, globs in names.items()})
-
-
-def deny(*modules: str, **names: str) -> PermissionRule:
-    return replace(allow(*modules, **names), effect=Effect.DENY)
 
 
 class Fleet:

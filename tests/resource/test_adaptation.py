@@ -382,15 +382,6 @@ def _any_requirement(chance: random.Random, now: float) -> Requirement:
     )
 
 
-def test_reaction_begins_with_the_first_violated_window() -> None:
-    one = running(20.0, FAST, MIDDLE)
-    assert one.profile == "middle"
-    one.window({"rate": 20.0}, 2.0)
-    one.window({"rate": 9.0}, 3.0)  # it fell at 2.3, say
-    assert applies(one.window({"rate": 9.0}, 4.0)) == ["fast"]
-    assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
-
-
 def test_declared_soft_shortfall_is_no_disturbance() -> None:
     only = Profile("only", {"rate": 10.0, "latency": 0.1}, cost=1)
     one = running(20, only, hard=False)

@@ -220,15 +220,6 @@ async def test_invalid_requirement_is_answered_and_changes_nothing(sonar: Sonar,
     await status(responses, lambda s: s.name == "/client" and s.level == OK)
 
 
-async def test_invalid_first_requirement_is_answered(sonar: Sonar, node: Node) -> None:
-    responses = await node.subscribe("/sonar/responses", ARRAY)
-    await ask(node, noise=">= 5 cm")
-    told = await status(responses, lambda s: s.name == "/client")
-    assert told.level == ERROR
-    assert "less is better" in told.message
-    assert not sonar.adapter.loop.requirements
-
-
 async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
     async with Node("mortal", master_uri=core.uri) as node:
         responses = await node.subscribe("/sonar/responses", ARRAY)
@@ -236,20 +227,6 @@ async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
         await status(responses, lambda s: s.name == "/mortal" and s.level == OK)
         assert sonar.adapter.loop.requirements.keys() == {"/mortal"}
     await until(lambda: not sonar.adapter.loop.requirements and sonar.current == "coarse")
-
-
-async def test_failed_profile_is_replaced(sonar: Sonar, node: Node) -> None:
-    responses = await node.subscribe("/sonar/responses", ARRAY)
-    sonar.broken["fine"] = OSError("no such mode")
-    publisher = await ask(node, noise="<= 5 cm")
-    await until(lambda: excluded(sonar.member) == "OSError: no such mode")
-    assert sonar.adapter.loop.profile == "coarse"
-    # It goes on publishing under the profile that it has.
-    words = await listen(node, "/sonar/words")
-    await until(lambda: words)
-    assert words[0].data == "coarse"
-    say(publisher)
-    await status(responses, lambda s: True)
 
 
 async def test_resource_client_requests_and_answers(sonar: Sonar, node: Node) -> None:
@@ -454,17 +431,3 @@ async def test_observed_quality_of_inputs_is_reported(core: RosCore, camera: Res
     assert float(seen.observed("/viewer", "frames.age") or 0) > 0
     assert seen.observed("/viewer", "latency") is None  # it did not ask for that
     await viewer.close()
-
-
-async def test_adaptation_follows_the_clients_observation(node: Node, camera: ResourceNode) -> None:
-    assert camera.adapter.loop.profile in ("", "small")
-    async with ResourceClient(node, "camera") as client:
-        await client.require(rate=at_least("20 Hz", hard=True))
-        async with asyncio.timeout(30):
-            while camera.adapter.loop.profile != "full":  # 50 Hz leave, and 5 arrive
-                await client.observe(rate="5 Hz")
-                await asyncio.sleep(0.05)
-        assert camera.adapter.loop.alarm is not None
-        await until(lambda: camera.adapter.loop.alarm is None)  # it says nothing more, so what leaves counts
-        await client.observe(rat=5)
-        await until(lambda: client.answer is not None and "did you mean rate" in client.answer.message)

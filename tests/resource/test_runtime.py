@@ -19,7 +19,7 @@ from rmpa.ros.wire.tcpros import TopicDescription
 from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
     from rmpa.resource.declare import Input, Output
@@ -90,55 +90,45 @@ async def test_a_resource_is_an_ordinary_node_of_its_core(core: RosCore, speaker
         speaker.outputs["words"].publish(data="too late")
 
 
-async def test_publish_refuses_a_message_of_another_type(core: RosCore, speaker: Resource) -> None:
-    runtime = Runtime(speaker, Node("speaker", master_uri=core.uri))
-    await runtime.start()
-    words = speaker.outputs["words"]
-    try:
-        with pytest.raises(MessageError, match="date"):
-            words.publish(date="x")
-        with pytest.raises(MessageError, match="words: data is a string, not <object"):
-            words.publish(object())
-        with pytest.raises(MessageError, match="words: std_msgs/String: a message and fields"):
-            words.publish(words.type.make({"data": "x"}), data="y")
-    finally:
-        await runtime.close()
-
-
-async def test_messages_are_held_while_a_profile_is_applied(core: RosCore, speaker: Resource) -> None:
-    runtime = Runtime(speaker, Node("speaker", master_uri=core.uri))
-    ear = Ear()
+@pytest.fixture
+async def running(core: RosCore, speaker: Resource) -> AsyncIterator[tuple[Runtime, Ear]]:
+    runtime, ear = Runtime(speaker, Node("speaker", master_uri=core.uri)), Ear()
     await runtime.start([ear])
+    yield runtime, ear
+    await runtime.close()
+
+
+@pytest.mark.usefixtures("running")
+async def test_publish_refuses_a_message_of_another_type(speaker: Resource) -> None:
     words = speaker.outputs["words"]
-    try:
-        runtime.hold()
-        words.publish(data="1")
-        assert ear.heard == []
-        runtime.release()
-        assert ear.heard == [("published", "words")]
-        runtime.hold()
-        words.publish(data="of a profile that failed")
-        runtime.release(drop=True)
-        assert len(ear.heard) == 1
-    finally:
-        await runtime.close()
+    with pytest.raises(MessageError, match="date"):
+        words.publish(date="x")
+    with pytest.raises(MessageError, match="words: data is a string, not <object"):
+        words.publish(object())
+    with pytest.raises(MessageError, match="words: std_msgs/String: a message and fields"):
+        words.publish(words.type.make({"data": "x"}), data="y")
 
 
-async def test_held_messages_are_bounded_drop_oldest(
-    core: RosCore, speaker: Resource, monkeypatch: pytest.MonkeyPatch
+async def test_messages_are_held_while_a_profile_is_applied(
+    running: tuple[Runtime, Ear], speaker: Resource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rmpa.resource.limits.RESOURCE_HELD_MAX", 40)
-    runtime = Runtime(speaker, Node("speaker", master_uri=core.uri))
-    ear = Ear()
-    await runtime.start([ear])
-    try:
-        runtime.hold()
-        for _ in range(10):
-            speaker.outputs["words"].publish(data="0123456789")  # 14 bytes
-        runtime.release()
-        assert ear.heard == [("published", "words")] * 2
-    finally:
-        await runtime.close()
+    runtime, ear = running
+    words = speaker.outputs["words"]
+    runtime.hold()
+    words.publish(data="1")
+    assert ear.heard == []
+    runtime.release()
+    assert ear.heard == [("published", "words")]
+    runtime.hold()
+    words.publish(data="of a profile that failed")
+    runtime.release(drop=True)
+    assert len(ear.heard) == 1
+    runtime.hold()
+    for _ in range(10):
+        words.publish(data="0123456789")  # 14 bytes: the oldest are dropped
+    runtime.release()
+    assert ear.heard == [("published", "words")] * 3
 
 
 async def test_messages_are_numbered_so_that_losses_are_seen(core: RosCore) -> None:

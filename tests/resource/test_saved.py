@@ -8,14 +8,11 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.client import ResourceClient
 from rmpa.resource.node import ResourceNode
-from rmpa.resource.quality import MEASURED, at_least, at_most
+from rmpa.resource.quality import MEASURED
 from rmpa.resource.resource import Resource
-from rmpa.resource.runtime import RuntimePart
 from rmpa.resource.saved import Clients, SavedCoolDown, SavedRequirement, SavedState
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.node.node import Node
 from tests.resource.rig import until
 
 if TYPE_CHECKING:
@@ -235,74 +232,6 @@ def cooling(member: ResourceNode) -> list[CoolDown]:
     return list(member.adapter.loop.cooling(asyncio.get_running_loop().time()).values())
 
 
-async def test_configuration_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
-    path = tmp_path / "sonar.json"
-    first = await started(core, path)
-    await first.configuration.set({"gain": 2.5, "profile": "fine", "context": "docked"})
-    await first.close()
-    other = RosCore(port=0)  # the module's whole agent was restarted: its parameter server knows nothing
-    await other.start()
-    again = await started(other, path)
-    assert again.resource.parameters["gain"].value == 2.5
-    assert (again.adapter.loop.pinned, again.contexts.current) == ("fine", "docked")
-    await until(lambda: again.adapter.loop.profile == "fine")
-    await again.configuration.set({"profile": "", "gain": 1.0, "context": ""})
-    await again.close()
-    third = await started(other, path)
-    assert third.resource.parameters["gain"].value == 1.0
-    assert (third.adapter.loop.pinned, third.contexts.current) == ("", "")
-    await third.close()
-    given = resource()
-    given.parameters["gain"].value = 7.0  # as rmpa run --set does
-    given.parameters["gain"].given = True
-    await other.close()
-    fourth = await started(core, path, given)
-    assert given.parameters["gain"].value == 7.0
-    await fourth.close()
-
-
-async def test_requirements_survive_a_restart(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "sonar.json"
-    first = await started(core, path)
-    async with Node("stays", master_uri=core.uri) as stays, ResourceClient(stays, "sonar") as one:
-        async with Node("leaves", master_uri=core.uri) as leaves, ResourceClient(leaves, "sonar") as two:
-            await one.require(noise=at_most("5 cm"), expires="60 s")
-            await two.require(rate=at_least("1 Hz"), priority=3)
-            before = first.adapter.loop.requirements["/stays"].expires
-            await first.close()
-        monkeypatch.setattr(limits, "RESOURCE_CLIENT_GRACE", 3.0)
-        again = await started(core, path)
-        began, loop = asyncio.get_running_loop().time(), again.adapter.loop
-        assert loop.requirements.keys() == {"/stays", "/leaves"}
-        assert loop.requirements["/leaves"].priority == 3
-        await until(lambda: "/leaves" not in loop.requirements)
-        assert 2.5 < asyncio.get_running_loop().time() - began < 20
-        # The latched request came again meanwhile, and did not begin anew with its 60 s.
-        assert before is not None
-        assert loop.requirements["/stays"].expires == pytest.approx(before, abs=0.05)
-        await again.close()
-
-
-async def test_expired_latched_request_stays_expired(core: RosCore, tmp_path: Path) -> None:
-    member = await started(core, tmp_path / "sonar.json")
-    async with Node("client", master_uri=core.uri) as node, ResourceClient(node, "sonar") as client:
-        await client.require(noise=at_most("5 cm"), expires="300 ms")
-        assert "/client" in member.adapter.loop.requirements
-        await until(lambda: not member.adapter.loop.requirements)
-        seen: list[object] = []
-        watcher = RuntimePart()
-        watcher.changed = lambda: seen.append(dict(member.adapter.loop.requirements))  # type: ignore[method-assign]
-        member.runtime.parts.append(watcher)
-        assert client._requirements is not None
-        again: Any = {"header": {"stamp": float(next(iter(member.adapter.clients.expiries))[1])}}
-        pairs: Any = [{"key": "noise", "value": "<= 5 cm"}, {"key": "expires", "value": "300 ms"}]
-        message = client._requirements.make({**again, "status": [{"name": "x", "values": pairs}]})
-        client._requirements.publish(message)
-        await asyncio.sleep(0.5)
-        assert not any(seen)
-    await member.close()
-
-
 async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
     def broken() -> Resource:
         one = Resource("sonar", role="sensing")
@@ -333,19 +262,6 @@ async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> No
     await until(lambda: len(tried) == 2)
     await until(lambda: again.adapter.loop.profile == "coarse")
     await again.close()
-
-
-async def test_resource_runs_without_a_usable_store(core: RosCore, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    member = await started(core, tmp_path / "file" / "sonar.json")
-    async with Node("watcher", master_uri=core.uri) as node:
-        quality = await node.subscribe("/sonar/quality", "diagnostic_msgs/DiagnosticArray")
-        async with asyncio.timeout(30):
-            async for received in quality:
-                if "nothing is kept" in received.message.status[0].message:
-                    assert received.message.status[0].level == 1
-                    break
-    await member.close()
 
 
 async def test_a_damaged_file_is_set_aside(core: RosCore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

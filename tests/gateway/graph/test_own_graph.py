@@ -9,7 +9,6 @@ import pytest
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.rules import SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.conftest import settings
 from tests.agent.test_agent import Sink, node, until
 from tests.agent.test_services import connect, provider, serving
 from tests.gateway.graph.gateways import (
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
-
-__all__ = ["settings"]
 
 
 async def test_a_module_s_topic_is_a_source_with_its_module_node_and_type(settings: Callable[..., Settings]) -> None:
@@ -196,24 +193,6 @@ async def test_a_foreign_service_is_called_by_a_node_of_a_module(settings: Calla
         assert not seen.of("/add")
         shown.close()
         await until(lambda: provider(a) == "" == provider(g))
-
-
-async def test_a_service_waits_while_another_node_has_its_name(settings: Callable[..., Settings]) -> None:
-    async def serve(request: bytes) -> bytes:
-        return request
-
-    async def describe() -> ServiceDescription:
-        return ServiceDescription("a/Add", STRING_MD5)
-
-    async with joined([settings("a")], [settings("g")]) as mesh:
-        (graph,) = mesh.graphs
-        (a, g) = mesh.agents
-        async with serving(a):
-            await until(lambda: provider(g) == "/rmpa/a/adder")
-            shown = graph.show_service(foreign_service(), serve, describe)
-            await until(lambda: "/rmpa/a/adder" in shown.problem)
-        await until(lambda: provider(g) == "/rmpa/warehouse/arm/adder")
-        assert shown.problem == ""
 
 
 async def test_of_two_sources_of_one_name_and_node_the_second_waits(settings: Callable[..., Settings]) -> None:

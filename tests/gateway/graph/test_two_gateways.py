@@ -8,7 +8,6 @@ from rmpa.bridge.policy import OUTSIDE_GUID, is_outside
 from rmpa.gateway.foreign import foreign_origin
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.ros.wire.tcpros import ServiceDescription
-from tests.agent.conftest import settings
 from tests.agent.test_agent import Sink, node, until
 from tests.agent.test_services import connect, provider, serving
 from tests.gateway.graph.gateways import (
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
 
-__all__ = ["settings"]
 PROXY = "/rmpa/warehouse/arm/talker"
 
 

@@ -110,16 +110,6 @@ def test_all_pairs_but_one_are_converted_by_bytes_and_their_cdr_stays_as_it_was(
     assert digest.hexdigest() == "139ed1c62b725159194ce34fafa03579d34c2045e19894ffa738a9f199ee9558"
 
 
-def test_a_message_of_ros1_has_the_cdr_that_ros2_reads() -> None:
-    conversion = convert("sensor_msgs/Range")
-    kind = conversion.ros1
-    header = {"seq": 7, "stamp": {"secs": 5, "nsecs": 6}, "frame_id": "sonar"}
-    cdr = conversion.to_ros2(kind.serialize(kind.make({"header": header, "range": 1.5, "max_range": 4.0})))
-    read: Any = JAZZY.store.deserialize_cdr(cdr, "sensor_msgs/msg/Range")
-    assert (read.header.stamp.sec, read.header.stamp.nanosec, read.header.frame_id) == (5, 6, "sonar")
-    assert (read.range, read.max_range, read.variance) == (1.5, 4.0, 0.0)
-
-
 def test_a_field_that_only_ros2_has_is_dropped_on_the_way_to_ros1() -> None:
     conversion = convert("sensor_msgs/Range")
     types = JAZZY.store.types

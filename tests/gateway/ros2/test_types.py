@@ -20,12 +20,6 @@ def test_the_hash_of_a_message_is_the_published_one(jazzy: Ros2Types) -> None:
     assert jazzy.type_hash("std_msgs/msg/String") == published
 
 
-def test_the_hash_of_a_service_is_the_published_one(jazzy: Ros2Types) -> None:
-    service = ServiceType("example_interfaces/AddTwoInts", "int64 a\nint64 b\n---\nint64 sum\n")
-    published = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
-    assert jazzy.service_hash(service) == published
-
-
 def test_humble_has_no_hash() -> None:
     humble = Ros2Types("humble")
     assert humble.type_hash("std_msgs/msg/String") == NO_HASH

@@ -42,15 +42,6 @@ def with_everything() -> Followed:
     return catalogue
 
 
-def test_a_source_is_there_with_its_module() -> None:
-    catalogue = Followed()
-    catalogue.token(SCAN.token(), 0.0, alive=True)
-    assert told(catalogue) == []
-    catalogue.token(ARM.token(), 0.0, alive=True)
-    assert told(catalogue) == [(FOUND, ARM), (FOUND, SCAN)]
-    assert catalogue.sources(ARM) == [SCAN]
-
-
 def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sources() -> None:
     catalogue = with_everything()
     catalogue.token(ARM.token(), 10.0, alive=False)
@@ -109,15 +100,6 @@ def test_a_short_break_of_the_link_takes_nothing_down() -> None:
     catalogue.handle_timer(100.0)
     assert GONE not in {change for change, _ in told(catalogue)}
     assert catalogue.sources(ARM) == [SCAN]
-
-
-def test_a_source_whose_token_stays_is_shown_again_with_its_module() -> None:
-    catalogue = with_everything()
-    catalogue.token(ARM.token(), 10.0, alive=False)
-    catalogue.handle_timer(11.0)
-    told(catalogue)
-    catalogue.token(ARM.token(), 12.0, alive=True)
-    assert told(catalogue) == [(FOUND, ARM), (FOUND, SCAN)]
 
 
 def test_tokens_of_this_site_are_not_another_sites() -> None:

@@ -174,13 +174,6 @@ def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> 
     assert list(imports.refusals()) == []
 
 
-def test_two_publishers_of_one_type_share_a_name() -> None:
-    imports = Imports()
-    imports.found(announced("/scan"))
-    imports.found(announced("/scan", "base"))
-    assert len(imports.entries) == 2
-
-
 def test_a_source_of_this_site_goes_before_those_of_others() -> None:
     imports = Imports()
     imports.found(announced("/scan"))

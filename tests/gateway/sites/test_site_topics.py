@@ -7,7 +7,6 @@ import asyncio
 import pytest
 
 from rmpa.config.rules import Crossing, CrossingRule
-from rmpa.core.contract import ContractRule
 from rmpa.gateway.sites.keys import token_keys
 from rmpa.gateway.zenoh.threads import QueuedPublisher
 from tests.gateway.sites.site_bed import MD5, described, site_bed
@@ -31,24 +30,6 @@ async def test_nothing_is_read_at_one_site_until_a_node_subscribes_at_the_other(
         assert topic.messages == [b"one", b"two"]
         topic.on_demand(False)
         await until(lambda: not yard.graph.taps)
-
-
-async def test_a_late_subscriber_gets_the_latched_message_once() -> None:
-    async with site_bed() as bed:
-        yard, hall = await bed.pair()
-        source = yard.graph.add("/map", described(latching=True))
-        yard.graph.send(source, b"old")
-        yard.graph.send(source, b"map")
-        topic = await hall.subscribed("/map")
-        assert topic.description == described(latching=True)
-        await until(lambda: topic.messages)
-        cellar = await bed.site("cellar")
-        late = await cellar.subscribed("/map")
-        await until(lambda: late.messages)
-        yard.graph.send(source, b"new map")
-        await until(lambda: b"new map" in topic.messages and b"new map" in late.messages)
-        assert topic.messages == [b"map", b"new map"]
-        assert late.messages == [b"map", b"new map"]
 
 
 async def test_a_subscriber_that_comes_back_gets_the_present_latched_message_alone() -> None:
@@ -79,35 +60,6 @@ async def test_two_latched_publishers_of_one_topic_each_keep_their_last_message(
         assert [topic.messages for topic in topics] == [[b"/one"], [b"/two"]]
 
 
-async def test_a_burst_of_a_thousand_messages_arrives_or_is_counted() -> None:
-    async with site_bed() as bed:
-        yard, hall = await bed.pair()
-        source = yard.graph.add("/burst", described())
-        topic = await hall.subscribed("/burst")
-        await until(lambda: yard.graph.send(source, b"first"))
-        await until(lambda: topic.messages)
-        for number in range(1000):
-            yard.graph.send(source, number.to_bytes(4, "big") * 25)
-        imported = hall.imported("/burst")
-        await until(lambda: len(topic.messages) + imported.lost >= 1001, 30)
-        assert imported.messages == len(topic.messages) == 1001
-        assert imported.lost == 0
-
-
-async def test_what_the_queue_drops_is_counted_at_both_ends() -> None:
-    async with site_bed() as bed:
-        rule = ContractRule(("/burst",), (), {"depth": 1})
-        yard, hall = await bed.site("yard", contracts=(rule,)), await bed.site("hall")
-        source = yard.graph.add("/burst", described())
-        topic = await hall.subscribed("/burst")
-        await until(lambda: yard.graph.send(source, b"first"))
-        for _ in range(2000):
-            yard.graph.send(source, b"x" * 2000)
-        out, into = yard.exported("/burst"), hall.imported("/burst")
-        await until(lambda: len(topic.messages) + into.lost == 2001 and out.dropped == into.lost, 30)
-        assert out.dropped > 0
-
-
 async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypatch: pytest.MonkeyPatch) -> None:
     async with site_bed() as bed:
         yard, hall = await bed.pair()
@@ -120,21 +72,6 @@ async def test_a_loss_at_the_end_is_counted_although_no_message_follows(monkeypa
             yard.graph.send(source, b"swallowed by the network")
         await until(lambda: hall.imported("/burst").lost == 3)
         assert hall.imported("/burst").messages == 1
-
-
-async def test_a_rule_limits_the_rate_at_the_near_end_and_counts() -> None:
-    async with site_bed() as bed:
-        yard = await bed.site("yard", rules=(CrossingRule(names=("/fast",), rate=10.0),))
-        hall = await bed.site("hall")
-        source = yard.graph.add("/fast", described())
-        topic = await hall.subscribed("/fast")
-        await until(lambda: yard.graph.send(source, b"0"))
-        for _ in range(500):
-            yard.graph.send(source, b"x")
-        limited = yard.exported("/fast").limited
-        assert limited > 450
-        await until(lambda: len(topic.messages) == 501 - limited)
-        assert hall.imported("/fast").lost == 0
 
 
 async def test_the_last_message_of_a_latched_topic_is_sent_when_its_limit_lets_it() -> None:
@@ -213,19 +150,6 @@ async def test_a_publisher_with_another_definition_is_described_anew() -> None:
         yard.graph.send(source, b"new form")
         await until(lambda: topic.messages == [b"new form"])
         assert topic.description == other
-
-
-async def test_a_module_that_goes_takes_its_topics_with_it() -> None:
-    async with site_bed() as bed:
-        yard, hall = await bed.pair()
-        source = yard.graph.add("/scan", described())
-        await hall.subscribed("/scan")
-        yard.graph.remove(source)
-        await until(lambda: not hall.shows("/scan"))
-        again = yard.graph.add("/scan", described(), run="f")
-        topic = await hall.subscribed("/scan")
-        yard.graph.send(again, b"back")
-        await until(lambda: topic.messages == [b"back"])
 
 
 async def test_another_gateway_takes_over_and_the_other_site_keeps_its_topics() -> None:

@@ -91,28 +91,6 @@ def failed(way: Diagnosis) -> Check:
     return way.failed
 
 
-async def test_the_way_of_a_topic_is_told_from_both_gateways() -> None:
-    async with site_bed() as bed:
-        yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
-        source = yard.site.graph.add("/chatter", TEXT)
-        await until(lambda: hall.site.shows("/chatter"))
-        (way,) = await hall.why("/chatter")
-        assert (way.flows, way.node, way.peer, way.to) == (False, "/talker", "yard/arm", "site hall")
-        assert (levels(way)["demand there"], levels(way)["demand here"]) == ("warn", "fail")
-        (leaving,) = await yard.why("/chatter", asker="arm")
-        assert levels(leaving)["demand there"] == "fail"
-        await hall.site.subscribed("/chatter")
-        await until(lambda: yard.site.exported("/chatter").wanted)
-        yard.site.graph.send(source, b"hello")
-        await until(lambda: hall.site.topic("/chatter").messages)
-        (way,) = await hall.why("/chatter", "yard", "arm")
-        assert set(levels(way).values()) == {"ok"}
-        assert [stage.name for stage in way.stages][-2:] == ["demand here", "arrived"]
-        (leaving,) = await yard.why("/chatter", asker="arm")
-        assert (leaving.peer, leaving.to, leaving.flows) == ("arm", "other sites", True)
-        assert "the gateway of yard has sent 1 messages" in leaving.stages[-1].text
-
-
 async def test_rules_of_both_sites_are_named() -> None:
     out = CrossingRule(names=("/home/**",), crossing=Crossing.NONE)
     into = CrossingRule(names=("/noise",), crossing=Crossing.OUT)

@@ -46,20 +46,6 @@ async def far_end(net: ZenohBed) -> AsyncIterator[int]:
         await process.wait()
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-async def test_a_site_that_dies_or_freezes_is_seen_soon(how: signal.Signals) -> None:
-    async with bed() as net, far_end(net) as pid:
-        watcher = await net.session()
-        seen: list[tuple[bool, float]] = []
-        watcher.watch_tokens("up/*", lambda _, alive: seen.append((alive, time.monotonic())))
-        await until(lambda: seen == [(True, seen[0][1])] if seen else False)
-        at = time.monotonic()
-        os.kill(pid, how)
-        await until(lambda: not seen[-1][0])
-        # 0.2 s and 1.5 s are wanted; a busy machine may take longer, but Zenoh's own lease is 10 s.
-        assert seen[-1][1] - at < (2.0 if how is signal.SIGKILL else limits.LEASE + 3.0)
-
-
 @pytest.mark.timeout(240)
 async def test_a_frozen_subscriber_holds_the_others_up_for_a_lease_at_most_and_nothing_is_lost_uncounted() -> None:
     async with bed() as net, far_end(net) as pid:

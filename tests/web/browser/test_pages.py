@@ -91,44 +91,6 @@ async def test_a_small_screen_shows_the_tables_of_the_first_page_whole(site: Sit
     assert await page.run(f"{cut}.map((each) => each.ariaLabel)") == []
 
 
-async def test_a_killed_module_shows_within_a_second_and_a_half_and_so_does_its_return(site: Site) -> None:
-    page = await site.open()
-    base = "document.querySelector('[data-module=base]')"
-    before = await page.run(f"JSON.stringify({base}.getBoundingClientRect())")
-    took = []
-    for _ in range(3):  # the best of three: other tests may have the processor
-        slowest = 0.0
-        for scene, up in (("killed", "false"), ("demo", "true")):
-            site.server.agent.scene = scene
-            changed = time.monotonic()
-            await page.wait(f"{base}.classList.contains('up') === {up}")
-            slowest = max(slowest, time.monotonic() - changed)
-        took.append(slowest)
-    assert min(took) < 1.5
-    assert await page.run(f"JSON.stringify({base}.getBoundingClientRect())") == before
-
-
-async def test_without_an_agent_the_page_says_so_and_comes_back_by_itself(site: Site) -> None:
-    page = await site.open()
-    site.server.agent.scene = "mute"
-    await page.wait_text("The agent has not answered")
-    await page.wait_text("Start one with `rmpa up`.")
-    assert "Nothing is wrong" not in await page.run("document.body.innerText")
-    assert await page.run("document.querySelectorAll('[data-module]').length") == 4
-    site.server.agent.scene = "demo"
-    await page.wait("!document.querySelector('.banner')")
-
-
-async def test_a_lost_connection_is_told_and_comes_back_by_itself(site: Site) -> None:
-    page = await site.open()
-    await page.run("window.before = window.rmpa.frames.patches; window.lost = false;"
-                   "new MutationObserver(() => { if (document.querySelector('.banner')) window.lost = true; })"
-                   ".observe(document.body, {childList: true, subtree: true}); true")  # fmt: skip
-    await site.server.drop()
-    await page.wait("window.lost && !document.querySelector('.banner') && window.rmpa.frames.patches > window.before")
-    assert await page.run("document.querySelectorAll('[data-module]').length") == 4
-
-
 async def test_the_keyboard_reaches_everything(site: Site) -> None:
     page = await site.open()
     await page.press("/")
@@ -440,14 +402,6 @@ async def test_a_service_is_called(site: Site) -> None:
         "peer": "base",
         "request": {"data": False},
     }
-
-
-async def test_a_parameter_is_changed(site: Site) -> None:
-    page = await site.open("params")
-    await click(page, '"noetic"')
-    await edit(page, "melodic")
-    await page.wait_text('"melodic"')
-    assert site.server.params["/rosdistro"] == "melodic"
 
 
 RATE = "[...document.querySelectorAll('button.field')].find((each) => each.ariaLabel.startsWith('Change rate'))"

@@ -211,10 +211,6 @@ def test_a_frame_without_a_mask_is_found_wherever_it_begins(step: int) -> None:
         assert all(passed) is (unmasked == b"")
 
 
-def test_a_binary_frame_differs_by_its_opcode() -> None:
-    assert frame_header(Opcode.BINARY, 1) == b"\x82\x01"
-
-
 def _all(queue: FairQueue[str]) -> list[str]:
     found = []
     while (entry := queue.pop()) is not None:

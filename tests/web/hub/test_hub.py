@@ -46,24 +46,6 @@ async def test_all_clients_share_one_subscription_and_one_payload(core: RosCore)
         assert abs(message.stamp_ns - time.time_ns()) < DEADLINE * 1e9
 
 
-async def test_the_last_client_ends_the_subscription_after_a_while(core: RosCore, monkeypatch: Any) -> None:
-    monkeypatch.setattr("rmpa.web.limits.SUBSCRIPTION_LINGER", 0.01)
-    async with running_hub(core) as hub, node(core, "talker") as talker:
-        publisher = await talker.advertise("/t", STRING)
-        client = FakeClient(hub)
-        one, two = FakeClient(hub).hear("/t"), client.hear("/t")
-        await publisher.wait_for_subscriber()
-        one.close()
-        publisher.publish_raw(ONE)
-        await until(lambda: two.payloads)
-        assert one.payloads == []
-        client.close()
-        await until(lambda: publisher.subscribers == 0)
-        one.close()  # it has ended: nothing follows
-        FakeClient(hub).hear("/t")
-        await publisher.wait_for_subscriber()
-
-
 async def test_beyond_a_bound_only_topics_with_a_publisher_are_subscribed_to(
     core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,7 @@ import pytest
 from rmpa.core.errors import PeerRefused
 from rmpa.web import limits
 from rmpa.web.gateways.frame_writer import Opcode
-from rmpa.web.rosbridge.protocol import PublishFrames, decode_png
+from rmpa.web.rosbridge.protocol import decode_png
 from tests.web.recorder import NOW_NS
 from tests.web.rosbridge.client import Client
 
@@ -84,20 +84,6 @@ def test_unsubscribe_without_an_id_ends_all() -> None:
     assert asked.closed
 
 
-def test_throttled_messages_wait_in_the_queue_and_then_come() -> None:
-    client = Client()
-    handle = client.subscribe(type=STRING, throttle_rate=1000, queue_length=2)
-    for number in range(5):
-        client.publish(handle, STRING, {"data": str(number)})
-    assert [each["msg"]["data"] for each in client.received()] == ["0"]
-    client.advance(0.9)
-    assert not client.received()
-    client.advance(0.1)
-    assert [each["msg"]["data"] for each in client.received()] == ["3"]
-    client.advance(10)
-    assert [each["msg"]["data"] for each in client.received()] == ["4"]
-
-
 def test_the_longest_queue_is_used_and_freed_with_the_last_subscription() -> None:
     client = Client()
     handle = client.subscribe(id="a", type=STRING, throttle_rate=1000, queue_length=1)
@@ -125,17 +111,6 @@ def test_long_messages_come_in_fragments_of_the_smallest_size() -> None:
     first, second = ("".join(each["data"] for each in got if each["id"] == mid) for mid in (0, 1))
     assert json.loads(first)["msg"]["data"] == "x" * 100
     assert json.loads(second)["msg"]["data"] == "y" * 100
-
-
-def test_clients_of_one_topic_share_the_encoded_message() -> None:
-    frames = PublishFrames()
-    clients = [Client(frames) for _ in range(2)]
-    payload = memoryview(HELLO)
-    for client in clients:
-        handle = client.subscribe()
-        handle.message(payload)
-    (first,), (second,) = (client.frames() for client in clients)
-    assert first is second
 
 
 def test_a_broken_message_is_reported_once() -> None:

@@ -20,7 +20,6 @@ from rmpa.gateway.ros2.format import (
     data_key,
     parse_token,
 )
-from rmpa.gateway.ros2.goals import parse_outcome
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import SERVICE_TYPE, Ros2Types, TypePair
 from rmpa.gateway.zenoh.threads import ZenohQos
@@ -90,34 +89,6 @@ async def bed() -> AsyncIterator[Bed]:
     assert not bed.graph.taps
 
 
-async def test_a_client_of_ros2_has_a_goal_done_by_a_server_of_ros1(bed: Bed) -> None:
-    server = bed.ros1_server()
-    await eventually(lambda: len(bed.endpoints("/rmpa/arm/counter")) == 5)
-    seen: list[bytes] = []
-    bed.ros2.subscribe(key("feedback"), lambda sample: seen.append(sample.payload))
-    goal, cancel = (bed.graph.topics[f"/count/{part}", "/action_clients"] for part in ("goal", "cancel"))
-    sending = asyncio.ensure_future(
-        bed.ros2.get(key("send_goal"), b"\0\1\0\0" + UUID + b"\7\0\0\0", ATTACHMENT, timeout=20)
-    )
-    for topic in (goal, cancel):
-        topic.on_demand(True)  # the server has connected
-    await eventually(lambda: goal.messages)
-    sent = ACTION["goal"].deserialize(goal.messages[0])
-    assert sent.goal.goal == 7
-    state = {"goal_id": {"id": sent.goal_id.id}, "status": 1}
-    bed.graph.send(server["status"], made("status", status_list=[state]))
-    (reply,) = await sending
-    assert (reply.ok, reply.payload[4]) == (True, 1)
-    assert Ros2Attachment.parse(reply.attachment).sequence == 3
-    waiting = asyncio.ensure_future(bed.ros2.get(key("get_result"), b"\0\1\0\0" + UUID, ATTACHMENT, timeout=20))
-    bed.graph.send(server["feedback"], made("feedback", status=state, feedback={"feedback": 2}))
-    await eventually(lambda: seen)
-    assert seen == [b"\0\1\0\0" + UUID + b"\2\0\0\0"]
-    bed.graph.send(server["result"], made("result", status={**state, "status": 3}, result={"result": 7}))
-    (reply,) = await waiting
-    assert (reply.payload[4], reply.payload[8:]) == (4, b"\7\0\0\0")
-
-
 async def test_a_server_of_ros1_that_goes_aborts_the_goal_of_ros2(bed: Bed) -> None:
     server = bed.ros1_server()
     await eventually(lambda: len(bed.endpoints("/rmpa/arm/counter")) == 5)
@@ -141,58 +112,6 @@ async def test_a_server_of_ros1_that_goes_aborts_the_goal_of_ros2(bed: Bed) -> N
     (reply,) = await waiting
     assert (reply.ok, reply.payload[4]) == (True, 6)
     assert not bed.endpoints("/rmpa/arm/counter")
-
-
-class Ros2Server:
-    """An action server of ROS 2, as rmw_zenoh shows it."""
-
-    def __init__(self, bed: Bed) -> None:
-        self.asked: dict[str, list[MemoryQuery]] = {part: [] for part in ("send_goal", "get_result", "cancel_goal")}
-        self.session = bed.network.session()
-        node = Ros2Node(0, self.session.zid, 0, "/fib_server")
-        for number, (part, queries) in enumerate(self.asked.items(), 1):
-            self.session.queryable(key(part), queries.append)  # type: ignore[arg-type]
-            name = f"/count/_action/{part}"
-            endpoint = Ros2Endpoint(node, number, EntityKind.SERVICE, name, *TYPES[part], Ros2Qos())
-            self.session.token(endpoint.token())
-
-    def answer(self, part: str, payload: bytes) -> None:
-        query = self.asked[part][-1]
-        query.reply(query.key, payload, query.attachment)
-        query.finish()
-
-
-async def test_a_client_of_ros1_has_a_goal_done_by_a_server_of_ros2(bed: Bed) -> None:
-    server = Ros2Server(bed)
-    await eventually(lambda: len(bed.graph.topics) == 3)
-    status, feedback, result = (
-        bed.graph.topics[f"/count/{p}", "/fib_server"] for p in ("status", "feedback", "result")
-    )
-    assert result.description is not None
-    assert result.description.md5sum == ACTION["result"].md5sum
-    status.on_demand(True)
-    await eventually(lambda: len(status.messages) > 1)
-    client = bed.graph.publisher("/count/goal", ACTION["goal"], "/client")
-    cancel = bed.graph.publisher("/count/cancel", ACTION["cancel"], "/client")
-    assert {tap.listener for tap in bed.graph.taps} == {"/rmpa/ros2/fib_server"}, "clients compare these names"
-    bed.graph.send(client, made("goal", goal_id={"id": "g1"}, goal={"goal": 5}))
-    await eventually(lambda: server.asked["send_goal"])
-    request = server.asked["send_goal"][0]
-    assert request.payload[20:] == b"\5\0\0\0"
-    assert Ros2Attachment.parse(request.attachment).sequence > 0
-    server.answer("send_goal", b"\0\1\0\0\1" + bytes(11))
-    await eventually(lambda: server.asked["get_result"])
-    publisher = server.session.publisher(key("feedback"), ZenohQos(), lambda _: None)
-    publisher.put(b"\0\1\0\0" + request.payload[4:20] + b"\3\0\0\0")
-    await eventually(lambda: feedback.messages)
-    assert ACTION["feedback"].deserialize(feedback.messages[0]).feedback.feedback == 3
-    bed.graph.send(cancel, made("cancel", id="g1"))
-    await eventually(lambda: server.asked["cancel_goal"])
-    server.answer("cancel_goal", b"\0\1\0\0" + bytes(8))
-    server.answer("get_result", b"\0\1\0\0\5\0\0\0\4\0\0\0")
-    await eventually(lambda: result.messages)
-    state, body = parse_outcome(result.messages[0])
-    assert (state.goal.id, state.status, body) == ("g1", 2, b"\4\0\0\0")
 
 
 DOCK = [
@@ -271,19 +190,6 @@ async def test_an_action_of_a_type_that_ros1_lacks_is_learnt_from_its_server(bed
     got = own.deserialize(result.messages[0])
     assert (got.status.status, got.result.where) == (3, "home")
     session.close()
-    await eventually(lambda: not bed.graph.topics)
-
-
-async def test_a_server_of_ros2_that_dies_aborts_the_goal_and_leaves(bed: Bed) -> None:
-    server = Ros2Server(bed)
-    await eventually(lambda: len(bed.graph.topics) == 3)
-    result = bed.graph.topics["/count/result", "/fib_server"]
-    client = bed.graph.publisher("/count/goal", ACTION["goal"], "/client")
-    bed.graph.send(client, made("goal", goal_id={"id": "g1"}, goal={"goal": 5}))
-    await eventually(lambda: server.asked["send_goal"])
-    server.session.close()
-    await eventually(lambda: result.messages)
-    assert parse_outcome(result.messages[0])[0].status == 4
     await eventually(lambda: not bed.graph.topics)
 
 

@@ -64,24 +64,6 @@ async def test_a_topic_of_a_module_is_a_publisher_of_ros2() -> None:
         assert bed.own(EntityKind.PUBLISHER) == []
 
 
-async def test_a_late_node_of_ros2_gets_the_latched_message() -> None:
-    async with topic_bed() as bed:
-        source = bed.graph.publisher("/map", STRING, latching=True)
-        early: list[ZenohSample] = []
-        ends = bed.subscribe("/map", early)
-        await eventually(lambda: bed.own(EntityKind.PUBLISHER)[0].qos.latched)
-        bed.graph.send(source, string("old"))
-        bed.graph.send(source, string("new"))
-        await eventually(lambda: len(early) == 2)
-        for each in ends:
-            each.close()
-        late: list[ZenohSample] = []
-        bed.subscribe("/map", late, qos=LATCHED)
-        await eventually(lambda: late)
-        assert [bed.read(each.payload).data for each in late] == ["new"]
-        assert bed.graph.taps, "the last message is followed, for later ones"
-
-
 async def test_a_latched_topic_is_transient_local_before_its_first_subscriber(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -235,16 +217,6 @@ async def test_a_header_is_numbered_as_its_publisher_numbers_its_messages() -> N
         assert [(each.header.seq, each.point.x) for each in got] == [(2, 1.0), (4, 2.0)]
 
 
-async def test_each_node_has_its_own_messages() -> None:
-    async with topic_bed() as bed:
-        left, right = bed.publisher("/tf", node="/left"), bed.publisher("/tf", node="/right")
-        topics = [await bed.subscribed(each) for each in (left, right)]
-        left.say("l")
-        right.say("r")
-        await eventually(lambda: all(topic.messages for topic in topics))
-        assert [topic.messages for topic in topics] == [[string("l")], [string("r")]]
-
-
 async def test_a_program_that_chooses_its_own_gid_is_heard() -> None:
     async with topic_bed() as bed:
         talker = bed.publisher("/chatter")
@@ -341,21 +313,6 @@ async def test_the_fields_of_a_type_that_only_ros2_has_are_asked_of_its_node() -
         assert (list(got.speed), got.names, got.count) == ([1.0, 2.0, 3.0, 4.0], ["a"], -7)
 
 
-async def test_a_false_description_is_not_believed() -> None:
-    name = "base_msgs/msg/Wheels"
-    theirs = Ros2Types("jazzy")
-    theirs.learn(MessageType.learn("base_msgs/Wheels", "float64[4] speed").specifications)
-    async with topic_bed() as bed:
-        server = bed.endpoint(
-            EntityKind.SERVICE, "/base/get_type_description", SERVICE_TYPE, "/base", type_hash="RIHS01_" + "1" * 64
-        )
-        bed.ros2.queryable(server.key(), lambda query: describe(theirs, name, query))  # type: ignore[arg-type]
-        bed.ros2.token(server.token())
-        bed.publisher("/wheels", node="/base", type_name=name, type_hash="RIHS01_" + "2" * 64)
-        await eventually(lambda: bed.problems)
-        assert "has the type hash" in next(iter(bed.problems.values()))
-
-
 async def test_a_type_that_no_one_describes_is_told_with_what_to_do() -> None:
     async with topic_bed() as bed:
         bed.publisher("/wheels", node="/base", type_name="base_msgs/msg/Wheels", type_hash="RIHS01_" + "2" * 64)
@@ -424,29 +381,6 @@ async def test_a_rate_limit_is_kept_and_counted() -> None:
         ((export, _),) = bed.neighbour.topics.exports()
         assert export.messages + export.limited == 50
         assert export.limited >= 40
-
-
-async def test_hostile_tokens_are_ignored_and_counted() -> None:
-    async with topic_bed() as bed:
-        zid = bed.ros2.zid
-        type_name, type_hash = "std_msgs::msg::dds_::String_", "RIHS01_" + "0" * 64
-        head = f"@ros2_lv/0/{zid}/0/1/MP/%/%"
-        hostile = (
-            f"{head}/bot",
-            f"{head}/b ot/%a/{type_name}/{type_hash}/::,10:,:,:,,",
-            f"{head}/bot/%{'x' * 300}/{type_name}/{type_hash}/::,10:,:,:,,",
-            f"{head}/bot/%a%%b/{type_name}/{type_hash}/::,10:,:,:,,",
-            f"{head}/bot/%a/std_msgs::msg::dds_::Str;ing_/{type_hash}/::,10:,:,:,,",
-            f"@ros2_lv/0/{zid}/0/1/MP/%/%rmpa%arm/talker/%a/{type_name}/{type_hash}/::,10:,:,:,,",
-        )
-        for key in hostile:
-            bed.ros2.token(key)
-        bed.publisher("/good")
-        await eventually(lambda: bed.topic("/good"))
-        assert list(bed.graph.topics) == [("/good", "/bot")]
-        ignored = bed.neighbour.context.ros2.ignored
-        assert sum(ignored.values()) == len(hostile)
-        assert ignored["other gateway"] == 1
 
 
 async def test_of_two_gateways_of_one_mesh_one_shows_a_node_and_the_other_takes_over() -> None:
