@@ -2,10 +2,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from contextlib import asynccontextmanager
 from datetime import datetime
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import pytest
 
@@ -28,6 +27,7 @@ from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import leaves
 from rmpa.trust.permissions import Permissions
 from tests.bridge.services.test_calls import Wire
+from tests.ros.node.peers import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -160,6 +160,8 @@ class FakeCore:
 class Side:
     """One module."""
 
+    made: ClassVar[list[Side]] = []
+
     def __init__(
         self,
         name: str,
@@ -182,6 +184,7 @@ class Side:
         )
         self.params = Params(cast("Shared", self.shared))
         self.core.told = self.params.param_update
+        self.made.append(self)
 
     def reload(self, settings: Settings) -> None:
         self.shared.context = BridgeContext.of(settings, self.shared.context.gate)
@@ -234,12 +237,6 @@ def join(one: Side, other: Side, number: int = 1) -> None:
     other.up(number)
 
 
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(20):
-        while not condition():
-            await asyncio.sleep(0.001)
-
-
 def follows(*rules: FollowRule) -> ParamSettings:
     return ParamSettings(follow=rules)
 
@@ -250,19 +247,14 @@ DESCRIPTION = FollowRule("/robot_description", "base", "/base/robot_description"
 ARM = FollowRule("/arm", "base", "/arm")
 
 
-@pytest.fixture
-async def sides(monkeypatch: pytest.MonkeyPatch) -> Any:
+@pytest.fixture(autouse=True)
+async def sides(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
     monkeypatch.setattr(limits, "ASK_EXPRESS_MAX", 1000)
     monkeypatch.setattr(limits, "PARAM_SMALL", 4000)
     monkeypatch.setattr(limits, "PARAM_GATHER", 0.002)
-    made: list[Side] = []
-
-    def make(*sides: Side) -> None:
-        made.extend(sides)
-
-    yield make
-    for side in made:
-        await side.close()
+    yield
+    while Side.made:
+        await Side.made.pop().close()
 
 
 DATE = datetime(2020, 1, 2, 3, 4, 5)  # noqa: DTZ001 - XML-RPC's have no zone
@@ -289,12 +281,9 @@ async def test_a_text_that_does_not_parse(text: str) -> None:
         await read_text(text)
 
 
-async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(
-    sides: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "PARAMS_SET_MAX", 100)
     base, pad = Side("base", ParamSettings(remote_get=("/**",), remote_set=("/**",))), Side("pad")
-    sides(base, pad)
     join(base, pad)
     for count in (101, 100):
         text = await write_text("", {"deep": {f"p{number}": number for number in range(count)}})
@@ -306,10 +295,9 @@ async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(
             assert await pad.ask(transfer.SET, {"key": "/many", "text": text}) == {"count": 100}
 
 
-async def test_get_set_list_delete(sides: Any) -> None:
+async def test_get_set_list_delete() -> None:
     base = Side("base", ParamSettings(remote_get=("/open/**", "/big"), remote_set=("/open/**",)))
     pad = Side("pad")
-    sides(base, pad)
     join(base, pad)
     base.core.set("/open", {"a": 1, "b": "x" * 5000})
     base.core.set("/closed", 1)
@@ -350,15 +338,14 @@ def large_set(text: str) -> dict[str, Any]:
     return {"key": "/x", "text": f"<?xml version='1.0'?>{' ' * 20_000}" + text.partition("?>")[2]}
 
 
-async def owner_and_peer(sides: Any) -> tuple[Side, Side, dict[str, Any]]:
+async def owner_and_peer() -> tuple[Side, Side, dict[str, Any]]:
     base, pad = Side("base", ParamSettings(remote_get=("/**",), remote_set=("/**",))), Side("pad")
-    sides(base, pad)
     join(base, pad)
     return base, pad, large_set(await write_text("", "y"))
 
 
-async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set(sides: Any) -> None:
-    base, pad, args = await owner_and_peer(sides)
+async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set() -> None:
+    base, pad, args = await owner_and_peer()
     base.links[1].time.set(60.0, 0.001)  # by the peer's clock it is a minute later
     with pytest.raises(PeerRefused, match=r"came \d\d.\d s after the asking agent had given it up"):
         await pad.ask(transfer.SET, args)
@@ -368,8 +355,8 @@ async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set(si
     assert await pad.ask(transfer.SET, args) == {"count": 1}
 
 
-async def test_large_messages_are_bounded(sides: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    base, pad, args = await owner_and_peer(sides)
+async def test_large_messages_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, pad, args = await owner_and_peer()
     base.asks._links[1]._budget.limit = pad.asks._links[1]._outgoing.limit = 30_000
     entered, leave = asyncio.Event(), asyncio.Event()
 
@@ -395,9 +382,8 @@ async def test_large_messages_are_bounded(sides: Any, monkeypatch: pytest.Monkey
     assert base.asks._links[1]._budget.used == pad.asks._links[1]._outgoing.used == 0
 
 
-async def test_a_large_value_does_not_replace_one_that_was_told_after_it(sides: Any) -> None:
+async def test_a_large_value_does_not_replace_one_that_was_told_after_it() -> None:
     base, pad = Side("base", ParamSettings(remote_get=("/**",))), Side("pad", follows(DESCRIPTION))
-    sides(base, pad)
     base.core.set("/robot_description", "x" * 20_000)
     pad.link(base, 1)
     base.link(pad, 1)
@@ -415,8 +401,8 @@ async def test_a_large_value_does_not_replace_one_that_was_told_after_it(sides: 
     assert pad.core.get("/base/robot_description") == "small"
 
 
-async def test_a_lost_lane_fails_what_waits(sides: Any) -> None:
-    base, pad, args = await owner_and_peer(sides)
+async def test_a_lost_lane_fails_what_waits() -> None:
+    base, pad, args = await owner_and_peer()
     cast("Any", pad.links[1].link).bulk.slow = True
     asked = asyncio.create_task(pad.ask(transfer.SET, args))
     await until(lambda: pad.asks._links[1].waiting)
@@ -426,9 +412,8 @@ async def test_a_lost_lane_fails_what_waits(sides: Any) -> None:
     assert base.core.get("/x") is None
 
 
-async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
+async def test_a_followed_parameter_is_as_over_there() -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
-    sides(base, pad)
     base.core.set("/robot_description", "one")
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
@@ -452,9 +437,8 @@ async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
 
 
 @pytest.mark.parametrize("size", [10, 9000])
-async def test_what_is_set_here_is_put_back(sides: Any, size: int, caplog: pytest.LogCaptureFixture) -> None:
+async def test_what_is_set_here_is_put_back(size: int, caplog: pytest.LogCaptureFixture) -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
-    sides(base, pad)
     base.core.set("/robot_description", "x" * size)
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "x" * size)
@@ -473,16 +457,14 @@ async def test_what_is_set_here_is_put_back(sides: Any, size: int, caplog: pytes
     assert pad.core.get("/base/robot_description") == "x" * size
 
 
-async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any) -> None:
+async def test_an_owner_that_comes_back_without_it_takes_nothing_away() -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
-    sides(base, pad)
     base.core.set("/robot_description", "one")
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "one")
     base.down(1)
     pad.down(1)
     again = Side("base")
-    sides(again)
     join(again, pad, 2)
     await until(
         lambda: [one.told for one in again.params.owner._followers.values()] == [{"/robot_description": hash(None)}]
@@ -495,9 +477,8 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     await until(lambda: pad.core.get("/base/robot_description") == "two")
 
 
-async def test_two_of_one_name_are_not_mixed(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+async def test_two_of_one_name_are_not_mixed(caplog: pytest.LogCaptureFixture) -> None:
     first, second, pad = Side("base"), Side("base"), Side("pad", follows(DESCRIPTION))
-    sides(first, second, pad)
     first.core.set("/robot_description", "first")
     second.core.set("/robot_description", "second")
     join(first, pad, 1)
@@ -509,10 +490,9 @@ async def test_two_of_one_name_are_not_mixed(sides: Any, caplog: pytest.LogCaptu
     await until(lambda: pad.core.get("/base/robot_description") == "second")
 
 
-async def test_refusals_are_said_and_asked_again(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+async def test_refusals_are_said_and_asked_again(caplog: pytest.LogCaptureFixture) -> None:
     base = Side("base", ParamSettings(remote_get=("/arm/**",)), TimeSettings())
     pad = Side("pad", follows(DESCRIPTION, ARM), TimeSettings(follow="base"))
-    sides(base, pad)
     base.core.set("/use_sim_time", True)
     base.core.set("/robot_description", "one")
     join(base, pad)
@@ -535,10 +515,9 @@ async def test_refusals_are_said_and_asked_again(sides: Any, caplog: pytest.LogC
     assert pad.core.get("/use_sim_time") is True
 
 
-async def test_no_chains_and_no_loops(sides: Any) -> None:
+async def test_no_chains_and_no_loops() -> None:
     base = Side("base", follows(FollowRule("/arm/p", "pad", "/arm/p")))
     pad = Side("pad", follows(ARM))
-    sides(base, pad)
     base.core.set("/arm", {"p": 1})
     pad.core.set("/arm", {"p": 2})
     join(base, pad)
@@ -548,9 +527,8 @@ async def test_no_chains_and_no_loops(sides: Any) -> None:
         await base.ask(transfer.SET, {"key": "/arm/x", "text": text})
 
 
-async def test_a_core_that_is_started_anew_gets_all_of_it_again(sides: Any) -> None:
+async def test_a_core_that_is_started_anew_gets_all_of_it_again() -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
-    sides(base, pad)
     base.core.set("/robot_description", "x" * 9000)
     base.core.set("/arm", 1)
     join(base, pad)
@@ -578,10 +556,9 @@ async def test_a_core_that_is_started_anew_gets_all_of_it_again(sides: Any) -> N
 
 @pytest.mark.parametrize("value", [1, "x" * 9000], ids=["small", "large"])
 async def test_what_the_core_did_not_take_at_once_is_not_taken_for_a_change_of_a_node_here(
-    sides: Any, caplog: pytest.LogCaptureFixture, value: XmlRpcValue
+    caplog: pytest.LogCaptureFixture, value: XmlRpcValue
 ) -> None:
     base, pad = Side("base"), Side("pad", follows(ARM))
-    sides(base, pad)
     base.core.set("/arm", value)
     pad.core.down = True
     join(base, pad)
@@ -592,9 +569,8 @@ async def test_what_the_core_did_not_take_at_once_is_not_taken_for_a_change_of_a
     assert "put back" not in caplog.text
 
 
-async def test_what_a_peer_no_longer_follows_is_forgotten(sides: Any) -> None:
+async def test_what_a_peer_no_longer_follows_is_forgotten() -> None:
     base, pad = Side("base"), Side("pad")
-    sides(base, pad)
     join(base, pad)
     for number in range(3):
         await pad.ask(transfer.FOLLOW, {"keys": [f"/p{number}"]})
@@ -602,9 +578,8 @@ async def test_what_a_peer_no_longer_follows_is_forgotten(sides: Any) -> None:
     assert base.params.owner._followers[1].told.keys() == {"/p2"}
 
 
-async def test_a_lost_notification_is_noticed(sides: Any) -> None:
+async def test_a_lost_notification_is_noticed() -> None:
     base, pad = Side("base"), Side("pad", follows(ARM))
-    sides(base, pad)
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
@@ -614,9 +589,8 @@ async def test_a_lost_notification_is_noticed(sides: Any) -> None:
     await until(lambda: pad.core.get("/arm") == 2)
 
 
-async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
+async def test_other_rules_leave_the_rest_alone() -> None:
     base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
-    sides(base, pad)
     base.core.set("/robot_description", "one")
     base.core.set("/arm", 1)
     join(base, pad)
@@ -631,19 +605,17 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     assert base.params.owner.followed == {"/arm"}
 
 
-async def test_time_is_followed_although_nothing_may_be_read(sides: Any) -> None:
+async def test_time_is_followed_although_nothing_may_be_read() -> None:
     simulator = Side("sim", ParamSettings(remote_get=()), TimeSettings(share=True))
     pad = Side("pad", time=TimeSettings(follow="sim"))
-    sides(simulator, pad)
     simulator.core.set("/use_sim_time", True)
     join(simulator, pad)
     await until(lambda: pad.core.get("/use_sim_time") is True)
 
 
 @pytest.mark.parametrize("before", [None, False])
-async def test_time_that_is_no_longer_followed_is_as_it_was(sides: Any, before: bool | None) -> None:
+async def test_time_that_is_no_longer_followed_is_as_it_was(before: bool | None) -> None:
     simulator, pad = Side("sim", time=TimeSettings(share=True)), Side("pad", time=TimeSettings(follow="sim"))
-    sides(simulator, pad)
     simulator.core.set("/use_sim_time", True)
     if before is not None:
         pad.core.set("/use_sim_time", before)
@@ -654,10 +626,9 @@ async def test_time_that_is_no_longer_followed_is_as_it_was(sides: Any, before: 
     assert pad.core.get("/use_sim_time") is before
 
 
-async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: Any) -> None:
+async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed() -> None:
     base = Side("base", ParamSettings(remote_get=("/arm", "/arm/p")))
     pad = Side("pad", follows(ARM))
-    sides(base, pad)
     base.core.set("/arm", {"p": 1, "secret": 2})
     join(base, pad)
     await until(lambda: pad.states() == {"/arm": "refused"})
@@ -666,9 +637,8 @@ async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: A
     await until(lambda: pad.core.get("/arm") == {"p": 1})
 
 
-async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+async def test_values_that_do_not_parse_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
     base, pad = Side("base"), Side("pad", follows(ARM))
-    sides(base, pad)
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
@@ -688,16 +658,11 @@ def denying(*names: str) -> PermissionGate:
     return PermissionGate(Permissions(TrustSettings(rules=(allow, deny))))
 
 
-@asynccontextmanager
-async def linked(params: ParamSettings, gate: PermissionGate = OPEN_GATE) -> AsyncIterator[tuple[Side, Side]]:
+def linked(params: ParamSettings, gate: PermissionGate = OPEN_GATE) -> tuple[Side, Side]:
     """An owner with these rules, and a peer of it."""
     owner, peer = Side("base", params, gate=gate), Side("pad")
-    try:
-        join(owner, peer)
-        yield owner, peer
-    finally:
-        await owner.close()
-        await peer.close()
+    join(owner, peer)
+    return owner, peer
 
 
 ALL = ParamSettings(remote_get=("/**",), remote_set=("/**",))
@@ -715,49 +680,49 @@ ALL = ParamSettings(remote_get=("/**",), remote_set=("/**",))
     ],
 )
 async def test_a_slash_at_the_end_does_not_pass_a_deny(denied: str, key: str, value: XmlRpcValue) -> None:
-    async with linked(ALL, denying(denied)) as (owner, peer):
-        owner.core.set("/motors/limit", 1)
-        with pytest.raises(PeerRefused, match="do not let pad read or set"):
-            await peer.ask(transfer.SET, {"key": key, "text": await write_text("", value)})
-        assert owner.core.get("/motors/limit") == 1
-        await peer.ask(transfer.SET, {"key": "/speed", "text": await write_text("", {"max": 2})})
-        assert owner.core.get("/speed/max") == 2
+    owner, peer = linked(ALL, denying(denied))
+    owner.core.set("/motors/limit", 1)
+    with pytest.raises(PeerRefused, match="do not let pad read or set"):
+        await peer.ask(transfer.SET, {"key": key, "text": await write_text("", value)})
+    assert owner.core.get("/motors/limit") == 1
+    await peer.ask(transfer.SET, {"key": "/speed", "text": await write_text("", {"max": 2})})
+    assert owner.core.get("/speed/max") == 2
 
 
 async def test_without_trust_a_member_with_a_slash_at_its_end_is_set_as_before() -> None:
-    async with linked(ALL) as (owner, peer):
-        await peer.ask(transfer.SET, {"key": "/motors", "text": await write_text("", {"limit/": 5})})
-        assert owner.core.get("/motors") == {"limit": 5}
+    owner, peer = linked(ALL)
+    await peer.ask(transfer.SET, {"key": "/motors", "text": await write_text("", {"limit/": 5})})
+    assert owner.core.get("/motors") == {"limit": 5}
 
 
 async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() -> None:
     """The globs of [params] refuse it as well, and their error names the first parameter that none fits."""
-    async with linked(ParamSettings(remote_get=("/open/**", "/run_id")), denying("/secret/**")) as (owner, peer):
-        owner.core.set("/open", {"a": 1})
-        owner.core.set("/secret/door", 1234)
-        with pytest.raises(PeerRefused) as caught:
-            await peer.ask(transfer.GET, {"key": "/"})
-        assert "secret" not in str(caught.value)
-        text = (await peer.ask(transfer.GET, {"key": "/open"}))["text"]
-        assert await read_text(text) == {"a": 1}
+    owner, peer = linked(ParamSettings(remote_get=("/open/**", "/run_id")), denying("/secret/**"))
+    owner.core.set("/open", {"a": 1})
+    owner.core.set("/secret/door", 1234)
+    with pytest.raises(PeerRefused) as caught:
+        await peer.ask(transfer.GET, {"key": "/"})
+    assert "secret" not in str(caught.value)
+    text = (await peer.ask(transfer.GET, {"key": "/open"}))["text"]
+    assert await read_text(text) == {"a": 1}
 
 
 async def test_a_peer_that_names_other_sites_is_refused_and_logged_by_its_own_name(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """What a member says of the sites that ask is not proved: it must not fill the log, nor put others in it."""
-    async with linked(ALL, denying("/door")) as (owner, peer):
-        for number in range(20):
-            with pytest.raises(PeerRefused, match="permissions there do not let"):
-                await peer.ask(transfer.GET, {"key": "/door", "site": f"site{number}", "askers": ["base"]})
-        assert owner.params.owner._gate._counters["permission.param"] == 20
+    owner, peer = linked(ALL, denying("/door"))
+    for number in range(20):
+        with pytest.raises(PeerRefused, match="permissions there do not let"):
+            await peer.ask(transfer.GET, {"key": "/door", "site": f"site{number}", "askers": ["base"]})
+    assert owner.params.owner._gate._counters["permission.param"] == 20
     lines = [record.getMessage() for record in caplog.records if "may not" in record.getMessage()]
     assert [line[: len("! pad may not")] for line in lines] == ["! pad may not"]
 
 
 @pytest.mark.parametrize("site", [0, False, [], {}, 0.0])
 async def test_what_is_no_name_of_a_site_is_refused(site: object) -> None:
-    async with linked(ALL, denying("/door")) as (owner, peer):
-        with pytest.raises(PeerRefused, match="is not the name of a site or a module"):
-            await peer.ask(transfer.GET, {"key": "/run_id", "site": site})
-        assert owner.counters["ask.failed"] == 0
+    owner, peer = linked(ALL, denying("/door"))
+    with pytest.raises(PeerRefused, match="is not the name of a site or a module"):
+        await peer.ask(transfer.GET, {"key": "/run_id", "site": site})
+    assert owner.counters["ask.failed"] == 0

@@ -19,13 +19,13 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.runtime.accept import Use
 
-DEADLINE: Final = 10.0
 STRING: Final = "std_msgs/String"
 
 
@@ -77,12 +77,6 @@ class Slave:
             while not wanted():
                 self._news.clear()
                 await self._news.wait()
-
-
-async def until(wanted: Callable[[], bool]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not wanted():
-            await asyncio.sleep(0.005)
 
 
 @pytest.fixture

@@ -17,9 +17,10 @@ from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from rmpa.ros.master.parameters import GraphChange
 
@@ -27,20 +28,10 @@ if TYPE_CHECKING:
 # The external core against masters: the embedded one as another program's, and such that do wrong.
 
 
-DEADLINE: Final = 20.0
-
-
 STRING: Final = "std_msgs/String"
 
 
 OURS: Final = "http://127.0.0.1:1/"
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Let the loop turn until something has happened."""
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 async def a_master(port: int = 0) -> RosCore:

@@ -27,12 +27,12 @@ from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, legal_text, response_pieces
+from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-DEADLINE: Final = 20.0
 STRING: Final = "std_msgs/String"
 
 
@@ -89,12 +89,6 @@ class Slave:
     async def subscribe(self, core: RosCore, topic: str) -> None:
         self.subscriptions.append([topic, STRING])
         await call(core.uri, "registerSubscriber", self.name or "/nameless", topic, STRING, self.uri)
-
-
-async def until(wanted: Callable[[], object]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not wanted():
-            await asyncio.sleep(0.005)
 
 
 @pytest.fixture

@@ -107,6 +107,7 @@ class RawPublisher:
         self.description = description
         self.answer: XmlRpcValue = None
         self.asked: list[tuple[XmlRpcValue, ...]] = []
+        self._links: list[RawSubscriber] = []
         self._server = XmlRpcServer(self._call)
         self._socket = socket.create_server(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -118,6 +119,8 @@ class RawPublisher:
     async def __aexit__(self, *_: object) -> None:
         await self._server.close()
         self._socket.close()
+        for link in self._links:
+            link.close()
 
     @property
     def uri(self) -> str:
@@ -140,7 +143,8 @@ class RawPublisher:
         async with asyncio.timeout(DEADLINE):
             sock, _ = await asyncio.get_running_loop().sock_accept(self._socket)
         sock.setblocking(False)
-        return RawSubscriber(sock)
+        self._links.append(RawSubscriber(sock))
+        return self._links[-1]
 
     async def serve(self) -> tuple[RawSubscriber, Mapping[str, str]]:
         """The next connection and its header, answered."""

@@ -24,6 +24,7 @@ class Owner(PublicationEvents):
 
     def __init__(self, description: TopicDescription | None, **options: int) -> None:
         self.said: list[str] = []
+        self.links: list[RawSubscriber] = []
         self.publication = Publication(
             "/t",
             "/p",
@@ -46,10 +47,13 @@ class Owner(PublicationEvents):
     async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
         before = self.publication.subscribers
         link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
+        self.links.append(link)
         await until(lambda: self.publication.subscribers > before)
         return link
 
     def close(self) -> None:
+        for link in self.links:
+            link.close()
         self.publication.withdraw()
         self.server.close()
 
@@ -89,7 +93,6 @@ async def test_a_subscriber_gets_the_header_and_then_every_message(known: Owner)
         known.publication.publish_framed(frame_message(payload))
     for payload in (b"one", b"", b"x" * 3_000_000, b"last"):
         assert await link.message() == payload
-    link.close()
 
 
 async def test_demand_is_reported_once_each_way(known: Owner) -> None:
@@ -111,7 +114,6 @@ async def test_a_subscriber_is_held_until_the_type_is_known(held: Owner) -> None
     held.publication.publish_framed(frame_message(b"now"))
     assert await link.message() == b"now"
     assert held.said == ["first"]
-    link.close()
 
 
 async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held: Owner) -> None:
@@ -122,8 +124,6 @@ async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held:
     assert await wrong.ended()
     assert "error" not in await right.header()
     assert held.said == ["first", f"refused /wrong: {error}"]
-    wrong.close()
-    right.close()
 
 
 async def test_a_held_subscriber_that_has_just_left_costs_no_other_the_topic(held: Owner) -> None:
@@ -134,14 +134,12 @@ async def test_a_held_subscriber_that_has_just_left_costs_no_other_the_topic(hel
         await asyncio.sleep(0)
     held.publication.describe(STRING)
     assert (await stays.header())["type"] == "std_msgs/String"
-    stays.close()
 
 
 async def test_demand_ends_when_all_held_subscribers_are_refused(held: Owner) -> None:
-    link = await held.subscriber(md5sum="0" * 32)
+    await held.subscriber(md5sum="0" * 32)
     held.publication.describe(STRING)
     assert [text.split()[0] for text in held.said] == ["first", "refused", "last"]
-    link.close()
 
 
 async def test_a_mismatch_is_no_demand(known: Owner) -> None:
@@ -162,8 +160,6 @@ async def test_latched_message_is_first_on_each_connection(latched: Owner) -> No
     assert (await late.header())["latching"] == "1"
     assert [await early.message() for _ in range(3)] == [b"old", b"kept", b"new"]
     assert [await late.message() for _ in range(2)] == [b"kept", b"new"]
-    early.close()
-    late.close()
 
 
 async def test_the_latched_message_can_be_forgotten(latched: Owner) -> None:
@@ -173,7 +169,6 @@ async def test_the_latched_message_can_be_forgotten(latched: Owner) -> None:
     await link.header()
     latched.publication.publish_framed(frame_message(b"new"))
     assert await link.message() == b"new"
-    link.close()
 
 
 async def test_another_definition_disconnects_subscribers(latched: Owner) -> None:
@@ -190,8 +185,6 @@ async def test_another_definition_disconnects_subscribers(latched: Owner) -> Non
     assert (await again.header())["type"] == "std_msgs/Int32"
     latched.publication.publish_framed(frame_message(b"new"))
     assert await again.message() == b"new"
-    link.close()
-    again.close()
 
 
 @pytest.mark.trap(2)
@@ -203,11 +196,10 @@ async def test_a_wildcard_is_never_described(held: Owner) -> None:
 @pytest.mark.trap(9)
 @pytest.mark.parametrize(("asked", "given"), [("1", 1), ("0", 0), ("true", 0), ("", 0)])
 async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, given: int) -> None:
-    link = await known.subscriber(tcp_nodelay=asked)
+    await known.subscriber(tcp_nodelay=asked)
     (inbound,) = known.publication._connections
     assert isinstance(inbound, AcceptedConnection)
     assert inbound._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == given
-    link.close()
 
 
 @pytest.mark.trap(13)
@@ -215,7 +207,6 @@ async def test_a_half_closed_subscriber_is_gone(known: Owner) -> None:
     link = await known.subscriber()
     link.sock.shutdown(socket.SHUT_WR)
     await until(lambda: known.said == ["first", "last"])
-    link.close()
 
 
 @pytest.mark.trap(20)
@@ -265,12 +256,11 @@ async def test_slow_subscriber_loses_the_oldest_and_delays_no_other() -> None:
 @pytest.mark.trap(19)
 async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
     owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
-    slow = await owner.subscriber(buffer=4096)
+    await owner.subscriber(buffer=4096)
     for _ in range(200):
         owner.publication.publish_framed(frame_message(bytes(100_000)))
     (inbound,) = owner.publication._connections
     assert inbound.pending_bytes <= 1_000_000 + 100_004
-    slow.close()
     owner.close()
 
 
@@ -281,7 +271,6 @@ async def test_withdrawal_closes_all_connections_silently(known: Owner) -> None:
     known.publication.withdraw()
     assert await link.ended()
     assert known.said == ["first"]
-    link.close()
 
 
 async def test_figures(known: Owner) -> None:
@@ -295,7 +284,6 @@ async def test_figures(known: Owner) -> None:
     assert connection.bytes > 7
     assert connection.info.startswith("TCPROS connection on port ")
     assert (known.publication.messages, known.publication.bytes) == (1, 7)
-    link.close()
 
 
 async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
@@ -307,12 +295,11 @@ async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
     await known.publication.drained()
     assert reading == [100_000] * 20
     assert limits.SUBSCRIBER_QUEUE_MESSAGES > 20
-    link.close()
 
 
 @pytest.mark.trap(18)
 async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
-    link = await known.subscriber()
+    await known.subscriber()
     (inbound,) = known.publication._connections
     assert isinstance(inbound, AcceptedConnection)
     for level, option, value in (
@@ -322,7 +309,6 @@ async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: O
         (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 9),
     ):
         assert inbound._socket.getsockopt(level, option) == value
-    link.close()
 
 
 # --- messages in parts ------------------------------------------------------------------------------------------
@@ -359,7 +345,6 @@ async def test_parts_go_on_as_they_come_and_make_the_message(known: Owner) -> No
     assert await link.message() == b"after"
     assert known.publication.messages == 3
     assert known.publication.bytes == 4 + len(WHOLE) + 2 * 4 + 11
-    link.close()
 
 
 async def test_messages_without_subscribers_are_counted(known: Owner) -> None:
@@ -394,8 +379,6 @@ async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -
     assert got == [message for message in sent if message in got], "in order, none torn, none twice"
     # The one that was on its way when the rest came may be one of the two that the queue holds.
     assert got[-1] == sent[-1]
-    for link in (slow, *fast):
-        link.close()
     owner.close()
 
 
@@ -409,7 +392,6 @@ async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) ->
     for link, messages in ((early, [WHOLE, b"next"]), (late, [b"next"])):
         await link.header()
         assert [await link.message() for _ in messages] == messages
-        link.close()
 
 
 @pytest.mark.trap(10)
@@ -426,7 +408,6 @@ async def test_late_subscriber_gets_latched_message_whole(latched: Owner) -> Non
     for link, messages in ((early, [b"old map", WHOLE]), (late, [b"old map", WHOLE]), (latest, [WHOLE])):
         await link.header()
         assert [await link.message() for _ in range(len(messages) + 1)] == [*messages, b"next"]
-        link.close()
 
 
 async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
@@ -455,13 +436,11 @@ async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
     assert [len(await stuck.message()) for _ in range(fills + 2)] == [100_000] * fills + [4, 4]
     await late.header()
     assert await late.message() == b"next"
-    for link in (half, stuck, late):
-        link.close()
     owner.close()
 
 
 async def test_abort_of_the_last_subscriber_ends_the_demand(known: Owner) -> None:
-    link = await known.subscriber()
+    await known.subscriber()
     begin(known.publication)
     assert known.publication.abort() == 1
     assert known.said == ["first", "last"]
@@ -470,8 +449,6 @@ async def test_abort_of_the_last_subscriber_ends_the_demand(known: Owner) -> Non
     known.publication.publish_framed(frame_message(b"next"))
     await again.header()
     assert await again.message() == b"next"
-    link.close()
-    again.close()
 
 
 async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
@@ -482,7 +459,6 @@ async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
     link = await latched.subscriber()
     await link.header()
     assert await link.message() == b"old"
-    link.close()
 
 
 async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None:
@@ -494,17 +470,15 @@ async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None
     extend(known.publication, *PARTS[2:])
     await stays.header()
     assert await stays.message() == WHOLE
-    stays.close()
 
 
 async def test_withdrawn_in_the_middle_nothing_is_left(latched: Owner) -> None:
-    link = await latched.subscriber()
+    await latched.subscriber()
     begin(latched.publication)
     extend(latched.publication, *PARTS[:2])
     latched.publication.withdraw()
     extend(latched.publication, *PARTS[2:])
     assert latched.publication.latched == ()
-    link.close()
 
 
 async def test_new_subscriber_gets_latched_depth_in_order(latched: Owner) -> None:
@@ -521,7 +495,6 @@ async def test_new_subscriber_gets_latched_depth_in_order(latched: Owner) -> Non
     assert [await link.message() for _ in range(3)] == [b"1", b"2", WHOLE]
     latched.publication.keep(1)
     assert list(latched.publication.latched) == kept[-1:]
-    link.close()
 
 
 def test_no_contract_keeps_more_than_the_limit() -> None:
@@ -535,9 +508,9 @@ def test_no_contract_keeps_more_than_the_limit() -> None:
 @pytest.mark.trap(19)
 async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     owner = Owner(STRING)
-    early = await owner.subscriber(callerid="/early", buffer=4096)
+    await owner.subscriber(callerid="/early", buffer=4096)
     owner.publication.bound(3)
-    late = await owner.subscriber(callerid="/late", buffer=4096)
+    await owner.subscriber(callerid="/late", buffer=4096)
     for _ in range(100):
         owner.publication.publish_framed(frame_message(bytes(200_000)))
     links = [link for link in owner.publication._connections if isinstance(link, AcceptedConnection)]
@@ -545,15 +518,13 @@ async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     assert all(link.dropped > 50 and link.outbox.waiting_entries <= 4 for link in links)
     owner.publication.bound(10**6)
     assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
-    early.close()
-    late.close()
     owner.close()
 
 
 async def test_a_held_subscriber_counts_as_connected_while_others_are_served(
     held: Owner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    links = [await held.subscriber(callerid=name) for name in ("/one", "/two")]
+    [await held.subscriber(callerid=name) for name in ("/one", "/two")]
     assert held.publication.callers == {"/one", "/two"}
     seen: list[frozenset[str]] = []
     monkeypatch.setattr(held, "listeners_changed", lambda: seen.append(held.publication.callers))
@@ -561,8 +532,6 @@ async def test_a_held_subscriber_counts_as_connected_while_others_are_served(
     assert set(seen) == {frozenset({"/one", "/two"})}, "not one of them seems to have left meanwhile"
     assert held.publication.listeners == ("/one", "/two")
     assert held.said == ["first"]
-    for link in links:
-        link.close()
 
 
 @pytest.mark.trap(42)
@@ -578,5 +547,3 @@ async def test_one_subscriber_is_hung_up_on_and_the_others_stay(known: Owner) ->
     assert not known.publication.hang_up("/one")
     assert known.publication.hang_up("/two")
     assert known.said == ["first", "last"]
-    for link in links.values():
-        link.close()

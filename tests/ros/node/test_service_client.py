@@ -69,13 +69,12 @@ async def server() -> AsyncIterator[RawServer]:
 
 
 async def test_servers_description_is_read(server: RawServer) -> None:
-    connection, link = await server.serve()
+    connection, _link = await server.serve()
     assert connection.description.type == ADD.type
     assert connection.description.md5sum == MD5
     assert connection.caller_id == "/server"
     connection.close()
     assert connection.closed
-    link.close()
 
 
 async def test_a_reply_in_pieces(server: RawServer) -> None:
@@ -89,7 +88,6 @@ async def test_a_reply_in_pieces(server: RawServer) -> None:
     assert await answer == (True, b"abc")
     assert not connection._stream.closed
     connection.close()
-    link.close()
 
 
 async def test_one_call_at_a_time(server: RawServer) -> None:
@@ -101,7 +99,6 @@ async def test_one_call_at_a_time(server: RawServer) -> None:
     await link.send(b"\x01\x00\x00\x00\x00")
     assert await answer == (True, b"")
     connection.close()
-    link.close()
 
 
 async def test_a_server_that_dies_in_the_middle_of_a_call(server: RawServer) -> None:
@@ -137,11 +134,10 @@ async def test_server_that_closed_before_the_call_is_distinguished(server: RawSe
 
 
 async def test_a_late_answer_closes_the_connection(server: RawServer) -> None:
-    connection, link = await server.serve()
+    connection, _link = await server.serve()
     with pytest.raises(ServiceFailed, match=r"no answer within 0\.02 s"):
         await connection.call(b"1", 0.02)
     assert connection.closed
-    link.close()
 
 
 async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: RawServer) -> None:
@@ -151,17 +147,15 @@ async def test_who_does_not_wait_for_the_answer_closes_the_connection(server: Ra
     answer.cancel()
     await until(lambda: connection.closed)
     assert await link.ended()
-    link.close()
 
 
 async def test_close_fails_the_call(server: RawServer) -> None:
-    connection, link = await server.serve()
+    connection, _link = await server.serve()
     answer = asyncio.create_task(connection.call(bytes(10_000_000)))
     await until(lambda: connection.busy)
     connection.close()
     with pytest.raises(ServiceFailed, match="the connection was closed"):
         await answer
-    link.close()
 
 
 @pytest.mark.parametrize(
@@ -177,14 +171,12 @@ async def test_a_server_that_breaks_the_protocol(server: RawServer, sent: bytes,
     await link.send(sent)
     with pytest.raises(ServiceFailed, match=problem):
         await answer
-    link.close()
 
 
 async def test_unrequested_bytes_break_the_protocol(server: RawServer) -> None:
     connection, link = await server.serve()
     await link.send(b"\x01\x00\x00\x00\x00")
     await until(lambda: connection.closed)
-    link.close()
 
 
 async def test_refusals(server: RawServer) -> None:
@@ -198,7 +190,6 @@ async def test_refusals(server: RawServer) -> None:
     await link.send(encode_header(server_header("/server", ADD)))
     with pytest.raises(PeerRefused, match=f"the server of /add has md5sum .{MD5}., not"):
         await opening
-    link.close()
 
 
 async def test_nobody_there() -> None:

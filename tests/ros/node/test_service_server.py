@@ -3,7 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import pytest
 
@@ -16,6 +16,7 @@ from rmpa.ros.wire.tcpros import ServiceDescription, encode_header
 from tests.ros.node.peers import DEADLINE, RawSubscriber, until
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import AsyncIterator, Mapping
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -27,6 +28,8 @@ async def node() -> AsyncIterator[SlaveNode]:
     made = SlaveNode("/server", "127.0.0.1", "http://127.0.0.1:11311/")
     await made.start()
     yield made
+    while RawClient.made:
+        RawClient.made.pop().close()
     await made.close()
 
 
@@ -48,6 +51,12 @@ def serve(node: SlaveNode, *args: object, **kwargs: object) -> ServiceEndpoint:
 
 class RawClient(RawSubscriber):
     """A bare client."""
+
+    made: ClassVar[list[RawClient]] = []
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock)
+        self.made.append(self)
 
     @classmethod
     async def call(cls, node: SlaveNode, **fields: str) -> RawClient:
@@ -100,7 +109,6 @@ async def test_a_persistent_connection_goes_on(node: SlaveNode, word: str) -> No
     for _ in range(3):
         await client.send(TWO)
         assert await client.reply() == FORTY_TWO
-    client.close()
 
 
 async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
@@ -119,7 +127,6 @@ async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
     await hasty.send(encode_header(header) + TWO)
     await hasty.header()
     assert await hasty.reply() == FORTY_TWO
-    hasty.close()
 
 
 async def test_a_request_that_came_before_the_description_waits_for_it(node: SlaveNode) -> None:
@@ -180,7 +187,7 @@ async def test_callers_behind_one_that_fails_are_answered(node: SlaveNode, caplo
         raise ZeroDivisionError
 
     endpoint = serve(node, add, describe, description=None, on_mismatch=broken)
-    other = await RawClient.call(node, md5sum="0" * 32)
+    await RawClient.call(node, md5sum="0" * 32)
     await until(lambda: len(endpoint._clients) == 1)
     caller = await RawClient.call(node)
     await until(lambda: len(endpoint._clients) == 2)
@@ -189,8 +196,6 @@ async def test_callers_behind_one_that_fails_are_answered(node: SlaveNode, caplo
     await caller.header()
     assert await caller.reply() == FORTY_TWO
     assert "could not be answered" in caplog.text
-    other.close()
-    caller.close()
 
 
 async def test_a_refused_description_is_asked_for_again(node: SlaveNode) -> None:
@@ -206,7 +211,6 @@ async def test_a_refused_description_is_asked_for_again(node: SlaveNode) -> None
     client.close()
     client = await RawClient.call(node)
     assert (await client.header())["md5sum"] == MD5
-    client.close()
 
 
 async def test_a_description_that_fails_is_an_error_to_the_client(node: SlaveNode) -> None:
@@ -216,7 +220,6 @@ async def test_a_description_that_fails_is_an_error_to_the_client(node: SlaveNod
     serve(node, add, describe, description=None)
     client = await RawClient.call(node)
     assert await client.header() == {"error": "no agent answers at base"}
-    client.close()
 
 
 @pytest.mark.trap(23)
@@ -244,7 +247,6 @@ async def test_another_md5_sum_is_refused_loudly(node: SlaveNode) -> None:
     assert text.startswith("client [/old] wants service /add to have md5sum [000")
     assert told == [f"/old: {text}"]
     assert await client.ended()
-    client.close()
 
 
 async def test_an_unknown_service_is_a_clear_error(node: SlaveNode) -> None:
@@ -399,8 +401,6 @@ async def test_a_silent_client_is_closed(node: SlaveNode, monkeypatch: pytest.Mo
     assert len(endpoint._clients) == 1  # persistent ones may wait for their next call as long as they like
     await idle.send(TWO)
     assert await idle.reply() == FORTY_TWO
-    for client in (silent, half, idle):
-        client.close()
 
 
 async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode) -> None:
@@ -437,8 +437,6 @@ async def test_withdrawn_service_answers_waiting_clients(node: SlaveNode) -> Non
     assert gone == [True]
     with pytest.raises(PeerRefused, match="does not offer the service"):
         await ServiceConnection.open(node.service_uri, "/add", "/c")
-    waiting.close()
-    idle.close()
 
 
 async def test_a_node_that_ends_answers_what_is_under_way() -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import socket
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import pytest
 
@@ -19,9 +19,12 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+async def impatient(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
     monkeypatch.setattr(limits, "TCPROS_RETRY_FIRST", 0.001)
     monkeypatch.setattr(limits, "TCPROS_RETRY_MAX", 0.01)
+    yield
+    while Said.made:
+        Said.made.pop().close()
 
 
 @pytest.fixture
@@ -32,6 +35,8 @@ async def publisher() -> AsyncIterator[RawPublisher]:
 
 class Said:
     """One connection to one publisher, and what it said."""
+
+    made: ClassVar[list[Said]] = []
 
     def __init__(self, uri: str, *, on_parts: PartsTaker | None = None, **options: str) -> None:
         self.headers: list[Mapping[str, str]] = []
@@ -53,6 +58,7 @@ class Said:
             md5sum=options.get("md5sum", "*"),
         )
         self.link.start()
+        self.made.append(self)
 
     def close(self) -> None:
         self.link.close()
@@ -61,13 +67,11 @@ class Said:
 @pytest.mark.trap(3, 11)
 async def test_it_asks_for_tcpros_only_and_sends_its_header_at_once(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
-    link, fields = await publisher.serve()
+    _link, fields = await publisher.serve()
     assert publisher.asked == [("/s", "/t", [["TCPROS"]])]
     assert fields == {"callerid": "/s", "md5sum": "*", "tcp_nodelay": "1", "topic": "/t", "type": "*"}
     await until(lambda: said.headers)
     assert said.headers[0]["message_definition"] == "string data\n"
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(8)
@@ -81,8 +85,6 @@ async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: Raw
             await link.send(wire[start : start + chunk])
         await until(lambda: len(said.messages) == 2)  # noqa: B023 - awaited within the turn
         assert said.messages == [b"\x03\x00\x00\x00one", b"\x00\x00\x00\x00"]
-        said.close()
-        link.close()
 
 
 async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
@@ -96,8 +98,6 @@ async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
     connection = said.link.connection()
     assert (connection.messages, connection.bytes, connection.connected) == (5, 5_000_020, True)
     assert (connection.direction, connection.other) == ("i", publisher.uri)
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(14, 17)
@@ -112,8 +112,6 @@ async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(pub
     assert [m[4:] for m in said.messages] == [b"whole", b"after"]
     assert said.lost == ["the publisher closed the connection"]
     assert len(said.headers) == 2
-    said.close()
-    again.close()
 
 
 async def test_an_unreachable_publisher_is_tried_for_ever() -> None:
@@ -123,7 +121,6 @@ async def test_an_unreachable_publisher_is_tried_for_ever() -> None:
     await until(lambda: len(said.lost) > 5)
     assert f"no XML-RPC server answers at {uri}" in said.lost[0]
     assert not said.refused
-    said.close()
 
 
 @pytest.mark.trap(21)
@@ -147,10 +144,8 @@ async def test_a_publisher_that_is_not_ready_is_asked_again(
     said = Said(publisher.uri)
     await until(lambda: len(said.lost) > 2)
     publisher.answer = None
-    link, _ = await publisher.serve()
+    _link, _ = await publisher.serve()
     await until(lambda: said.headers)
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(15)
@@ -163,8 +158,6 @@ async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
     await until(lambda: said.link._task is None)
     assert (said.refused, said.lost, said.messages) == (["go away"], [], [])
     assert said.link.refused == "go away"
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(1)
@@ -176,8 +169,6 @@ async def test_a_publisher_with_another_md5_sum_is_not_believed(publisher: RawPu
     await until(lambda: said.refused)
     assert f"not [std_msgs/String/{MD5}]" in said.refused[0]
     assert said.messages == []
-    said.close()
-    link.close()
 
 
 @pytest.mark.parametrize("junk", [b"GET / HTTP/1.1\r\n", struct.pack("<II", 9, 5) + b"topic"])
@@ -188,8 +179,6 @@ async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes)
     await until(lambda: said.lost)
     assert "connection header" in said.lost[0]
     assert not said.headers
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(17)
@@ -202,8 +191,6 @@ async def test_what_cannot_be_a_length_ends_the_connection(publisher: RawPublish
     assert [m[4:] for m in said.messages] == [b"before"]
     assert said.oversized == []
     assert said.link.malformed
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(17)
@@ -227,8 +214,6 @@ async def test_a_message_beyond_the_limit_is_left_out_and_others_come(
     connection = said.link.connection()
     assert (connection.messages, connection.bytes) == (len(wanted), len(wire))
     assert not said.lost
-    said.close()
-    link.close()
 
 
 async def test_a_message_beyond_the_limit_takes_no_memory(
@@ -243,8 +228,6 @@ async def test_a_message_beyond_the_limit_takes_no_memory(
     await link.send(frame_message(b"behind"))
     await until(lambda: said.messages)
     assert len(said.link._stream._buffer) <= 8 << 20  # type: ignore[union-attr] # it is connected
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(17)
@@ -261,19 +244,15 @@ async def test_publisher_lost_within_an_oversized_message_is_found_again(
     await again.send(frame_message(b"after"))
     await until(lambda: said.messages)
     assert [m[4:] for m in said.messages] == [b"after"]
-    said.close()
-    again.close()
 
 
 @pytest.mark.trap(18)
 async def test_one_that_never_answers_is_given_up(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.05)
     said = Said(publisher.uri)
-    link = await publisher.accept()
+    await publisher.accept()
     await until(lambda: said.lost)
     assert "no header from the publisher" in said.lost[0]
-    said.close()
-    link.close()
 
 
 async def test_closed_from_within_a_message_no_other_comes(publisher: RawPublisher) -> None:
@@ -289,7 +268,6 @@ async def test_closed_from_within_a_message_no_other_comes(publisher: RawPublish
     await link.send(frame_message(b"one") + frame_message(b"two"))
     assert await link.ended()
     assert got == [b"\x03\x00\x00\x00one"]
-    link.close()
 
 
 class Followed:
@@ -322,13 +300,11 @@ async def test_a_subscription_follows_the_list_of_publishers() -> None:
         followed.subscription.update([two.uri])
         assert await first.ended()
         followed.subscription.update([one.uri], keep=True)
-        third, _ = await one.serve()
+        _third, _ = await one.serve()
         await second.send(frame_message(b"still"))
         await until(lambda: len(followed.messages) == 3)
         assert len(one.asked) == 2
         assert len(two.asked) == 1
-        for link in (first, second, third):
-            link.close()
         followed.close()
 
 
@@ -345,8 +321,6 @@ async def test_refusing_publisher_is_tried_again_when_listed_again() -> None:
         again, _ = await one.serve()
         await again.send(frame_message(b"now"))
         await until(lambda: followed.messages == [(one.uri, b"now")])
-        link.close()
-        again.close()
         followed.close()
 
 
@@ -366,10 +340,6 @@ async def test_half_a_message_holds_up_no_other(publisher: RawPublisher) -> None
         assert isinstance(stuck.link._stream._sock, socket.socket)
         assert stuck.link._stream._sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         await half.send(b" a minute ago")
-        stuck.close()
-        fine.close()
-        half.close()
-        whole.close()
 
 
 # --- messages in parts ------------------------------------------------------------------------------------------
@@ -422,8 +392,6 @@ async def test_only_above_the_limit_a_message_comes_in_parts(publisher: RawPubli
     assert all(size > core_limits.CUT_THROUGH_BYTES for size in said.sizes)
     connection = said.link.connection()
     assert (connection.messages, connection.bytes) == (5, sum(len(payload) + 4 for payload in payloads))
-    said.close()
-    link.close()
 
 
 async def test_the_first_bytes_are_handed_on_before_the_last_ones_were_sent(publisher: RawPublisher) -> None:
@@ -442,15 +410,13 @@ async def test_the_first_bytes_are_handed_on_before_the_last_ones_were_sent(publ
     await until(lambda: len(said.messages) == 3)
     assert [m[4:] for m in said.messages] == [b"one", LARGE, b"two"]
     assert said.aborts == 0
-    said.close()
-    link.close()
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 4097, 100_003])
 async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk: int) -> None:
     """Fed by hand: a socket would join the pieces again."""
     said = InParts(publisher.uri)
-    link, _ = await publisher.serve()
+    _link, _ = await publisher.serve()
     await until(lambda: said.headers)
     payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(core_limits.CUT_THROUGH_BYTES - 3), b""]
     wire = b"".join(map(frame_message, payloads))
@@ -463,8 +429,6 @@ async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk:
     assert [m[4:] for m in said.messages] == payloads
     assert said.link.messages == len(payloads)
     assert said.link.bytes == len(wire)
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(14, 17)
@@ -481,7 +445,6 @@ async def test_publisher_lost_within_parts_aborts_and_reconnects(publisher: RawP
     assert (said.aborts, len(said.lost), said.link.messages) == (1, 1, 3)
     said.close()
     assert said.aborts == 1
-    again.close()
 
 
 async def test_left_in_the_middle_of_parts_is_an_abort_too(publisher: RawPublisher) -> None:
@@ -493,7 +456,6 @@ async def test_left_in_the_middle_of_parts_is_an_abort_too(publisher: RawPublish
     assert (said.aborts, said.lost) == (1, [])
     said.close()
     assert said.aborts == 1
-    link.close()
 
 
 @pytest.mark.parametrize("when", ["begin", "part", "end"])
@@ -510,7 +472,7 @@ async def test_closed_from_within_a_part_no_other_comes(publisher: RawPublisher,
                 self.link.close()
 
     said = Closing(publisher.uri)
-    link, _ = await publisher.serve()
+    _link, _ = await publisher.serve()
     await until(lambda: said.headers)
     assert said.link._stream is not None
     stream, wire = said.link._stream, frame_message(LARGE)
@@ -519,8 +481,6 @@ async def test_closed_from_within_a_part_no_other_comes(publisher: RawPublisher,
     assert said.messages == ([wire] if when == "end" else [])
     assert said.parts == {"begin": [], "part": [5000], "end": [5000, len(wire) - 5000]}[when]
     assert said.aborts == (when != "end")
-    said.close()
-    link.close()
 
 
 @pytest.mark.trap(17)
@@ -531,5 +491,3 @@ async def test_a_claim_beyond_the_limit_begins_no_parts(publisher: RawPublisher)
     await until(lambda: said.lost)
     assert said.sizes in ([], [len(LARGE) + 4])
     assert (said.aborts, said.half) == (0, b"")
-    said.close()
-    link.close()
