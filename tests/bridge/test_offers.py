@@ -396,15 +396,6 @@ def test_another_peer_provides_what_one_has_no_place_for() -> None:
     assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
 
 
-def test_services_beyond_the_limit_come_when_there_is_room() -> None:
-    made = services(count=2)
-    actions = made.advertised(1, provided("/a", "/b", "/c"))
-    assert [type(action) for action in actions] == [Provide, Provide, Warn]
-    assert made.refused(1) == 1
-    assert made.advertised(1, provided(removed=("/a",)))[-1] == Provide(1, "/c", "/n")
-    assert made.refused(1) == 0
-
-
 def test_the_services_limits_are_reloaded() -> None:
     made = services(nodes=1, count=2)
     made.advertised(1, provided("/a", node="/first"))

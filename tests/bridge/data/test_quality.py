@@ -589,16 +589,6 @@ def test_period_begins_anew_after_a_pause() -> None:
 # The history of a peer's clock.
 
 
-def test_a_clock_that_was_set_makes_all_before_void() -> None:
-    clock = PeerClockHistory()
-    clock.add(1.0, 0.01, 0.0)
-    clock.add(1.019, 0.01, 1.0)  # within both bounds
-    assert clock.trusted_from < 0
-    clock.add(1.5, 0.01, 2.0)
-    assert list(clock.estimates) == [(2.0, 1.5, 0.01)]
-    assert clock.trusted_from == 2.0
-
-
 def test_drift_is_no_setting() -> None:
     clock = PeerClockHistory()
     clock.add(0.0, 0.0, 0.0)

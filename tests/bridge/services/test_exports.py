@@ -20,7 +20,7 @@ from rmpa.config.settings import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndRoute, Probe, Send, ServerGone, ServeRoute, ServiceExports
-from tests.bridge.services.test_rules import apply_rules, rules
+from tests.bridge.services.test_rules import rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
 ABOUT = ServiceDescription("a/Add", "6a2e34150c00229791cc89ff309fff21")
@@ -119,13 +119,6 @@ def test_one_probe_answers_all_who_wait(exports: ServiceExports) -> None:
     assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)], "whoever asks again has another try"
 
 
-def test_a_link_that_is_gone_ends_its_routes(exports: ServiceExports) -> None:
-    requests = opened(exports)
-    assert exports.link_down(1) == [EndRoute(1, requests)]
-    assert exports.link_down(1) == []
-    assert exports.described("/add", ADD, ABOUT) == []
-
-
 def test_one_route_for_two_services_breaks_the_protocol(exports: ServiceExports) -> None:
     exports.opened(1, OpenService(ROUTE, "/add"))
     with pytest.raises(RemoteProtocolError):
@@ -143,15 +136,3 @@ def test_names_on_the_way_are_each_peers_own() -> None:
     assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/robot1/go", ADD)]
     (refused,) = made.opened(1, OpenService(ROUTE, "/robot1/go"))
     assert isinstance(refused, Send)
-
-
-def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> None:
-    exports.graph("/sub", ADD)
-    told(exports)
-    requests = opened(exports)
-    assert apply_rules(exports, rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
-    assert told(exports) == [AdvertiseServices(removed=("/sub",))]
-    assert exports.callers("/add") == (1,)
-    gone = apply_rules(exports, rules(ServiceSettings(deny=("/add",))))
-    assert EndRoute(1, requests) in gone
-    assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/adder"),), ("/add",))]

@@ -15,8 +15,7 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.config.peer_rules import PeerRule, PolicySettings
-from rmpa.config.settings import ServiceSettings
+from rmpa.config.peer_rules import PeerRule
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.ros.wire.tcpros import ServiceDescription
 from tests.bridge.recorder import EndedService, ForgetAbout, OpenedService, Provide, Send, ServiceImports, Withdraw
@@ -138,16 +137,6 @@ def test_a_lost_link_ends_calls_and_keeps_services_until_the_peer_is_gone(import
     assert list(imports) == []
 
 
-def test_what_a_returning_peer_no_longer_has_goes_when_it_has_said_all(imports: ServiceImports) -> None:
-    imports.advertised(1, offer("/sub", "/mul"))
-    imports.link_down(1)
-    imports.link_up(1, "base", rank=10)
-    assert imports.advertised(1, offer("/sub", full=True, more=True)) == [ForgetAbout(1, "/sub")]
-    *gone, new = imports.advertised(1, offer("/div"))
-    assert new == Provide(1, "/div", "/n")
-    assert {a.service for a in gone if isinstance(a, Withdraw)} == {"/add", "/mul"}
-
-
 def test_another_node_in_its_place_is_another_service(imports: ServiceImports) -> None:
     assert imports.advertised(1, offer("/add", node="/m")) == [
         Withdraw(1, "/add", "/n", "another node of base provides it now"),
@@ -190,17 +179,6 @@ def test_two_of_one_peer_that_would_have_one_name_here() -> None:
     assert "has this name here already" in made.hidden(second[0])
 
 
-def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> None:
-    imports.advertised(1, offer("/sub"))
-    opened(imports)
-    (gone,) = apply_rules(imports, rules(ServiceSettings(deny=("/sub",))))
-    assert gone == Withdraw(1, "/sub", "/n", "policy: services.deny has '/sub'")
-    remote = imports.get(1, "/add")
-    assert remote is not None
-    assert remote.state == "open"
-    assert apply_rules(imports, rules()) == [Provide(1, "/sub", "/n")]
-
-
 def test_a_name_that_all_modules_have_costs_one_judgement_each(monkeypatch: pytest.MonkeyPatch) -> None:
     # Modules of one kind have the same names: judging all claims for each new one would be quadratic.
     judged = []
@@ -231,16 +209,3 @@ def test_a_name_that_all_modules_have_costs_one_judgement_each(monkeypatch: pyte
     assert hidden(made, peers + 1, "/start") == "/mine of this module provides it itself"
     assert judged == []
     assert made.shown("/start") is None
-
-
-def test_new_rules_judge_a_name_that_all_modules_have_once() -> None:
-    made = ServiceImports(rules())
-    for number in range(1, 5):
-        made.link_up(number, f"arm{number}", rank=number)
-        made.advertised(number, offer("/start", full=True))
-    denied = (PeerRule("arm1", policy=PolicySettings(deny=("/start",))),)
-    actions = apply_rules(made, rules(peers=denied))
-    assert [type(action) for action in actions] == [Withdraw, Provide]
-    assert made.shown("/start") is made.get(2, "/start")
-    assert "arm1" in hidden(made, 1, "/start")
-    assert "arm2 provides it too" in hidden(made, 4, "/start")

@@ -253,21 +253,6 @@ def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:
     assert exports.description(CMD) == ABOUT
 
 
-def test_each_route_has_its_peers_contract_and_a_numbering_of_its_own(
-    exports: Exports,
-) -> None:
-    graph(exports, {CMD: JOY})
-    for peer, contract in ((1, RELIABLE), (2, Contract()), (3, RELIABLE)):
-        exports.link_up(peer)
-        exports.opened(peer, OpenRoute(7, "/cmd", "/joy", contract))
-    added = [action for action in exports.described(CMD, ABOUT) if isinstance(action, AddRoute)]
-    assert [(route.peer, route.contract, route.epoch, route.after) for route in added] == [
-        (1, RELIABLE, 1, None),
-        (2, Contract(), 0, None),
-        (3, RELIABLE, 2, None),
-    ]
-
-
 def test_another_transport_alone_leaves_routes_open(flowing: Exports) -> None:
     policy, asked = Policy(PolicySettings()), Contract(reliability=Reliability.RELIABLE, transport=Transport.AUTO)
     flowing.link_up(2)

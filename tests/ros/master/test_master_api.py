@@ -224,16 +224,6 @@ def test_lookups_may_be_answered_for_each_caller(master: Master) -> None:
     assert asked == [("/s", RPC, "/near", B), ("/s", RPC, "/unknown", "")]
 
 
-def test_states_are_snapshots(master: Master) -> None:
-    master("registerPublisher", "/p", "/t", STRING, A)
-    state = master.api.registrations.state()
-    assert master.api.registrations.state() is state
-    assert (state.publishers, state.types, state.nodes) == ({"/t": {"/p": A}}, {"/t": STRING}, {"/p": A})
-    master("registerService", "/p", "/s", RPC, A)
-    assert state.services == {}
-    assert master.api.registrations.state().services == {"/s": {"/p": RPC}}
-
-
 def test_a_state_handed_out_does_not_change(master: Master) -> None:
     def everything() -> GraphState:
         return master.api.registrations.state()

@@ -236,18 +236,6 @@ def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     assert not pair.mirror.dead
 
 
-def test_missing_registrations_are_sent_again(pair: Pair) -> None:
-    pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
-    pair.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
-    pair.flush()
-    pair.call("unregisterPublisher", "/rmpa", "/t", OURS)
-    pair.writes.clear()
-    assert pair.look() == [("unregisterPublisher", ("/rmpa", "/t", OURS))]
-    pair.flush()
-    assert pair.look() == []
-    assert pair.mirror.registrations.state() == pair.master.registrations.state()
-
-
 def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
     pair.flush()

@@ -87,19 +87,6 @@ async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: Raw
         assert said.messages == [b"\x03\x00\x00\x00one", b"\x00\x00\x00\x00"]
 
 
-async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
-    said = Said(publisher.uri)
-    link, _ = await publisher.serve()
-    payloads = [bytes([n]) * 1_000_000 for n in range(5)]
-    for payload in payloads:
-        await link.send(frame_message(payload))
-    await until(lambda: len(said.messages) == 5)
-    assert [m[4:] for m in said.messages] == payloads
-    connection = said.link.connection()
-    assert (connection.messages, connection.bytes, connection.connected) == (5, 5_000_020, True)
-    assert (connection.direction, connection.other) == ("i", publisher.uri)
-
-
 @pytest.mark.trap(14, 17)
 async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)

@@ -3,142 +3,73 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros.wire.slave_api import BusConnection, BusLink, bus_info, read_bus_info
-from rmpa.ros.wire.xmlrpc import parse_response
 
 if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-# Each library with a publisher and a subscriber: ten messages of 80 bytes with their length, which all others heard.
-ROSPY_TALKER_INFO = b"""<?xml version='1.0'?>
-<methodResponse>
-<params>
-<param>
-<value><array><data>
-<value><int>1</int></value>
-<value><string>bus info</string></value>
-<value><array><data>
-<value><array><data>
-<value><int>1</int></value>
-<value><string>/rosout</string></value>
-<value><string>o</string></value>
-<value><string>TCPROS</string></value>
-<value><string>/rosout</string></value>
-<value><boolean>1</boolean></value>
-<value><string>TCPROS connection on port 43063 to [127.0.0.1:33964 on socket 8]</string></value>
-</data></array></value>
-<value><array><data>
-<value><int>3</int></value>
-<value><string>/cpp_listener</string></value>
-<value><string>o</string></value>
-<value><string>TCPROS</string></value>
-<value><string>/chatter</string></value>
-<value><boolean>1</boolean></value>
-<value><string>TCPROS connection on port 43063 to [127.0.0.1:33980 on socket 11]</string></value>
-</data></array></value>
-</data></array></value>
-</data></array></value>
-</param>
-</params>
-</methodResponse>
-"""
-ROSCPP_TALKER_INFO = (
-    b'<?xml version="1.0"?>\n<methodResponse><params><param>\n\t'
-    b"<value><array><data><value><i4>1</i4></value><value></value><value><array><data>"
-    b"<value><array><data><value><i4>0</i4></value><value>/rosout</value><value>o</value><value>TCPROS</value>"
-    b"<value>/rosout</value><value><boolean>1</boolean></value>"
-    b"<value>TCPROS connection on port 52309 to [127.0.0.1:34730 on socket 10]</value></data></array></value>"
-    b"<value><array><data><value><i4>1</i4></value><value>/py_listener</value><value>o</value><value>TCPROS</value>"
-    b"<value>/chatter</value><value><boolean>1</boolean></value>"
-    b"<value>TCPROS connection on port 52309 to [127.0.0.1:34736 on socket 11]</value></data></array></value>"
-    b"</data></array></value></data></array></value>\n</param></params></methodResponse>\n"
-)
-# The others as they are parsed.
-ROSPY_LISTENER_INFO: XmlRpcValue = [
-    *(1, "bus info"),
-    [
-        [
-            1,
-            "/rosout",
-            "o",
-            "TCPROS",
-            "/rosout",
-            True,
-            "TCPROS connection on port 39855 to [127.0.0.1:48826 on socket 9]",
-        ],
-        [
-            *(2, "http://127.0.0.1:36171/", "i", "TCPROS", "/chatter", True),
-            "TCPROS connection on port 34736 to [127.0.0.1:52309 on socket None]",
-        ],
-    ],
-]
-ROSCPP_LISTENER_INFO: XmlRpcValue = [
-    *(1, ""),
-    [
-        [
-            *(1, "http://127.0.0.1:36171/", "i", "TCPROS", "/chatter", True),
-            "TCPROS connection on port 34738 to [127.0.0.1:52309 on socket 13]",
-        ],
-    ],
-]
-OURS_INFO: XmlRpcValue = [
-    *(1, "bus info"),
-    [
-        [
-            *(4, "http://127.0.0.1:36171/", "i", "TCPROS", "/rosout", True),
-            "TCPROS connection on port 34730 to [127.0.0.1:52309]",
-        ]
-    ],
-]
+TALKER: Final = "http://127.0.0.1:36171/"
 
 
-@pytest.mark.parametrize(
-    ("answer", "links"),
-    [
-        pytest.param(
-            parse_response(ROSPY_TALKER_INFO),
-            [
-                BusLink(1, "/rosout", False, "/rosout", True, 43063, ("127.0.0.1", 33964)),
-                BusLink(3, "/cpp_listener", False, "/chatter", True, 43063, ("127.0.0.1", 33980)),
-            ],
-            id="rospy, publisher",
-        ),
-        pytest.param(
-            parse_response(ROSCPP_TALKER_INFO),
-            [
-                BusLink(0, "/rosout", False, "/rosout", True, 52309, ("127.0.0.1", 34730)),
-                BusLink(1, "/py_listener", False, "/chatter", True, 52309, ("127.0.0.1", 34736)),
-            ],
-            id="roscpp, publisher",
-        ),
-        pytest.param(
-            ROSPY_LISTENER_INFO,
-            [
-                BusLink(1, "/rosout", False, "/rosout", True, 39855, ("127.0.0.1", 48826)),
-                BusLink(2, "http://127.0.0.1:36171/", True, "/chatter", True, 34736, ("127.0.0.1", 52309)),
-            ],
-            id="rospy, subscriber",
-        ),
-        pytest.param(
-            ROSCPP_LISTENER_INFO,
-            [BusLink(1, "http://127.0.0.1:36171/", True, "/chatter", True, 34738, ("127.0.0.1", 52309))],
-            id="roscpp, subscriber",
-        ),
-        pytest.param(
-            OURS_INFO,
-            [BusLink(4, "http://127.0.0.1:36171/", True, "/rosout", True, 34730, ("127.0.0.1", 52309))],
-            id="an agent",
-        ),
-    ],
-)
-def test_the_connections_of_each_library_are_read(answer: XmlRpcValue, links: list[BusLink]) -> None:
-    assert read_bus_info(answer) == links
+def connection(port: int, to: int, behind: str = "") -> str:
+    """The text that all libraries write of a connection."""
+    return f"TCPROS connection on port {port} to [127.0.0.1:{to}{behind}]"
+
+
+# Each library with a publisher and a subscriber, as its answer is parsed, and where it is connected.
+ANSWERS: Final[dict[str, tuple[str, list[list[XmlRpcValue]], list[tuple[int, int]]]]] = {
+    "rospy, publisher": (
+        "bus info",
+        [
+            [1, "/rosout", "o", "TCPROS", "/rosout", True, connection(43063, 33964, " on socket 8")],
+            [3, "/cpp_listener", "o", "TCPROS", "/chatter", True, connection(43063, 33980, " on socket 11")],
+        ],
+        [(43063, 33964), (43063, 33980)],
+    ),
+    "roscpp, publisher": (
+        "",
+        [
+            [0, "/rosout", "o", "TCPROS", "/rosout", True, connection(52309, 34730, " on socket 10")],
+            [1, "/py_listener", "o", "TCPROS", "/chatter", True, connection(52309, 34736, " on socket 11")],
+        ],
+        [(52309, 34730), (52309, 34736)],
+    ),
+    "rospy, subscriber": (
+        "bus info",
+        [
+            [1, "/rosout", "o", "TCPROS", "/rosout", True, connection(39855, 48826, " on socket 9")],
+            [2, TALKER, "i", "TCPROS", "/chatter", True, connection(34736, 52309, " on socket None")],
+        ],
+        [(39855, 48826), (34736, 52309)],
+    ),
+    "roscpp, subscriber": (
+        "",
+        [[1, TALKER, "i", "TCPROS", "/chatter", True, connection(34738, 52309, " on socket 13")]],
+        [(34738, 52309)],
+    ),
+    "an agent": (
+        "bus info",
+        [[4, TALKER, "i", "TCPROS", "/rosout", True, connection(34730, 52309)]],
+        [(34730, 52309)],
+    ),
+}
+
+
+@pytest.mark.parametrize(("status", "rows", "ports"), ANSWERS.values(), ids=ANSWERS)
+def test_the_connections_of_each_library_are_read(
+    status: str, rows: list[list[XmlRpcValue]], ports: list[tuple[int, int]]
+) -> None:
+    found = read_bus_info([1, status, [*rows]])
+    assert [(link.local_port, link.remote) for link in found] == [(own, ("127.0.0.1", to)) for own, to in ports]
+    for link, (number, other, direction, _, topic, connected, _) in zip(found, rows, strict=True):
+        assert (link.number, link.other, link.inbound) == (number, other, direction == "i")
+        assert (link.topic, link.connected) == (topic, connected)
 
 
 def test_a_node_of_ours_is_read_too() -> None:

@@ -413,16 +413,6 @@ def test_a_frame_that_does_not_hold_one_message_breaks_the_protocol(payload: byt
     assert inlet.got == []
 
 
-def test_rest_of_a_dropped_message_is_dropped() -> None:
-    inlet = Inlet()
-    inlet.flow.part(1, 0, LAST, memoryview(b"c"))
-    inlet.flow.part(1, 0, ABORT | LAST, memoryview(b""))
-    inlet.message(5)
-    inlet.parts(3, bytes(BIG), 100, 200)
-    assert inlet.outlet.parts == 0
-    assert inlet.got == [b""]
-
-
 @pytest.mark.parametrize("cut", [4, 100])
 def test_aborted_message_disconnects_its_subscribers(cut: int) -> None:
     inlet = Inlet()

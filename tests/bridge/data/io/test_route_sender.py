@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
-from rmpa.core.contract import Contract, History, Priority, Reliability
+from rmpa.core.contract import Contract, History, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime import limits as runtime_limits
@@ -227,14 +227,6 @@ def test_parts_go_as_they_come_once_the_lane_is_right() -> None:
     assert link.sent[-1][2][-1:] == b"z"
 
 
-def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
-    link, flow = Link(), ExportFlow()
-    flow.add(1, link, 7, Contract(priority=Priority.HIGH), 0)
-    flow.begin(BIG)
-    flow.part(memoryview(bytes(BIG)))
-    assert link.lanes == ["express"]
-
-
 def test_aborted_message_uses_its_number() -> None:
     link, flow = Link(), ExportFlow()
     flow.large = True
@@ -332,34 +324,6 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 # --- reliable -------------------------------------------------------------------------------------------------
 
 
-def test_acknowledgements_move_the_window(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
-    link, sender = fresh(reliable)
-    for n in range(10):
-        assert sender.message(n, bytes([n])) == 0
-    assert link.numbers == [1, 2, 3, 4]
-    sender.acknowledged(2)
-    assert link.numbers == [1, 2, 3, 4, 5, 6]
-    sender.acknowledged(6)
-    sender.acknowledged(10)
-    assert [payload[0] for _, _, payload in link.sent] == list(range(10))
-    assert link.stamps == list(range(10))
-    assert sender.sender.idle
-    assert clock.due == [], "TCP repeats; no timer of ours does"
-
-
-def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 2)
-    link, sender = fresh(reliable, Contract(reliability=Reliability.RELIABLE, depth=5))
-    lost = [sender.message(0, bytes([n])) for n in range(9)]
-    # 1 and 2 are under way: to drop them frees no place that is known to be lost.
-    assert sum(lost) == 2
-    sender.acknowledged(2)
-    sender.acknowledged(6)
-    sender.acknowledged(8)
-    assert link.numbers == [1, 2, 5, 6, 7, 8, 9]
-
-
 def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     link, sender = fresh(reliable)
     sender.message(0, LARGE)
@@ -381,27 +345,6 @@ def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
     sender.message(0, SMALL)
     with pytest.raises(RemoteProtocolError):
         sender.acknowledged(2)
-
-
-@pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
-    new, (old, sender) = Link(), fresh(reliable)
-    for n in range(3):
-        sender.message(0, bytes([n]))
-    sender.suspend()
-    sender.message(0, bytes([3]))
-    sender.message(0, LARGE)
-    assert len(old.sent) == 3
-    sender.acknowledged(2)  # what still came over the old link, behind the end
-    sender.resume(new, 9, after)
-    assert new.numbers == list(range(after + 1, 5))
-    assert set(new.routes) <= {9}
-    assert list(new.fences) == [("express", 1)], "the large one"
-    answer(new, sender)
-    assert new.sent[-1] == ("bulk", 5, LARGE)
-    assert new.numbers == list(range(after + 1, 6))
-    assert 9 in new.express.terms
-    assert 9 in new.bulk.terms
 
 
 def test_later_acknowledgement_outweighs_the_position() -> None:

@@ -249,25 +249,6 @@ def test_what_a_sender_says_that_it_has_given_up_is_lost(
     play(scene)
 
 
-def test_after_a_new_numbering_messages_may_be_lost_and_the_count_goes_on() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        flow = proxied.describe(SURE, epoch=5)
-        flow.message(1, 0, framed("one"))
-        flow.message(4, 0, framed("four"))
-        proxied.topics.retract(CMD)
-        await asyncio.sleep(1.0)
-        await proxied.publish()
-        new = proxied.describe(SURE, route=2, epoch=6)
-        assert new is not flow
-        assert (lost(new), proxied.kinds()) == (
-            2,
-            [QosEventKind.MESSAGES_LOST, QosEventKind.LOSS_UNKNOWN],
-        )
-
-    play(scene)
-
-
 def test_another_run_of_the_agent_is_told_what_it_cannot_know() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
@@ -317,30 +298,6 @@ def test_a_changed_contract_makes_a_new_flow() -> None:
         new.message(1, 0, framed("two"))
         assert listener.texts == ["one", "two"]
         assert (lost(new), proxied.kinds()) == (0, [QosEventKind.LOSS_UNKNOWN])
-
-    play(scene)
-
-
-@pytest.mark.parametrize("how", ["detach", "retract"])
-def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
-    async def scene(proxied: Proxied) -> None:
-        publication = await proxied.publish()
-        flow = proxied.describe(SURE, epoch=5, latching=True)
-        flow.message(1, 0, framed("one"))
-        proxied.topics.link_down()
-        proxied.topics.detach(CMD, 1, keep=True)
-        if how == "detach":
-            proxied.topics.detach(CMD, 0)
-            assert publication.latched == ()
-        else:
-            proxied.topics.retract(CMD)
-        # A source that leaves the graph while its peer is away is still missed.
-        _, missed_at = proxied.topics.pasts.get(CMD, (None, ""))
-        assert missed_at == ("/cmd" if how == "retract" else "")
-        assert proxied.topics.position(CMD) is None
-        assert proxied.topics.flow(CMD) is None
-        await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
-        assert proxied.acks == []
 
     play(scene)
 
