@@ -12,13 +12,13 @@ from rmpa.ros.core import liveness
 from rmpa.ros.core import liveness as identify
 from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.node.subscription import Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+from tests.ros.core.slaves import Slave
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
@@ -32,51 +32,6 @@ STRING: Final = "std_msgs/String"
 def waiting(core: RosCore) -> int:
     """Notifications in the queues."""
     return sum(map(len, core._notifier._queues.values()))
-
-
-class Slave:
-    """A slave API that records what it is called with; it can be slow, and can have a name or none."""
-
-    def __init__(self, name: str | None = None) -> None:
-        self.name = name
-        self.calls: list[tuple[str, list[XmlRpcValue]]] = []
-        self.go = asyncio.Event()
-        self.go.set()
-        self.at_once = 0
-        self.most_at_once = 0
-        self._news = asyncio.Event()
-        self.server = XmlRpcServer(self._answer)
-
-    async def __aenter__(self) -> Self:
-        await self.server.start()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.go.set()
-        await self.server.close()
-
-    @property
-    def uri(self) -> str:
-        return f"http://127.0.0.1:{self.server.port}/"
-
-    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
-        if method in {"getName", "requestTopic"}:
-            if method == "getName" and self.name is not None:
-                return [1, "", self.name]
-            raise RosFault(-1, f"{method}: unknown method name")
-        self.calls.append((method, list(params)))
-        self._news.set()
-        self.at_once += 1
-        self.most_at_once = max(self.at_once, self.most_at_once)
-        await self.go.wait()
-        self.at_once -= 1
-        return [1, "", 0]
-
-    async def wait(self, wanted: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE):
-            while not wanted():
-                self._news.clear()
-                await self._news.wait()
 
 
 @pytest.fixture
@@ -131,7 +86,7 @@ async def test_failing_or_registering_listener_does_no_harm(core: RosCore, caplo
         core.on_change(fails)
         core.on_change(joins)
         core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
-        await slave.wait(lambda: bool(slave.calls))
+        await until(lambda: bool(slave.calls))
         # The last list that a subscriber hears is the one with both.
         assert slave.calls[-1] == (
             "publisherUpdate",
@@ -149,11 +104,11 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
             core.call("registerSubscriber", name, "/t", STRING, slave.uri)
         for number in range(1, 6):
             await call(core.uri, "registerPublisher", f"/p{number}", "/t", STRING, f"http://127.0.0.1:{number}/")
-        await quick.wait(lambda: bool(quick.calls) and len(quick.calls[-1][1][2]) == 5)  # type: ignore[arg-type]
-        await slow.wait(lambda: bool(slow.calls))
+        await until(lambda: bool(quick.calls) and len(quick.calls[-1][1][2]) == 5)  # type: ignore[arg-type]
+        await until(lambda: bool(slow.calls))
         assert len(slow.calls) == 1
         slow.go.set()
-        await slow.wait(lambda: len(slow.calls) == 2)
+        await until(lambda: len(slow.calls) == 2)
         assert slow.calls[-1][1][2] == [f"http://127.0.0.1:{number}/" for number in range(1, 6)]
         assert slow.most_at_once == 1
 
@@ -164,7 +119,7 @@ async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.
         slave.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
         core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
-        await slave.wait(lambda: len(slave.calls) >= 2)
+        await until(lambda: len(slave.calls) >= 2)
         slave.go.set()
         await until(lambda: core.counters["notify.sent"] == 1)
         await until(lambda: waiting(core) == 0)
@@ -184,7 +139,7 @@ async def test_parameter_updates_are_in_order(core: RosCore) -> None:
         for number in range(20):
             core.call("setParam", "/x", "/p", number)
         slave.go.set()
-        await slave.wait(lambda: len(slave.calls) == 20)
+        await until(lambda: len(slave.calls) == 20)
         assert [params[2] for _, params in slave.calls] == list(range(20))
 
 
@@ -204,7 +159,7 @@ async def test_a_twin_pushes_the_older_node_out(core: RosCore) -> None:
     async with Slave("/twin") as old:
         core.call("registerPublisher", "/twin", "/t", STRING, old.uri)
         core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
-        await old.wait(lambda: bool(old.calls))
+        await until(lambda: bool(old.calls))
         assert old.calls == [
             ("shutdown", ["/master", "[/twin] Reason: new node registered with same name"]),
         ]
@@ -220,7 +175,7 @@ async def test_another_node_at_a_stale_uri_is_not_shut_down(core: RosCore) -> No
 
 
 async def test_unnamed_registered_node_is_not_shut_down(core: RosCore) -> None:
-    async with Slave(None) as roscpp:
+    async with Slave() as roscpp:
         core.call("registerPublisher", "/twin", "/t", STRING, roscpp.uri)
         core.call("registerPublisher", "/innocent", "/u", STRING, roscpp.uri)
         core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
@@ -229,10 +184,10 @@ async def test_unnamed_registered_node_is_not_shut_down(core: RosCore) -> None:
 
 
 async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> None:
-    async with Slave(None) as roscpp:
+    async with Slave() as roscpp:
         core.call("registerPublisher", "/twin", "/t", STRING, roscpp.uri)
         core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
-        await roscpp.wait(lambda: bool(roscpp.calls))
+        await until(lambda: bool(roscpp.calls))
         assert roscpp.calls[0][0] == "shutdown"
 
 
@@ -261,7 +216,7 @@ async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: 
         core.suspect("/dead")
         core.suspect("/dead")
         core.suspect("/nobody")
-        await subscriber.wait(lambda: bool(subscriber.calls))
+        await until(lambda: bool(subscriber.calls))
         assert subscriber.calls == [("publisherUpdate", ["/master", "/t", []])]
         assert core.state().nodes == {"/s": subscriber.uri}
         assert core.counters["node.dead"] == 1
@@ -269,7 +224,7 @@ async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: 
 
 def lists_of(slave: Slave) -> list[XmlRpcValue]:
     """The lists of publishers that a slave was told."""
-    return [params[2] for method, params in slave.calls if method == "publisherUpdate"]
+    return [publishers for _, publishers in slave.updates]
 
 
 @pytest.mark.trap(16)
@@ -280,11 +235,11 @@ async def test_a_publisher_that_is_soon_back_is_told_twice(core: RosCore, monkey
     async with Slave() as subscriber:
         core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
         core.call("registerPublisher", "/p", "/t", STRING, uri)
-        await subscriber.wait(lambda: lists_of(subscriber) == [[uri]])
+        await until(lambda: lists_of(subscriber) == [[uri]])
         core.call("unregisterPublisher", "/p", "/t", uri)
-        await subscriber.wait(lambda: lists_of(subscriber) == [[uri], []])
+        await until(lambda: lists_of(subscriber) == [[uri], []])
         core.call("registerPublisher", "/p", "/t", STRING, uri)
-        await subscriber.wait(lambda: lists_of(subscriber) == [[uri], [], [uri], [uri]])
+        await until(lambda: lists_of(subscriber) == [[uri], [], [uri], [uri]])
 
 
 async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +254,7 @@ async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkey
         core.call("registerPublisher", "/q", "/u", STRING, uri)
         core.call("registerSubscriber", "/s", "/u", STRING, subscriber.uri)
         core.call("registerPublisher", "/r", "/u", STRING, "http://127.0.0.1:2/")
-        await subscriber.wait(lambda: len(subscriber.calls) == 2)
+        await until(lambda: len(subscriber.calls) == 2)
         assert lists_of(subscriber)[0] == [uri]
         assert core._returned._timer is None
 
@@ -511,7 +466,7 @@ async def test_services_are_looked_up_at_once_whatever_else_waits(core: RosCore)
         stopped.go.clear()
         core.call("registerSubscriber", "/s", "/t", STRING, stopped.uri)
         core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
-        await stopped.wait(lambda: bool(stopped.calls))
+        await until(lambda: bool(stopped.calls))
         await call(core.uri, "registerService", "/p", "/add", "rosrpc://127.0.0.1:5/", "http://127.0.0.1:1/")
         assert (await call_api(core.uri, "lookupService", "/c", "/add"))[::2] == (1, "rosrpc://127.0.0.1:5/")
         assert (await call_api(core.uri, "lookupService", "/c", "/none"))[::2] == (-1, "")
@@ -524,6 +479,6 @@ async def test_no_connection_to_a_node_is_kept_open(core: RosCore) -> None:
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
         for number in range(1, 9):
             core.call("registerPublisher", f"/p{number}", "/t", STRING, f"http://127.0.0.1:{number}/")
-            await slave.wait(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
+            await until(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
         await until(lambda: core.counters["notify.sent"] == 8)
         await until(lambda: not slave.server._connections)

@@ -9,7 +9,7 @@ import os
 import threading
 from contextlib import asynccontextmanager
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import pytest
@@ -23,10 +23,10 @@ from rmpa.ros.core import state
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.state import StoredState, parse, serialize
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
-from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, legal_text, response_pieces
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, legal_text, response_pieces
+from tests.ros.core.slaves import Slave
 from tests.ros.node.peers import DEADLINE, until
 
 if TYPE_CHECKING:
@@ -34,61 +34,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 STRING: Final = "std_msgs/String"
-
-
-class Slave:
-    """A node's slave API as rospy has it; without a name as a roscpp node that publishes nothing has it."""
-
-    def __init__(self, name: str = "") -> None:
-        self.name = name
-        self.publications: list[list[str]] = []
-        self.subscriptions: list[list[str]] = []
-        self.updates: list[tuple[str, list[str]]] = []
-        self.asked = 0
-        self.lists = 0
-        self.error = False
-        """Whether it refuses to say what it has, as a client library without these methods."""
-        self.go = asyncio.Event()
-        self.go.set()
-        self.server = XmlRpcServer(self._answer)
-
-    async def __aenter__(self) -> Self:
-        await self.server.start()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.go.set()
-        await self.server.close()
-
-    @property
-    def uri(self) -> str:
-        return f"http://127.0.0.1:{self.server.port}/"
-
-    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
-        self.asked += 1
-        await self.go.wait()
-        match method, params:
-            case "getName", _ if self.name:
-                return [1, "", self.name]
-            case (("getPublications" | "getSubscriptions"), _) if self.error:
-                self.lists += 1
-                return [-1, "not implemented", []]
-            case "getPublications", _:
-                return [1, "", self.publications]
-            case "getSubscriptions", _:
-                return [1, "", self.subscriptions]
-            case "publisherUpdate", (_, str(topic), list(publishers)):
-                self.updates.append((topic, [str(uri) for uri in publishers]))
-                return [1, "", 0]
-        raise RosFault(-1, f"{method}: unknown method name")
-
-    async def publish(self, core: RosCore, topic: str) -> None:
-        self.publications.append([topic, STRING])
-        await call(core.uri, "registerPublisher", self.name or "/nameless", topic, STRING, self.uri)
-
-    async def subscribe(self, core: RosCore, topic: str) -> None:
-        self.subscriptions.append([topic, STRING])
-        await call(core.uri, "registerSubscriber", self.name or "/nameless", topic, STRING, self.uri)
 
 
 @pytest.fixture
@@ -129,7 +74,7 @@ async def test_running_nodes_are_restored_and_notified(path: Path) -> None:
             await call(core.uri, "subscribeParam", "/hearer", hearer.uri, "/speed")
             await until(lambda: saved(core))
             run_id = core.call("getParam", "/x", "/run_id").value
-        hearer.updates.clear()
+        hearer.calls.clear()
         async with running(path) as core:
             await until(lambda: names(core) == {"/talker", "/hearer"})
             assert core.state().publishers == {"/chatter": {"/talker": talker.uri}}
@@ -357,7 +302,7 @@ async def test_hanging_node_delays_the_start_by_the_bound_and_is_registered_when
             await answers.publish(core, "/a")
             await hearer.subscribe(core, "/a")
         hangs.go.clear()
-        hearer.updates.clear()
+        hearer.calls.clear()
         async with running(path) as core:
             assert names(core) == {"/answers", "/hearer"}
             assert core.restored().endswith("2 of 3 nodes of the run before are taken up, /hangs did not answer")
