@@ -24,10 +24,10 @@ NAMES = st.from_regex(r"(/[a-c]{1,2}){1,4}", fullmatch=True)
 
 def test_every_peer_may_have_its_names_below_its_own_but_those_that_a_rule_names() -> None:
     names = Names(Settings(prefix_peers=True, peers=(PeerRule("pc", remap_in=(("/**", "/**"),)), ROBOT)).naming)
-    assert names.local_name("arm", "/odom") == "/arm/odom"
-    assert names.wire_name("arm", "/arm/goal") == "/goal"
-    assert names.local_name("pc", "/cmd_vel") == "/cmd_vel"
-    assert names.local_name("robot1", "/tf") == "/tf"
+    assert names.of("arm").local_name("/odom") == "/arm/odom"
+    assert names.of("arm").wire_name("/arm/goal") == "/goal"
+    assert names.of("pc").local_name("/cmd_vel") == "/cmd_vel"
+    assert names.of("robot1").local_name("/tf") == "/tf"
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_every_peer_may_have_its_names_below_its_own_but_those_that_a_rule_names
     ],
 )
 def test_their_names_here(wire: str, local: str) -> None:
-    assert Names((ROBOT,)).local_name("robot1", wire) == local
+    assert Names((ROBOT,)).of("robot1").local_name(wire) == local
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_their_names_here(wire: str, local: str) -> None:
     ],
 )
 def test_our_names_there(local: str, wire: str) -> None:
-    assert Names((ROBOT,)).wire_name("robot1", local) == wire
+    assert Names((ROBOT,)).of("robot1").wire_name(local) == wire
 
 
 def test_a_name_is_renamed_once() -> None:
@@ -79,8 +79,8 @@ def test_rules_of_several_tables_apply_in_order_and_others_not_at_all() -> None:
         PeerRule("*", "/{peer}", (("/a", "/z"), ("/b", "/z2"))),
     )
     names = Names(rules)
-    assert [names.local_name("p1", name) for name in ("/a", "/b", "/c")] == ["/x", "/z2", "/p1/c"]
-    assert [names.local_name("q", name) for name in ("/a", "/b", "/c")] == ["/y", "/z2", "/q/c"]
+    assert [names.of("p1").local_name(name) for name in ("/a", "/b", "/c")] == ["/x", "/z2", "/p1/c"]
+    assert [names.of("q").local_name(name) for name in ("/a", "/b", "/c")] == ["/y", "/z2", "/q/c"]
 
 
 def test_without_rules_for_it_a_peer_is_plain() -> None:

@@ -432,9 +432,9 @@ class World:
         far, near = (Side(*rules) for rules in self.rules)
         found = set()
         for source in self.local:
-            wire = far.names.wire_name("p", source.topic)
+            wire = far.names.of("p").wire_name(source.topic)
             if far.policy.judge_for("p", source.topic, TYPE, wire).allowed:
-                topic = near.names.local_name("p", wire)
+                topic = near.names.of("p").local_name(wire)
                 if near.policy.judge_for("p", topic, TYPE, wire).allowed:
                     found.add((topic, source.node))
         return found

@@ -98,14 +98,6 @@ class Names:
     def __init__(self, rules: tuple[PeerRule, ...] = ()) -> None:
         self.of = lru_cache(config_limits.NAMES_REMEMBERED)(lambda peer: PeerNames(peer, rules))
 
-    def local_name(self, peer: str, wire: str) -> str:
-        """The local name of a peer's topic or service."""
-        return self.of(peer).local_name(wire)
-
-    def wire_name(self, peer: str, local: str) -> str:
-        """The wire name of a local topic or service for a peer."""
-        return self.of(peer).wire_name(local)
-
 
 def _filled(renaming: tuple[str, str], peer: str) -> tuple[str, str]:
     source, target = renaming

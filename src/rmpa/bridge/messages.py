@@ -164,11 +164,6 @@ class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
     epoch: Sequence = 0
     after: Sequence = 0
 
-    @property
-    def source(self) -> Source:
-        """The requested source."""
-        return Source(self.topic, self.node)
-
 
 class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     """The route is open; data follows.
@@ -222,11 +217,6 @@ class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
     node: Name
     subscriber: Text
     text: Text
-
-    @property
-    def source(self) -> Source:
-        """The source that did not fit."""
-        return Source(self.topic, self.node)
 
 
 class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):

@@ -153,7 +153,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         if origin is not None and not may_have(told.instance, origin):
             return PolicyDecision(False, f"it comes from {told.name}")
         name = self.name_of(key)
-        wire = context.names.wire_name(told.name, name)
+        wire = context.names.of(told.name).wire_name(name)
         if not is_crossing_name(wire):
             return PolicyDecision(False, f"its name there would be {wire!r}")
         decision = context.policy.judge_for(told.name, name, local.type, wire)
@@ -167,7 +167,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
             return None
         decision = self.judge_for(told, key, local)
         if decision.allowed:
-            return self.offer_for(key, local, context.names.wire_name(told.name, name))
+            return self.offer_for(key, local, context.names.of(told.name).wire_name(name))
         if isinstance(decision, PermissionDecision):
             context.gate.refused(self.access, told.name, name, decision)
         return None
@@ -262,7 +262,7 @@ class OfferBook(ABC, Generic[KeyT, LocalT, OfferT]):
         # Judged anew: after new rules the peer is told a little later.
         if local is None or not self.judge_for(told, key, local).allowed:
             return None
-        name = self._out.context.names.wire_name(told.name, self.name_of(key))
+        name = self._out.context.names.of(told.name).wire_name(self.name_of(key))
         return key if wire_of(self.offer_for(key, local, name)) == wire else None
 
     def decision(self, peer: int, key: KeyT) -> PolicyDecision | PermissionDecision | None:

@@ -290,7 +290,7 @@ class ImportBook(ABC, Generic[KeyT, EntryT, OfferT]):
     def name_here(self, peer: int, wire: str, origin: Origin | None) -> str:
         """The name here of a topic or service, by the rules for its own module, not by those for the relay."""
         module = self._peers[peer].name if origin is None else origin.name
-        return self._out.context.names.local_name(module, wire)
+        return self._out.context.names.of(module).local_name(wire)
 
     def _speaker(self, entry: EntryT) -> tuple[str, str]:
         """The module that permissions are asked for, and the peer that relays its entry, or empty."""

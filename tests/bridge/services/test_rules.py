@@ -49,9 +49,9 @@ def test_each_decision_names_its_rule(
 def test_rules_of_one_peer_come_on_top() -> None:
     peers = (PeerRule("robot*", prefix="/robot1", policy=PolicySettings(deny=("/robot1/stop",))),)
     names, policy = Names(peers), Policy(PolicySettings(), peers)
-    assert names.local_name("robot_7", "/stop") == "/robot1/stop"
-    assert names.wire_name("robot_7", "/robot1/go") == "/go"
-    assert names.local_name("base", "/stop") == "/stop"
+    assert names.of("robot_7").local_name("/stop") == "/robot1/stop"
+    assert names.of("robot_7").wire_name("/robot1/go") == "/go"
+    assert names.of("base").local_name("/stop") == "/stop"
     assert not policy.judge_for("robot_7", "/robot1/stop", wire="/stop").allowed
     assert policy.judge_for("base", "/robot1/stop", wire="/robot1/stop").allowed
 

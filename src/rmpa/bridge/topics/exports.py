@@ -227,14 +227,15 @@ class Exports(OfferBook[Source, LocalSource, TopicOffer]):
         if number in routes:
             self._out.warn("route.doubled", str(peer), f"a peer opens route {number} twice; the second is ignored")
             return
-        source = self.local(peer, message.source)
+        asked = Source(message.topic, message.node)
+        source = self.local(peer, asked)
         flow = self._flows.get(source) if source is not None else None
         before = flow.routes.get(peer) if flow is not None else None
         if len(routes) >= limit:
             why = f"more topics are open on one link than limits.topics = {limit} over there"
         elif source is None:
-            self._asked_in_vain(peer, message.source.topic)
-            why = f"{message.source}: not published here, or policy keeps it home"
+            self._asked_in_vain(peer, asked.topic)
+            why = f"{asked}: not published here, or policy keeps it home"
         elif before is not None and before.number:
             # One copy for each peer: otherwise a peer could multiply the traffic of this module at will.
             why = f"{source} is open on another route of this link"

@@ -354,7 +354,7 @@ class Mismatches:
 
     def reported(self, peer: int, name: str, message: Mismatch) -> None:
         """A peer reports that a subscriber there does not fit a local source; an empty text: that it fits now."""
-        source = self._exports.local(peer, message.source)
+        source = self._exports.local(peer, Source(message.topic, message.node))
         if source is None:
             return  # it went meanwhile
         subscriber = f"{name}{message.subscriber}"

@@ -298,7 +298,7 @@ class WhyService:
             no_link = Check("link", FAIL, f"there is no link to {to} that could be asked", remedy)
             stages = begin if begin[-1].level is FAIL else (*begin, no_link)
             return (Diagnosis.of(stages, name=topic, peer=self._name, to=to),)
-        question = {"topic": self._bridge.context.names.wire_name(to, topic)}
+        question = {"topic": self._bridge.context.names.of(to).wire_name(topic)}
         try:
             # Its time window, and at most two requests to this agent of ASK_TIMEOUT each.
             found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], 12.0)
@@ -310,7 +310,7 @@ class WhyService:
             return (Diagnosis.of((*begin, silent), name=topic, peer=self._name, to=to),)
 
     async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        topic = self._bridge.context.names.local_name(session.link.name, _name_in(args, "topic"))
+        topic = self._bridge.context.names.of(session.link.name).local_name(_name_in(args, "topic"))
         found = await self._arrives(str(session.link.guid), topic)
         return tuple(without_rules(one) for one in found[: observe_limits.WHY_SOURCES_MAX])
 
@@ -346,7 +346,7 @@ class WhyService:
         """Which of the names of this module, of those that a peer may know, is most like one on the wire."""
         context, gate = self._bridge.context, self._bridge.gate
         allowed = (name for name in yielding_to_data(list(names)) if gate.judge(access, asker, name).allowed)
-        known = {context.names.wire_name(asker, name) for name in allowed}
+        known = {context.names.of(asker).wire_name(name) for name in allowed}
         # In a thread: comparing thousands of names takes longer than a message may wait.
         return await asyncio.to_thread(did_you_mean, wire, known) or ""
 
