@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway.ros2.format import Ros2Attachment
 from rmpa.gateway.sites.keys import AttachmentReader, MessageSource
-from rmpa.gateway.sites.services import read_description, write_description
+from rmpa.gateway.sites.services import read_description
 from rmpa.ros.wire.tcpros import ServiceDescription
 
 _MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -16,7 +18,7 @@ SEEDS: list[bytes] = [
     MessageSource(_MD5, "/talker", ("warehouse",), latched=True).writer()(1, 2**40),
     MessageSource(_MD5, "/ns/node", ("a", "b", "c")).writer()(2**63, 0),
     MessageSource(_MD5, "/talker", ("yard",), run=7).writer()(5, 0),
-    write_description(ServiceDescription("std_srvs/Trigger", _MD5)),
+    msgspec.json.encode(ServiceDescription("std_srvs/Trigger", _MD5)),
     b"{}",
 ]
 

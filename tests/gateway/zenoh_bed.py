@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode
+from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import OpenSession, open_session
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class ZenohBed:
 
     async def start_router(self) -> OpenSession:
         """Open the router, or open it again after ``stop_router``."""
-        self.router = await open_session(ZenohConfig(ZenohMode.ROUTER, listen=(self.endpoint,)))
+        self.router = await open_session(ZenohConfig("router", listen=(self.endpoint,)))
         return self.router
 
     async def stop_router(self) -> None:

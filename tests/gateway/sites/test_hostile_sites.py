@@ -26,7 +26,7 @@ from rmpa.gateway.sites.keys import (
     TopicHeader,
     parse_token,
 )
-from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, to_json
+from rmpa.gateway.sites.params import ParamAnswer, ParamQuestion, from_json, read_text_about, to_json
 from rmpa.gateway.sites.plans import SiteImports
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ BOMBS = [
     "parse",
     [
         ParamQuestion.parse,
-        ParamAnswer.parse,
+        lambda data: read_text_about(data, ParamAnswer),
         TopicHeader.parse,
         parse_ways,
         lambda d: to_json(from_json(d)),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh.config import ZenohConfig, ZenohMode
+from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import open_session
 from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import bed, free_port, until
@@ -188,7 +188,7 @@ async def test_a_session_that_cannot_be_opened_says_where_why_and_what_to_do() -
     assert "cargo" not in str(refused.value)
     async with bed() as net:
         with pytest.raises(StartError, match=r"Address already in use.*; choose another --listen"):
-            await open_session(ZenohConfig(ZenohMode.ROUTER, listen=(net.endpoint,)))
+            await open_session(ZenohConfig("router", listen=(net.endpoint,)))
 
 
 async def test_a_key_that_zenoh_does_not_allow_is_refused_at_once() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -23,7 +23,7 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ACCESS, CrossingRules, SourceKind
-from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway
+from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway, read_json
 from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 # Seconds for a question to another site's gateway.
 _SITE_ASK_TIMEOUT: Final = 5.0
 
-_T = TypeVar("_T")
+_TEXT: Final = "a text of rmpa why"
 _NEEDS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, of the site", key="rmpa/1/<site>/-gateway/why"
 )
@@ -106,7 +106,7 @@ class WhyQuestion(msgspec.Struct, kw_only=True, frozen=True):
         Raises:
             RemoteProtocolError: It is none.
         """
-        found = _parse(data, cls, limits.KEY_MAX)
+        found = read_json(data, cls, _TEXT, limits.KEY_MAX)
         if not is_global_name(found.name):
             raise RemoteProtocolError(f"{found.name[:80]!r} is not a topic, nor a service")
         return found
@@ -118,17 +118,8 @@ def parse_ways(data: Buffer) -> tuple[Diagnosis, ...]:
     Raises:
         RemoteProtocolError: It is none.
     """
-    ways = _parse(data, tuple[Diagnosis, ...], limits.SITE_WHY_MAX)
+    ways = read_json(data, tuple[Diagnosis, ...], _TEXT, limits.SITE_WHY_MAX)
     return tuple(msgspec.structs.replace(way, stages=tuple(map(_printable, way.stages))) for way in ways)
-
-
-def _parse(data: Buffer, kind: type[_T], most: int) -> _T:
-    if len(data) > most:
-        raise RemoteProtocolError(f"a text of rmpa why has {len(data)} bytes, more than {most}")
-    try:
-        return msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RemoteProtocolError(f"not a text of rmpa why: {printable(str(error))}") from None
 
 
 def _printable(stage: Check) -> Check:
@@ -495,15 +486,7 @@ class SiteAnswers:
         told = [each for each in offered if self._owns(asker, each[0].module)]
         modules = sorted({(source.module, source.instance) for source, _ in offered})
         rows = [
-            SiteSourceInfo(
-                kind=KINDS[source.kind],
-                module=source.module,
-                node=source.node,
-                name=source.name,
-                type=source.type,
-                here=source.here,
-                problem=why,
-            )
+            _source_info(source, source.module, source.here, why)
             for source, why in sorted([*told, *refused], key=lambda each: (each[0].name, each[0].module))
         ]
         return SiteInfo(
@@ -549,15 +532,13 @@ class SiteAnswers:
         for source in self._sites.catalogue.sources(module):
             entry = self._sites.imports.entry(source)
             if self._rules.tells(asker, source.kind, entry.source.name if entry is not None else source.name):
-                yield SiteSourceInfo(
-                    kind=KINDS[source.kind],
-                    module=module.name,
-                    node=source.node,
-                    name=source.name,
-                    type=source.type,
-                    here=entry.source.name if entry is not None and self._sites.leads else "",
-                    problem=refused.get(source, ""),
-                )
+                here = entry.source.name if entry is not None and self._sites.leads else ""
+                yield _source_info(source, module.name, here, refused.get(source, ""))
+
+
+def _source_info(source: MeshSource | SiteSource, module: str, here: str, problem: str) -> SiteSourceInfo:
+    names = {"module": module, "node": source.node, "name": source.name, "type": source.type, "here": here}
+    return SiteSourceInfo(kind=KINDS[source.kind], **names, problem=problem)
 
 
 def _counted(name: str, instance: str, sources: list[SiteSourceInfo]) -> SiteModuleInfo:

@@ -94,7 +94,7 @@ class SiteCatalogue:
 
     def gateways(self, site: str) -> list[SiteGateway]:
         """The gateways of another site, the leading one first."""
-        return sorted(self._sites.get(site, _NO_SITE).gateways, key=lambda each: each.order)
+        return sorted(self._sites.get(site, _NO_SITE).gateways)
 
     def modules(self, site: str) -> list[SiteModule]:
         """The modules of another site, by name."""
@@ -180,7 +180,7 @@ class SiteCatalogue:
             if len(site.gateways) < limits.SITE_MODULES_MAX:
                 site.gateways.add(gateway)
             return
-        leader = min(site.gateways, key=lambda each: each.order, default=None)
+        leader = min(site.gateways, default=None)
         site.gateways.discard(gateway)
         if gateway != leader:
             return
@@ -283,7 +283,7 @@ class Leader:
     @property
     def leader(self) -> SiteGateway:
         """The gateway that leads, or will: the least of those that are known."""
-        return min((self._own, *self._others), key=lambda each: each.order)
+        return min((self._own, *self._others))
 
     def seen(self, other: SiteGateway, now: float) -> None:
         """A gateway's token appeared; those of other sites and this gateway's own are ignored."""

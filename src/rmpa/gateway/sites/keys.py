@@ -21,7 +21,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeVar
 
 import msgspec
 
@@ -149,7 +149,28 @@ def _read(raw: bytes, at: int) -> tuple[str, int]:
 # What gateways tell of a publisher, and what follows from the numbers of its messages.
 
 
+_T = TypeVar("_T")
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+def read_json(data: Buffer, kind: type[_T], what: str, most: int) -> _T:
+    """Read a text of another gateway; unknown keys are ignored.
+
+    Args:
+        data: The text, JSON.
+        kind: Its type.
+        what: The same for errors, such as ``a text about parameters``.
+        most: The most bytes that it may have.
+
+    Raises:
+        RemoteProtocolError: It is too long, or no such text.
+    """
+    if len(data) > most:
+        raise LimitExceeded(what, len(data), most)
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RemoteProtocolError(f"not {what}: {printable(str(error))}") from None
 
 
 class TopicHeader(msgspec.Struct, frozen=True):
@@ -190,13 +211,7 @@ class TopicHeader(msgspec.Struct, frozen=True):
         Raises:
             RemoteProtocolError: It is too long, no JSON object, or type, md5 sum or a number is none.
         """
-        if len(data) > limits.HEADER_MAX:
-            raise LimitExceeded("the header of a publisher at another site", len(data), limits.HEADER_MAX)
-        try:
-            found = msgspec.json.decode(data, type=cls)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            text = printable(str(error))
-            raise RemoteProtocolError(f"not the header of a publisher at another site: {text}") from None
+        found = read_json(data, cls, "the header of a publisher at another site", limits.HEADER_MAX)
         if not is_type_name(found.type):
             raise RemoteProtocolError(f"another site names the type {found.type[:80]!r}")
         return found
@@ -349,9 +364,9 @@ class SiteSource:
         return data_key(self.module.site, self.module.name, self.kind, self.type, self.name, self.to)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, order=True)
 class SiteGateway:
-    """A gateway of a site.
+    """A gateway of a site; of those of one site the least leads.
 
     Args:
         site: The site's name.
@@ -366,11 +381,6 @@ class SiteGateway:
     def token(self) -> str:
         """The gateway's liveliness token."""
         return f"{ROOT}/{self.site}/{GATEWAY}/{self.rank:03}/{self.instance}"
-
-    @property
-    def order(self) -> tuple[int, str]:
-        """By which gateways of one site are compared: the least leads."""
-        return self.rank, self.instance
 
 
 def data_key(site: str, module: str, kind: SourceKind, type_name: str, name: str, to: str = "") -> str:

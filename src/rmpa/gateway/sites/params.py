@@ -6,7 +6,7 @@ import base64
 import time
 from datetime import datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -20,7 +20,7 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.core.identity import peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
-from rmpa.gateway.sites.keys import ROOT, MessageSource
+from rmpa.gateway.sites.keys import ROOT, MessageSource, read_json
 from rmpa.gateway.sites.services import NO_MD5, caller
 from rmpa.ros.limits import PARAM_DEPTH_MAX
 from rmpa.ros.master.parameters import leaves
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 # Questions of other sites about parameters that are answered at once.
 _SITE_PARAMS_AT_ONCE: Final = 256
 
+_T = TypeVar("_T")
 _NEEDS: Final = Needs(
     (Access.PARAM,),
     "each parameter, of the site and of the modules that ask; also by the module that has it",
@@ -65,25 +66,7 @@ GATEWAYS: Final = "-"
 OPERATIONS: Final = ("get", "names", "set", "delete")
 
 
-class _Text(msgspec.Struct, omit_defaults=True, kw_only=True):
-    """A text between two gateways."""
-
-    def serialize(self) -> bytes:
-        """As JSON."""
-        return msgspec.json.encode(self)
-
-    @classmethod
-    def parse(cls, data: Buffer) -> Self:
-        """Read one.
-
-        Raises:
-            RemoteProtocolError: It is none, or names something that is no parameter.
-        """
-        found: Self = _decode(data, cls)
-        return found
-
-
-class ParamQuestion(_Text):
+class ParamQuestion(msgspec.Struct, omit_defaults=True, kw_only=True):
     """One question of a gateway; see the module's text.
 
     Attributes:
@@ -99,9 +82,13 @@ class ParamQuestion(_Text):
     askers: tuple[str, ...] = ()
 
     @classmethod
-    def parse(cls, data: Buffer) -> Self:
-        """Of ``_Text``."""
-        found = super().parse(data)
+    def parse(cls, data: Buffer) -> ParamQuestion:
+        """Read one.
+
+        Raises:
+            RemoteProtocolError: It is none, or names something that is no parameter.
+        """
+        found = read_text_about(data, cls)
         if found.op not in OPERATIONS:
             raise RemoteProtocolError(f"{found.op[:40]!r} is no question about parameters")
         if len(found.askers) > bridge_limits.PARAM_ASKERS_MAX or any(map(peer_name_problem, found.askers)):
@@ -112,7 +99,7 @@ class ParamQuestion(_Text):
         return found
 
 
-class ParamAnswer(_Text):
+class ParamAnswer(msgspec.Struct, omit_defaults=True, kw_only=True):
     """The answer to a ``ParamQuestion``; the fields are those that its text names."""
 
     text: str = ""
@@ -120,13 +107,9 @@ class ParamAnswer(_Text):
     count: int = 0
 
 
-def _decode(data: Buffer, kind: type[Any]) -> Any:
-    if len(data) > limits.SITE_PARAM_BYTES_MAX:
-        raise RemoteProtocolError(f"a text about parameters has {len(data)} bytes")
-    try:
-        return msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RemoteProtocolError(f"not a text about parameters: {error}") from None
+def read_text_about(data: Buffer, kind: type[_T]) -> _T:
+    """Read a text about parameters; raises ``RemoteProtocolError`` if it is none."""
+    return read_json(data, kind, "a text about parameters", limits.SITE_PARAM_BYTES_MAX)
 
 
 def param_key(site: str, module: str, name: str) -> str:
@@ -205,7 +188,7 @@ def from_json(data: Buffer) -> Any:
     """
     if len(data) > bridge_limits.PARAM_TEXT_MAX:
         raise RemoteProtocolError(f"a value of {len(data)} bytes; at most {bridge_limits.PARAM_TEXT_MAX} cross")
-    value = _decode(data, object)
+    value = read_text_about(data, object)
     _check_members(value)
     return value
 
@@ -313,7 +296,7 @@ class SiteParams:
             found = await self._owner(site, module, asked)
             if asked.op == "names":
                 found = {"names": await read_text(found["text"])}
-            return ParamAnswer(**found).serialize(), b""
+            return msgspec.json.encode(ParamAnswer(**found)), b""
         if query.payload:
             text = serialize_response(from_json(query.payload)).decode()
             found = await self._owner(site, module, ParamQuestion(op="set", key=name, text=text))
@@ -364,14 +347,14 @@ class SiteParams:
         attachment = MessageSource(NO_MD5, "/rmpa", (self._context.name,)).writer()
         replies = await self._context.session.get(
             param_key(site, module, GATEWAYS),
-            question.serialize(),
+            msgspec.json.encode(question),
             attachment(1, time.time_ns()),
             timeout=limits.SITE_PARAM_TIMEOUT,
         )
         for reply in sorted(replies, key=lambda each: not each.ok):
             if not reply.ok:
                 raise PeerRefused(f"{site}/{module}", reply.payload.decode(errors="replace"))
-            answer = ParamAnswer.parse(reply.payload)
+            answer = read_text_about(reply.payload, ParamAnswer)
             if what == transfer.NAMES:
                 return {"text": await write_text("the list of parameters", list(answer.names))}
             return {"text": answer.text, "count": answer.count}

@@ -28,7 +28,7 @@ from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering, OwnedTasks
 from rmpa.gateway.rules import SourceKind
-from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key
+from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key, read_json
 from rmpa.gateway.zenoh.threads import ZenohPriority
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.wire.tcpros import ServiceDescription
@@ -61,35 +61,17 @@ NO_MD5: Final = "0" * 32
 _MD5_LENGTH: Final = 32
 
 
-class _Described(msgspec.Struct):
-    type: str
-    md5sum: str
-    request_type: str = ""
-    response_type: str = ""
-
-
-def write_description(description: ServiceDescription) -> bytes:
-    """The reply to a query for the type."""
-    told = _Described(description.type, description.md5sum, description.request_type, description.response_type)
-    return msgspec.json.encode(told)
-
-
 def read_description(data: Buffer) -> ServiceDescription:
-    """Read a reply of ``write_description``.
+    """Read the reply to a query for the type.
 
     Raises:
         RemoteProtocolError: It is none, or names no type.
     """
-    if len(data) > _SERVICE_DESCRIPTION_MAX:
-        raise RemoteProtocolError(f"a description of a service has {len(data)} bytes")
-    try:
-        told = msgspec.json.decode(data, type=_Described)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RemoteProtocolError(f"not a description of a service: {error}") from None
+    told = read_json(data, ServiceDescription, "a description of a service", _SERVICE_DESCRIPTION_MAX)
     hexadecimal = len(told.md5sum) == _MD5_LENGTH and not told.md5sum.strip("0123456789abcdef")
     if not is_type_name(told.type) or not hexadecimal:
         raise RemoteProtocolError(f"not a description of a service: {told.type[:80]!r}, {told.md5sum[:40]!r}")
-    return ServiceDescription(told.type, told.md5sum, told.request_type, told.response_type)
+    return told
 
 
 def asked_type(key: str) -> str:
@@ -159,7 +141,7 @@ class ExportedService:
     async def _respond(self, md5: str, query: ArrivedQuery) -> tuple[bytes, bytes]:
         try:
             if DESCRIPTION in query.parameters.split(";"):
-                return write_description(await self._describe()), b""
+                return msgspec.json.encode(await self._describe()), b""
             return await self._call(md5, query.payload), b""
         finally:
             self._part.waiting -= len(query.payload)

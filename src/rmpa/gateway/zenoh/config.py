@@ -12,7 +12,6 @@ import socket
 import stat
 import threading
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -55,14 +54,6 @@ _ENCRYPTED: Final = ("tls", "quic")
 _INSECURE: Final = "or say --insecure, and every program that reaches it may read and write everything"
 
 
-class ZenohMode(StrEnum):
-    """Zenoh's modes."""
-
-    CLIENT = "client"
-    PEER = "peer"
-    ROUTER = "router"
-
-
 @dataclass(frozen=True, slots=True)
 class MeshCertificates:
     """The files (PEM) that prove a module's name to other members of its secured mesh.
@@ -100,8 +91,8 @@ class ZenohConfig:
     """The configuration of one session.
 
     Args:
-        mode: A client has one router; a peer or a router listens too. Two peers that reach only a router exchange
-            nothing, so what only connects is a client.
+        mode: ``client``, ``peer`` or ``router``. A client has one router; a peer or a router listens too. Two peers
+            that reach only a router exchange nothing, so what only connects is a client.
         connect: Endpoints to connect to.
         listen: Endpoints to listen at.
         certificates: For encrypted endpoints; ``None``: there are none.
@@ -110,7 +101,7 @@ class ZenohConfig:
         uplink: Bytes a second that the line carries; ``None``: it is not known, and Linux sizes the buffers.
     """
 
-    mode: ZenohMode = ZenohMode.CLIENT
+    mode: str = "client"
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     certificates: MeshCertificates | None = None
@@ -121,7 +112,7 @@ class ZenohConfig:
     def entries(self) -> dict[str, object]:
         """The entries of Zenoh's configuration that differ from its defaults, as JSON values by their path."""
         entries: dict[str, object] = {
-            "mode": str(self.mode),
+            "mode": self.mode,
             "connect/endpoints": list(self.connect),
             "listen/endpoints": list(self.listen),
             "connect/retry": {
@@ -168,14 +159,14 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
         problem = _problem(endpoint, certificates)
         if problem and not settings.insecure:
             raise StartError(f"zenoh {endpoint}", *problem)
-    mode = ZenohMode.ROUTER if settings.router else ZenohMode.PEER if settings.listen else ZenohMode.CLIENT
+    mode = "router" if settings.router else "peer" if settings.listen else "client"
     return ZenohConfig(mode, settings.connect, settings.listen, certificates, uplink=settings.uplink)
 
 
 def zenohd_entries(config: ZenohConfig) -> dict[str, object]:
     """The same as a nested object, which a configuration file has."""
     nested: dict[str, object] = {}
-    for path, value in replace(config, mode=ZenohMode.ROUTER).entries().items():
+    for path, value in replace(config, mode="router").entries().items():
         inner = nested
         *above, last = path.split("/")
         for part in above:

@@ -246,8 +246,6 @@ class OpenSession:
         key: str,
         on_query: Callable[[ArrivedQuery], None],
         _needs: Needs | None = None,
-        *,
-        complete: bool = True,
     ) -> Declaration:
         """Answer queries."""
         self._check(key)
@@ -271,7 +269,7 @@ class OpenSession:
             queue.add(arrival, len(arrival.payload))
 
         def declare() -> list[Any]:
-            return [self._session.declare_queryable(key, self._direct(arrived), complete=complete)]
+            return [self._session.declare_queryable(key, self._direct(arrived), complete=True)]
 
         return Declaration(self._declarations, self._kept, declare, queue)
 
