@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings, TrustSettings
-from rmpa.gateway.zenoh.access import open_trusted_session
+from rmpa.gateway.zenoh.session import open_trusted_session
 from tests.gateway.zenoh_bed import free_port
 from tests.trust.io.member_files import SecuredMesh
 

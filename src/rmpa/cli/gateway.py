@@ -415,6 +415,6 @@ def gateway_zenoh_config(**options: object) -> None:
     loaded = load_gateway(options, dict(os.environ), socket.gethostname())
     for note in loaded.notes:
         warn(note)
-    from rmpa.gateway.zenoh.access import zenohd_config
+    from rmpa.gateway.zenoh.config import zenohd_config
 
     click.echo(zenohd_config(loaded.settings), nl=False)

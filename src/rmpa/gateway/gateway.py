@@ -15,7 +15,7 @@ from rmpa.core.counters import Backoff
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
-from rmpa.gateway.zenoh.access import open_trusted_session
+from rmpa.gateway.zenoh.session import open_trusted_session
 from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 
 if TYPE_CHECKING:

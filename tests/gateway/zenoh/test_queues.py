@@ -35,7 +35,8 @@ async def lane() -> AsyncIterator[SendingLane]:
     made = SendingLane(asyncio.get_running_loop(), "test lane", (TimeoutError,))
     yield made
     made.stop()
-    assert await asyncio.to_thread(made.join, 20)
+    await asyncio.to_thread(made.thread.join, 20)
+    assert not made.thread.is_alive()
 
 
 def publisher(lane: SendingLane, handle: Handle, qos: ZenohQos, ended: list[str] | None = None) -> QueuedPublisher:

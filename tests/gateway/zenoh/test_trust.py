@@ -14,8 +14,8 @@ from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import access as trust
-from rmpa.gateway.zenoh.access import revoked_modules, zenohd_config
+from rmpa.gateway.zenoh import config as trust
+from rmpa.gateway.zenoh.config import revoked_modules, zenohd_config
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
 from tests.gateway.zenoh_bed import until

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.core.contract import Durability, History, Liveliness, Priority, Reliability
+from rmpa.core.contract import Durability, History, Liveliness, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.limits import ROUTE_QUEUE_MESSAGES
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohQos
 
 if TYPE_CHECKING:
     from rmpa.core.contract import Contract, Contracts
@@ -222,13 +222,6 @@ def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
 # The QoS of a topic that goes out to ROS 2: its contract in ROS 2's words, and in Zenoh's.
 
 
-_PRIORITIES: Final = {
-    Priority.HIGH: ZenohPriority.REAL_TIME,
-    Priority.NORMAL: ZenohPriority.DATA,
-    Priority.LOW: ZenohPriority.DATA_LOW,
-}
-
-
 def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool) -> Ros2Qos:
     """The QoS of a topic's publisher in ROS 2's graph.
 
@@ -267,7 +260,7 @@ def zenoh_qos(contract: Contract, qos: Ros2Qos) -> ZenohQos:
     return ZenohQos(
         reliable=reliable,
         block=reliable,
-        priority=_PRIORITIES[contract.priority],
+        priority=PRIORITIES[contract.priority],
         messages=contract.depth,
         cache=qos.depth if qos.latched else 0,
     )

@@ -19,7 +19,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
 from rmpa.gateway.topics import Export
-from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
+from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohPriority, ZenohQos
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -101,16 +101,10 @@ def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -
         latching: Whether a late subscriber gets the last message.
         large: Whether its messages are large: they yield to others unless the contract has a priority.
     """
-    if contract.priority is Priority.HIGH:
-        priority = ZenohPriority.REAL_TIME
-    elif contract.priority is Priority.LOW or large:
-        priority = ZenohPriority.DATA_LOW
-    else:
-        priority = ZenohPriority.DATA
     return ZenohQos(
         reliable=True,
         block=False,
-        priority=priority,
+        priority=PRIORITIES[Priority.LOW if large and contract.priority is Priority.NORMAL else contract.priority],
         messages=contract.depth,
         bytes=limits.RELIABLE_BYTES if contract.reliability is Reliability.RELIABLE else limits.BEST_EFFORT_BYTES,
         cache=1 if latching else 0,

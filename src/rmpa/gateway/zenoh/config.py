@@ -5,25 +5,32 @@ What a Zenoh session is opened with: from our settings to the keys of Zenoh's co
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import queue
 import socket
 import stat
 import threading
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.errors import StartError
+from rmpa.agent.trust import trust_store
+from rmpa.config.peer_rules import Effect
+from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.gateway import limits
 from rmpa.gateway.zenoh.threads import ZenohReply
+from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
+from rmpa.trust.store import CA, CERTIFICATE, DENY, KEY
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Collection, Mapping
 
     from rmpa.config.rules import GatewaySettings
+    from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.threads import Arrivals
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -203,6 +210,127 @@ def _is_loopback(address: str) -> bool:
     return host in ("localhost", "[::1]") or host.startswith("127.")
 
 
+# Which certificates may use a router.
+#
+# Zenoh's table of access knows the name in a certificate alone. So a router has one rule: members may use the keys
+# of sites, and those that were revoked may use nothing. Which topics, services and parameters a site may have is
+# judged by the gateways at both ends, and by the modules.
+
+
+_MESSAGES: Final = (
+    *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
+)
+# The keys of sites; ``**`` alone fits no chunk that begins with ``@``, as the caches of latched topics do.
+_SITES: Final = ("rmpa/1/**", "rmpa/1/**/@adv/**")
+_ALL: Final = ("**", "**/@adv/**", "@ros2_lv/**")
+# Where zenohd listens if the settings name no endpoint.
+_LISTEN: Final = ("tls/0.0.0.0:7447",)
+_HEAD: Final = """\
+// For zenohd 1.10 or later; made by rmpa gateway zenoh-config from [gateway] and [trust].
+// Both sides show a certificate of the mesh. zenohd reads this file and the certificates once, at its start: start
+// it again when the certificate is renewed (each {days:g} days), or a module was revoked.
+"""
+
+
+def session_config(settings: Settings) -> tuple[ZenohConfig, str]:
+    """What the gateway's session is opened with, and what its table of access cannot say.
+
+    Raises:
+        StartError: As ``gateway_config``; or the certificates are not whole, or other users can read them.
+    """
+    store = trust_store(settings)
+    certificates = None
+    if store is not None and store.exists:
+        store.load()
+        certificates = MeshCertificates(*(str(store.path(name)) for name in (CA, CERTIFICATE, KEY)))
+    config = gateway_config(settings.gateway, certificates)
+    if certificates is None or not config.listen:
+        return config, ""
+    table, note = access_table(settings)
+    return replace(config, access_control=table), note
+
+
+def access_table(settings: Settings) -> tuple[dict[str, object], str]:
+    """Zenoh's ``access_control``: members may use the keys of sites, revoked modules nothing.
+
+    Zenoh allows a certificate what it allows to everybody, whatever is denied to its name. So once a module was
+    revoked, the others are named, which the mesh's authority alone can do.
+
+    Returns:
+        The table, and what it cannot say.
+    """
+    keys = _ALL if settings.trust.default == Effect.ALLOW else _SITES
+    if settings.gateway.ros2.enabled:
+        domain = settings.gateway.ros2.domain
+        keys = (*keys, "@ros2_lv/**", f"{domain}/**", f"{domain}/**/@adv/**")
+    subject: dict[str, object] = {"id": "members"}
+    note = ""
+    if revoked := revoked_modules(settings):
+        if known := known_modules(settings):
+            subject["cert_common_names"] = sorted(set(known) - set(revoked))
+        else:
+            names = ", ".join(revoked)
+            note = f"{names}: revoked, and let in until the certificate ends; let the authority be the router"
+    rule = {"id": "sites", "permission": "allow", "flows": ["ingress", "egress"]}
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [{**rule, "messages": list(_MESSAGES), "key_exprs": list(dict.fromkeys(keys))}],
+        "subjects": [subject],
+        "policies": [{"rules": ["sites"], "subjects": ["members"]}],
+    }, note
+
+
+def zenohd_config(settings: Settings) -> str:
+    """A configuration file (JSON5) for zenohd, as a router between sites.
+
+    Raises:
+        StartError: The module has joined no secured mesh, and ``insecure`` is not set; or its files are broken.
+    """
+    gateway = replace(settings.gateway, router=True, listen=settings.gateway.listen or _LISTEN)
+    config, note = session_config(replace(settings, gateway=gateway))
+    text = _HEAD.format(days=CERTIFICATE_LIFETIME * RENEWAL_SHARE / 86_400) + (f"// Note: {note}\n" if note else "")
+    if config.certificates is None:
+        text += "// INSECURE: no certificates, and no rules of access.\n"
+    return text + json.dumps(zenohd_entries(config), indent=2) + "\n"
+
+
+def known_modules(settings: Settings) -> tuple[str, ...]:
+    """The modules with a certificate, which the mesh's authority knows; at other modules none."""
+    store = trust_store(settings)
+    if store is None or not store.is_authority:
+        return ()
+    try:
+        return tuple(sorted(store.load_issued()))
+    except StartError:
+        return ()
+
+
+def revoked_modules(settings: Settings) -> tuple[str, ...]:
+    """The modules on the deny list whose certificates from before may still be valid.
+
+    Zenoh knows a certificate by its name alone. So a name that was invited again stays out until those have ended.
+
+    Raises:
+        StartError: The files of trust are not whole, or the deny list is broken.
+    """
+    store = trust_store(settings)
+    if store is None or not store.exists:
+        return ()
+    files = store.load()
+    if not files.deny:
+        return ()
+    from rmpa.trust.certificates import DenyList, ca_public_key, read_document  # noqa: PLC0415 - the extra rmpa[trust]
+
+    try:
+        deny = read_document(files.deny, ca_public_key(files.ca), DenyList)
+    except RemoteProtocolError as error:
+        raise StartError(str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status") from None
+    ended = time.time() - CERTIFICATE_LIFETIME
+    return tuple(sorted(entry.name for entry in deny.entries if entry.before > ended))
+
+
 # Bounds what the kernel holds unsent of Zenoh's connections, so that priorities hold on a slow line too.
 #
 # Zenoh sends by priority, but what it has handed to the kernel goes first in, first out: on 1 Mbit/s that is
@@ -290,8 +418,8 @@ class SerialWorker:
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._discard = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.thread.start()
 
     def submit(self, job: Callable[[], object]) -> None:
         """Run ``job`` after all that was given before; its errors are logged."""
@@ -305,18 +433,6 @@ class SerialWorker:
         """
         self._discard = discard
         self._jobs.put(None)
-
-    def join(self, timeout: float) -> bool:
-        """Wait for the thread's end, which ``stop`` asks for.
-
-        Args:
-            timeout: Seconds.
-
-        Returns:
-            Whether it has ended.
-        """
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content
+from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content, session_config
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
     Arrivals,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.policy import Needs
+    from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply
     from rmpa.ros.wire.tcpros import Buffer
@@ -104,8 +105,8 @@ class OpenSession:
         library: The module ``zenoh``.
         session: Zenoh's session.
         loop: The event loop in which all callbacks are called.
-        listens_with: The file of the certificate that it listens with; ``None``: it does not, or has none.
-        changed: Whether its configuration would be another one now.
+        stale: Whether it has to be opened anew for others to connect: its certificate or table of access is another.
+            Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
     """
 
     def __init__(
@@ -113,8 +114,7 @@ class OpenSession:
         library: Any,
         session: Any,
         loop: asyncio.AbstractEventLoop,
-        listens_with: Path | None = None,
-        changed: Callable[[], bool] = lambda: False,
+        stale: Callable[[], bool] = lambda: False,
     ) -> None:
         self._zenoh = library
         self._session = session
@@ -126,9 +126,7 @@ class OpenSession:
         self._lanes: dict[ZenohPriority, SendingLane] = {}
         self._publishers: set[QueuedPublisher] = set()
         self._kept: set[Declaration] = set()
-        self._certificate = listens_with
-        self._stamp = _stamp(listens_with)
-        self._changed = changed
+        self._stale = stale
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
@@ -147,11 +145,8 @@ class OpenSession:
 
     @property
     def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect: its certificate or table of access is another.
-
-        Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
-        """
-        return _stamp(self._certificate) != self._stamp or self._changed()
+        """Whether it has to be opened anew for others to connect."""
+        return self._stale()
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
@@ -338,6 +333,7 @@ class OpenSession:
         await in_thread(self._end, "zenoh close")
 
     def _end(self) -> None:
+        lanes = [lane.thread for lane in self._lanes.values()]
         for lane in self._lanes.values():
             lane.stop()
         self._declarations.stop(discard=True)
@@ -345,14 +341,9 @@ class OpenSession:
         closing = SerialWorker("zenoh session close")
         closing.submit(self._session.close)
         closing.stop()
-        threads: tuple[SerialWorker | SendingLane, ...] = (
-            closing,
-            self._declarations,
-            self._queries,
-            *self._lanes.values(),
-        )
-        for thread in threads:
-            if not thread.join(_CLOSE_MAX):
+        for each in (closing.thread, self._declarations.thread, self._queries.thread, *lanes):
+            each.join(_CLOSE_MAX)
+            if each.is_alive():
                 _log.warning("zenoh: a thread of the session did not end within %g s", _CLOSE_MAX)
 
     def _direct(self, callback: Callable[[Any], None], ended: Callable[[], None] | None = None) -> Any:
@@ -455,7 +446,12 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
         raise _start_error(config, _reason(error)) from None
     files = config.certificates if config.listen else None
     certificate = Path(files.certificate) if files is not None else None
-    return OpenSession(zenoh, session, asyncio.get_running_loop(), certificate, changed)
+    stamp = _stamp(certificate)
+
+    def stale() -> bool:
+        return _stamp(certificate) != stamp or changed()
+
+    return OpenSession(zenoh, session, asyncio.get_running_loop(), stale)
 
 
 def _stamp(file: Path | None) -> tuple[int, int] | None:
@@ -484,3 +480,23 @@ def _start_error(config: ZenohConfig, reason: str) -> StartError:
     else:
         remedy = "start the router there, or correct --connect"
     return StartError(f"zenoh {where}", reason, remedy)
+
+
+async def open_trusted_session(settings: Settings) -> OpenSession:
+    """Open the session that the settings ask for.
+
+    Raises:
+        StartError: It may not be opened without certificates, an address is taken, or no router answers.
+    """
+    config, note = session_config(settings)
+    if note:
+        _log.warning("! zenoh: %s", note)
+
+    def changed() -> bool:
+        """Whether the table of access would be another one now: a module was revoked, or has joined since."""
+        try:
+            return session_config(settings)[0].access_control != config.access_control
+        except StartError:
+            return False  # files are being written
+
+    return await open_session(config, changed)

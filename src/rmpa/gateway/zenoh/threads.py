@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
+from rmpa.core.contract import Priority
 from rmpa.gateway import limits
 from rmpa.runtime.tls import CollectedSends
 
@@ -55,6 +56,14 @@ class ZenohPriority(IntEnum):
     DATA = 5
     DATA_LOW = 6
     BACKGROUND = 7
+
+
+# The priority of a topic's messages, by that of its contract.
+PRIORITIES: Final = {
+    Priority.HIGH: ZenohPriority.REAL_TIME,
+    Priority.NORMAL: ZenohPriority.DATA,
+    Priority.LOW: ZenohPriority.DATA_LOW,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -493,8 +502,8 @@ class SendingLane:
         self._ready: deque[QueuedPublisher] = deque()
         self._stopped = False
         self._failed = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.thread.start()
 
     def schedule(self, publisher: QueuedPublisher) -> None:
         """Give a publisher its turn. The caller has the lock."""
@@ -514,18 +523,6 @@ class SendingLane:
         with self.changed:
             self._stopped = True
             self.changed.notify()
-
-    def join(self, timeout: float) -> bool:
-        """Wait for the thread's end, which ``stop`` asks for.
-
-        Args:
-            timeout: Seconds.
-
-        Returns:
-            Whether it has ended.
-        """
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
 
     def _run(self) -> None:
         window_end, in_window = 0.0, 0
