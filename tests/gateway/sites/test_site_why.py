@@ -16,7 +16,7 @@ from rmpa.config.settings import TrustSettings
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.sites.answers import SiteAnswers, SiteWhy, WhyQuestion, here_stages, parse_ways, sent_stages
+from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
 from rmpa.gateway.sites.params import SiteParams
 from rmpa.gateway.sites.plans import SiteImport
@@ -219,7 +219,7 @@ async def test_a_gateway_that_does_not_tell_leaves_its_half_open() -> None:
         yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
         yard.site.graph.add("/chatter", TEXT)
         await until(lambda: hall.site.shows("/chatter"))
-        await yard.answers._why.close()
+        await yard.answers.close()
         (way,) = await hall.why("/chatter")
         assert levels(way)["source there"] == "unknown"
         assert levels(way)["demand here"] == "fail"
@@ -236,7 +236,7 @@ async def test_a_router_that_keeps_a_subscription_back_is_named(monkeypatch: pyt
         yard, hall = await asked(bed, "yard"), await asked(bed, "hall")
         yard.site.graph.add("/chatter", TEXT)
         await until(lambda: hall.site.shows("/chatter"))
-        monkeypatch.setattr(SiteWhy, "_ask", ask)
+        monkeypatch.setattr(SiteAnswers, "_ask", ask)
         (told,) = await hall.why("/chatter")
         assert levels(told)["demand there"] == "warn"
         await hall.site.subscribed("/chatter")

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.policy import OPEN_GATE
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import UnreachableError
 from rmpa.gateway import limits
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import TypeAlias
 
-    from rmpa.bridge.policy import PermissionGate
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
@@ -61,6 +59,10 @@ class Ros2Neighbour:
         contracts: The contracts of topics; by default those without any rule.
         find: Finds a ROS 1 type on this machine by its name; by default as agents do.
 
+    Attributes:
+        sites: Answers for the other sites; ``None``: the gateway joins none.
+        permissions: Which linked module may be told of a topic or service, by its name here.
+
     Raises:
         ConfigError: The distribution is not known, or a mapping file is wrong.
     """
@@ -82,6 +84,8 @@ class Ros2Neighbour:
         self._sources: dict[str, set[MeshSource]] = {}
         # The proxies that another gateway shows in ROS 2, with its session.
         self._standing_by: dict[str, str] = {}
+        self.sites: SiteAnswerer | None = None
+        self.permissions = CrossingRules()
         self._watch: Declaration | None = None
         self._closed = False
 
@@ -185,6 +189,69 @@ class Ros2Neighbour:
                 ways.append(_way((Check("rule", FAIL, why, _RULES),), name, node, *ends))
         return [way for way in ways if module in ("", way.peer)]
 
+    # --- questions -------------------------------------------------------------------------------------------------
+
+    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
+        """The reply to one question of ``observe.operations``; raises as that says."""
+        name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
+        if what == WHY:
+            told = any(self.permissions.tells(asker, kind, name) for kind in SourceKind)
+            ways = self.ways(name, site, module) if told and args.get("service") is not True else []
+            return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
+        if what == REPORT or (what == INFO and site == SITE):
+            report = await self._report(asker)
+            if what == INFO:
+                return msgspec.structs.replace(report, sites=(self._site(asker, sources=True),))
+            return msgspec.structs.replace(report, sites=(*report.sites, self._site(asker, sources=False)))
+        if self.sites is None:
+            raise UnreachableError(f"site {site!r}", "this gateway", f"it joins {SITE} alone")
+        return await self.sites.answer(what, args, asker)
+
+    async def _report(self, asker: str) -> SitesReport:
+        if self.sites is not None:
+            found: SitesReport = await self.sites.answer(REPORT, {}, asker)
+            return found
+        context = self.context
+        endpoints = context.session.endpoints
+        problem = "" if endpoints else "it is connected to no other Zenoh session"
+        return SitesReport(gateway=context.graph.name, site="", leads=True, problem=problem, endpoints=endpoints)
+
+    def _site(self, asker: str, *, sources: bool) -> SiteInfo:
+        listed = list(self._rows(asker)) if sources else []
+        return SiteInfo(
+            name=SITE,
+            state="joined",
+            gateways=1,
+            sources=tuple(listed[: limits.SITE_REPORT_SOURCES_MAX]),
+            not_shown=len(self.topics.refused),
+            beyond=max(0, len(listed) - limits.SITE_REPORT_SOURCES_MAX),
+        )
+
+    def _rows(self, asker: str) -> Iterator[SiteSourceInfo]:
+        """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
+        topic, service = SourceKind.TOPIC, SourceKind.SERVICE
+        rows: list[tuple[SourceKind, str, str, str, str, str]] = []
+        for each in self.topics.imports.values():
+            for one in each.publishers.values():
+                problem = each.problem or one.topic.problem
+                rows.append((topic, each.first.name, one.node, each.ros1_type, each.decision.name, problem))
+        for name, shown in self.services.shown.items():
+            rows.append((service, name, "", shown.server.type, name, ""))
+        for what, problem in self.context.problems.items():
+            name, _, node = what.partition(" of ")
+            rows.append((topic, name, node, "*", "", problem))
+        for kind, name, node, type_name, here, problem in rows:
+            if self.permissions.tells(asker, kind, here or name):
+                yield SiteSourceInfo(
+                    kind=kind.name.lower(),
+                    module="",
+                    node=node,
+                    name=name,
+                    type=type_name,
+                    here=here,
+                    problem=problem,
+                )
+
 
 def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) -> Diagnosis:
     return Diagnosis.of(stages, name=name, peer=peer, to=to, node=node)
@@ -240,84 +307,6 @@ def _flow(stage: str, text: str, messages: int, losses: tuple[int, ...], words: 
     return Check(stage, OK if messages and not lost else WARN, "; ".join((text, *lost)))
 
 
-class Ros2Answers:
-    """Answers questions about ROS 2, and has those about other sites answered.
-
-    Args:
-        neighbour: ROS 2.
-        sites: Answers for the other sites; ``None``: the gateway joins none.
-        gate: Decides which linked module may have a topic or service, by its name here.
-    """
-
-    def __init__(
-        self, neighbour: Ros2Neighbour, sites: SiteAnswerer | None = None, gate: PermissionGate = OPEN_GATE
-    ) -> None:
-        self._neighbour = neighbour
-        self._sites = sites
-        self._rules = CrossingRules(gate=gate)
-
-    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
-        """The reply to one question of ``observe.operations``; raises as that says."""
-        name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-        if what == WHY:
-            told = any(self._rules.tells(asker, kind, name) for kind in SourceKind)
-            ways = self._neighbour.ways(name, site, module) if told and args.get("service") is not True else []
-            return [*ways, *(await self._sites.answer(what, args, asker) if self._sites is not None else ())]
-        if what == REPORT or (what == INFO and site == SITE):
-            report = await self._report(asker)
-            if what == INFO:
-                return msgspec.structs.replace(report, sites=(self._site(asker, sources=True),))
-            return msgspec.structs.replace(report, sites=(*report.sites, self._site(asker, sources=False)))
-        if self._sites is None:
-            raise UnreachableError(f"site {site!r}", "this gateway", f"it joins {SITE} alone")
-        return await self._sites.answer(what, args, asker)
-
-    async def _report(self, asker: str) -> SitesReport:
-        if self._sites is not None:
-            found: SitesReport = await self._sites.answer(REPORT, {}, asker)
-            return found
-        context = self._neighbour.context
-        endpoints = context.session.endpoints
-        problem = "" if endpoints else "it is connected to no other Zenoh session"
-        return SitesReport(gateway=context.graph.name, site="", leads=True, problem=problem, endpoints=endpoints)
-
-    def _site(self, asker: str, *, sources: bool) -> SiteInfo:
-        listed = list(self._sources(asker)) if sources else []
-        return SiteInfo(
-            name=SITE,
-            state="joined",
-            gateways=1,
-            sources=tuple(listed[: limits.SITE_REPORT_SOURCES_MAX]),
-            not_shown=len(self._neighbour.topics.refused),
-            beyond=max(0, len(listed) - limits.SITE_REPORT_SOURCES_MAX),
-        )
-
-    def _sources(self, asker: str) -> Iterator[SiteSourceInfo]:
-        """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
-        topic, service = SourceKind.TOPIC, SourceKind.SERVICE
-        rows: list[tuple[SourceKind, str, str, str, str, str]] = []
-        for each in self._neighbour.topics.imports.values():
-            for one in each.publishers.values():
-                problem = each.problem or one.topic.problem
-                rows.append((topic, each.first.name, one.node, each.ros1_type, each.decision.name, problem))
-        for name, shown in self._neighbour.services.shown.items():
-            rows.append((service, name, "", shown.server.type, name, ""))
-        for what, problem in self._neighbour.context.problems.items():
-            name, _, node = what.partition(" of ")
-            rows.append((topic, name, node, "*", "", problem))
-        for kind, name, node, type_name, here, problem in rows:
-            if self._rules.tells(asker, kind, here or name):
-                yield SiteSourceInfo(
-                    kind=kind.name.lower(),
-                    module="",
-                    node=node,
-                    name=name,
-                    type=type_name,
-                    here=here,
-                    problem=problem,
-                )
-
-
 def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Settings) -> Ros2Neighbour:
     """Make the neighbour, after that of the sites if there is one, and have it answer; it is not started.
 
@@ -326,6 +315,7 @@ def make_ros2_neighbour(graph: AgentGraph, session: OpenSession, settings: Setti
     """
     agent = graph.agent
     neighbour = Ros2Neighbour(graph, session, settings.gateway, settings.make_contracts())
-    sites = agent.sites.answerer if settings.gateway.site else None
-    agent.sites.serve(Ros2Answers(neighbour, sites, agent.bridge.gate))
+    neighbour.permissions = CrossingRules(gate=agent.bridge.gate)
+    neighbour.sites = agent.sites.answerer if settings.gateway.site else None
+    agent.sites.serve(neighbour)
     return neighbour

@@ -203,23 +203,132 @@ def _told(site: str, module: str, name: str, there: Diagnosis | None, refusal: s
     return there.stages
 
 
-class SiteWhy:
-    """The ways of topics and services through this gateway.
+class SiteAnswers:
+    """Answers questions about other sites, of this machine and of linked modules: a ``SiteAnswerer``.
 
     Args:
-        sites: Its neighbour "other sites".
+        sites: The neighbour "other sites".
+        params: Asks modules of other sites about parameters.
     """
 
-    def __init__(self, sites: SiteNeighbour) -> None:
+    def __init__(self, sites: SiteNeighbour, params: SiteParams) -> None:
         self._sites = sites
         self._rules = sites.context.rules
+        self._params = params
         self._site = sites.own.site
         self._queryable = sites.context.session.queryable(_why_key(self._site), self._take, _NEEDS)
         sites.closing.append(self.close)
 
     async def close(self) -> None:
-        """Answer no more."""
+        """Answer no more questions of other gateways."""
         self._queryable.close()
+
+    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
+        """The reply to one question of ``observe.operations``; raises as that says."""
+        name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
+        others = {*self._sites.catalogue.sites, *self._sites.history.away} - {self._site}
+        known = [self._site, *sorted(others)]
+        if what == REPORT:
+            return self._report(known, asker, sources=False)
+        if what == WHY:
+            return await self.ways(name, site, module, asker, service=args.get("service") is True)
+        if what == INFO:
+            # Of a site that is not known the names of all are the answer.
+            return self._report([site] if site in known else known, asker, sources=site in known)
+        for each in (site, module):
+            if peer_name_problem(each) is not None:
+                raise RemoteProtocolError(f"{each[:80]!r} is not the name of a site or a module")
+        self._require(site)
+        if what == PARAM:
+            return await self._params.ask(asker, site, module, args)
+        raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
+
+    def _owns(self, asker: str, module: str) -> bool:
+        """Whether what a module of this site has is told by this gateway: the others it asks itself."""
+        return not self._rules.secured or asker in ("", module)
+
+    def _require(self, site: str) -> None:
+        sites = self._sites.catalogue.sites
+        if site == self._site or site in sites:
+            return
+        ago = self._sites.history.since_ago(site)
+        if ago is not None:
+            raise RmpaError(f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all")
+        known = f"known are: {', '.join(sites) or 'none'}"
+        raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", known)
+
+    # --- what is there ----------------------------------------------------------------------------------------------
+
+    def _report(self, names: list[str], asker: str, *, sources: bool) -> SitesReport:
+        endpoints = self._sites.context.session.endpoints
+        return SitesReport(
+            gateway=self._sites.context.graph.name,
+            site=self._site,
+            leads=self._sites.leads,
+            rank=self._sites.own.rank,
+            problem="" if endpoints else "it is connected to no other Zenoh session",
+            endpoints=endpoints,
+            sites=tuple(
+                (self._this_site if name == self._site else self._other)(name, asker, sources) for name in names
+            ),
+        )
+
+    def _this_site(self, name: str, asker: str, sources: bool) -> SiteInfo:
+        offered = [(source, "") for source, _ in self._sites.exports.offered()]
+        refused = [each for each in self._sites.exports.refusals() if self._owns(asker, each[0].module)]
+        told = [each for each in offered if self._owns(asker, each[0].module)]
+        modules = sorted({(source.module, source.instance) for source, _ in offered})
+        rows = [
+            _source_info(source, source.module, source.here, why)
+            for source, why in sorted([*told, *refused], key=lambda each: (each[0].name, each[0].module))
+        ]
+        return SiteInfo(
+            name=name,
+            state="this site",
+            gateways=1,
+            modules=tuple(
+                _counted(module, run, [row for row in rows if row.module == module and not row.problem])
+                for module, run in modules
+            ),
+            sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
+            not_shown=len(refused),
+        )
+
+    def _other(self, name: str, asker: str, sources: bool) -> SiteInfo:
+        catalogue = self._sites.catalogue
+        if name not in catalogue.sites:
+            return SiteInfo(name=name, state="unreachable", since_ago=self._sites.history.since_ago(name))
+        refused = {
+            source: why
+            for source, why in self._sites.imports.refusals()
+            if source.site == name and self._rules.tells(asker, source.kind, source.name)
+        }
+        rows: list[SiteSourceInfo] = []
+        modules = []
+        for module in catalogue.modules(name):
+            each = list(self._rows(module, asker, refused))
+            modules.append(_counted(module.name, module.instance, each))
+            rows += each
+        gateways = catalogue.gateways(name)
+        return SiteInfo(
+            name=name,
+            state="joined" if gateways else "no gateway",
+            since_ago=self._sites.history.since_ago(name),
+            gateways=len(gateways),
+            modules=tuple(modules),
+            sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
+            not_shown=len(refused),
+            beyond=catalogue.refused(name),
+        )
+
+    def _rows(self, module: SiteModule, asker: str, refused: Mapping[SiteSource, str]) -> Iterator[SiteSourceInfo]:
+        for source in self._sites.catalogue.sources(module):
+            entry = self._sites.imports.entry(source)
+            if self._rules.tells(asker, source.kind, entry.source.name if entry is not None else source.name):
+                here = entry.source.name if entry is not None and self._sites.leads else ""
+                yield _source_info(source, module.name, here, refused.get(source, ""))
+
+    # --- ``rmpa why`` -----------------------------------------------------------------------------------------------
 
     async def ways(
         self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
@@ -414,126 +523,6 @@ class SiteWhy:
 
 def _why_key(site: str) -> str:
     return f"{ROOT}/{site}/{GATEWAY}/why"
-
-
-class SiteAnswers:
-    """Answers questions about other sites, of this machine and of linked modules: a ``SiteAnswerer``.
-
-    Args:
-        sites: The neighbour "other sites".
-        params: Asks modules of other sites about parameters.
-    """
-
-    def __init__(self, sites: SiteNeighbour, params: SiteParams) -> None:
-        self._sites = sites
-        self._rules = sites.context.rules
-        self._params = params
-        self._why = SiteWhy(sites)
-
-    async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
-        """The reply to one question of ``observe.operations``; raises as that says."""
-        name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-        others = {*self._sites.catalogue.sites, *self._sites.history.away} - {self._sites.own.site}
-        known = [self._sites.own.site, *sorted(others)]
-        if what == REPORT:
-            return self._report(known, asker, sources=False)
-        if what == WHY:
-            return await self._why.ways(name, site, module, asker, service=args.get("service") is True)
-        if what == INFO:
-            # Of a site that is not known the names of all are the answer.
-            return self._report([site] if site in known else known, asker, sources=site in known)
-        for each in (site, module):
-            if peer_name_problem(each) is not None:
-                raise RemoteProtocolError(f"{each[:80]!r} is not the name of a site or a module")
-        self._require(site)
-        if what == PARAM:
-            return await self._params.ask(asker, site, module, args)
-        raise RemoteProtocolError(f"{what[:80]!r} is no question about sites")
-
-    def _owns(self, asker: str, module: str) -> bool:
-        """Whether what a module of this site has is told by this gateway: the others it asks itself."""
-        return not self._rules.secured or asker in ("", module)
-
-    def _require(self, site: str) -> None:
-        sites = self._sites.catalogue.sites
-        if site == self._sites.own.site or site in sites:
-            return
-        ago = self._sites.history.since_ago(site)
-        if ago is not None:
-            raise RmpaError(f"site {site} is unreachable since {ago:.0f} s; `rmpa site list` shows all")
-        known = f"known are: {', '.join(sites) or 'none'}"
-        raise UnreachableError(f"site {site!r}", "any Zenoh router that this gateway reaches", known)
-
-    # --- what is there ----------------------------------------------------------------------------------------------
-
-    def _report(self, names: list[str], asker: str, *, sources: bool) -> SitesReport:
-        own, endpoints = self._sites.own, self._sites.context.session.endpoints
-        return SitesReport(
-            gateway=self._sites.context.graph.name,
-            site=own.site,
-            leads=self._sites.leads,
-            rank=own.rank,
-            problem="" if endpoints else "it is connected to no other Zenoh session",
-            endpoints=endpoints,
-            sites=tuple(
-                (self._this_site if name == own.site else self._other)(name, asker, sources) for name in names
-            ),
-        )
-
-    def _this_site(self, name: str, asker: str, sources: bool) -> SiteInfo:
-        offered = [(source, "") for source, _ in self._sites.exports.offered()]
-        refused = [each for each in self._sites.exports.refusals() if self._owns(asker, each[0].module)]
-        told = [each for each in offered if self._owns(asker, each[0].module)]
-        modules = sorted({(source.module, source.instance) for source, _ in offered})
-        rows = [
-            _source_info(source, source.module, source.here, why)
-            for source, why in sorted([*told, *refused], key=lambda each: (each[0].name, each[0].module))
-        ]
-        return SiteInfo(
-            name=name,
-            state="this site",
-            gateways=1,
-            modules=tuple(
-                _counted(module, run, [row for row in rows if row.module == module and not row.problem])
-                for module, run in modules
-            ),
-            sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
-            not_shown=len(refused),
-        )
-
-    def _other(self, name: str, asker: str, sources: bool) -> SiteInfo:
-        catalogue = self._sites.catalogue
-        if name not in catalogue.sites:
-            return SiteInfo(name=name, state="unreachable", since_ago=self._sites.history.since_ago(name))
-        refused = {
-            source: why
-            for source, why in self._sites.imports.refusals()
-            if source.site == name and self._rules.tells(asker, source.kind, source.name)
-        }
-        rows: list[SiteSourceInfo] = []
-        modules = []
-        for module in catalogue.modules(name):
-            each = list(self._rows(module, asker, refused))
-            modules.append(_counted(module.name, module.instance, each))
-            rows += each
-        gateways = catalogue.gateways(name)
-        return SiteInfo(
-            name=name,
-            state="joined" if gateways else "no gateway",
-            since_ago=self._sites.history.since_ago(name),
-            gateways=len(gateways),
-            modules=tuple(modules),
-            sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
-            not_shown=len(refused),
-            beyond=catalogue.refused(name),
-        )
-
-    def _rows(self, module: SiteModule, asker: str, refused: Mapping[SiteSource, str]) -> Iterator[SiteSourceInfo]:
-        for source in self._sites.catalogue.sources(module):
-            entry = self._sites.imports.entry(source)
-            if self._rules.tells(asker, source.kind, entry.source.name if entry is not None else source.name):
-                here = entry.source.name if entry is not None and self._sites.leads else ""
-                yield _source_info(source, module.name, here, refused.get(source, ""))
 
 
 def _source_info(source: MeshSource | SiteSource, module: str, here: str, problem: str) -> SiteSourceInfo:

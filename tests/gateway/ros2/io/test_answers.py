@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.gateway.ros2.ros2 import Ros2Answers
 from rmpa.observe.operations import INFO, PARAM, REPORT, WHY
 from rmpa.observe.peer_info import SiteInfo, SitesReport
 from tests.gateway.memory_zenoh import eventually
@@ -29,7 +28,7 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> N
         bed.publisher("/chatter")
         bed.subscribe("/mine", [], node="/older", type_hash="RIHS01_" + "0" * 64)
         await eventually(lambda: bed.problems and bed.topic("/chatter"))
-        alone = Ros2Answers(bed.neighbour)
+        alone = bed.neighbour
         report: SitesReport = await alone.answer(REPORT, {})
         assert [(site.name, site.state) for site in report.sites] == [("ros2", "joined")]
         report = await alone.answer(INFO, {"site": "ros2"})
@@ -45,7 +44,8 @@ async def test_ros2_is_listed_with_its_topics_and_what_is_wrong_with_them() -> N
 
 async def test_questions_about_sites_go_to_what_answers_for_them() -> None:
     async with topic_bed() as bed:
-        both = Ros2Answers(bed.neighbour, OtherSites())
+        both = bed.neighbour
+        both.sites = OtherSites()
         report: SitesReport = await both.answer(REPORT, {})
         assert [site.name for site in report.sites] == ["hall", "ros2"]
         assert await both.answer(PARAM, {"site": "hall"}) == ["of a site"]
