@@ -22,8 +22,8 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.ros.node.node import Node
 from rmpa.trust import limits
 from rmpa.trust import store as files_of
-from rmpa.trust.authority import found_mesh
 from rmpa.trust.joining import join_mesh
+from rmpa.trust.membership import found_mesh
 from rmpa.trust.permissions import HAVE, page_hosts
 from rmpa.trust.tokens import Token
 

@@ -15,8 +15,7 @@ from rmpa.cli.agent import up
 from rmpa.cli.gateway import gateway
 from rmpa.cli.main import cli
 from rmpa.config.read import load_settings
-from rmpa.config.reference import json_schema, json_value, schema_text
-from rmpa.config.settings import SETTINGS, TABLES
+from rmpa.config.settings import SETTINGS, TABLES, json_schema, json_value, schema_text
 from rmpa.config.values import Multicast
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented

@@ -17,8 +17,7 @@ from rmpa.observe.control_client import ControlClient
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.authority import MeshAuthority, found_mesh
-from rmpa.trust.membership import Membership, new_key, private_key
+from rmpa.trust.membership import Membership, MeshAuthority, found_mesh, new_key, private_key
 from rmpa.trust.store import MemberFiles, TrustStore
 
 if TYPE_CHECKING:

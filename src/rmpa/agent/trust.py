@@ -45,9 +45,8 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.runtime.loop import SystemClock
-    from rmpa.trust.authority import MeshAuthority
     from rmpa.trust.joining import JoinServer
-    from rmpa.trust.membership import Membership
+    from rmpa.trust.membership import Membership, MeshAuthority
 
 _log = logging.getLogger(__name__)
 
@@ -108,8 +107,8 @@ class AgentTrust(Part):
     # More than 12 fields: documents, renewals of others and the renewal of its own need all of the membership.
 
     def __init__(self, settings: Settings, membership: Membership, bridge: Bridge, clock: SystemClock) -> None:
-        from rmpa.trust.authority import MeshAuthority  # noqa: PLC0415 - as in ``open_membership``
         from rmpa.trust.joining import JoinServer  # noqa: PLC0415
+        from rmpa.trust.membership import MeshAuthority  # noqa: PLC0415 - as in ``open_membership``
 
         self.membership = membership
         self.identity: Identity | None = None

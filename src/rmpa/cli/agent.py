@@ -28,8 +28,7 @@ from rmpa.cli.options import (
 from rmpa.cli.output import Painted, Table, paint, print_error, print_text, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings
-from rmpa.config.reference import json_value, schema_text, toml_value
-from rmpa.config.settings import SETTINGS
+from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
 from rmpa.core.counters import configure_logging
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe import limits

@@ -74,7 +74,7 @@ def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list
 
     def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
         # By its name, as commands are: it asks the agent by the modules of the commands, which import this one.
-        found: list[str] = importlib.import_module("rmpa.cli.completion").names(kind, ctx, incomplete)
+        found: list[str] = importlib.import_module("rmpa.cli.graph").complete_names(kind, ctx, incomplete)
         return found
 
     return complete
@@ -138,10 +138,18 @@ class Options:
     master_uri: str | None = None
 
     def show(self, value: object, *text: Text) -> None:
-        """Print a result: the value as JSON, or the text."""
-        from rmpa.cli.output import show
+        """Print a result, for programs or for people.
 
-        show(value, *text, as_json=self.as_json)
+        Args:
+            value: For JSON.
+            text: The same for people; an iterator is read only if it is shown.
+        """
+        from rmpa.cli.output import print_json, print_text
+
+        if self.as_json:
+            print_json(value)
+        else:
+            print_text(*text)
 
     def client(self, timeout: float | None = None) -> ControlClient:
         """A connection to the agent that is meant.

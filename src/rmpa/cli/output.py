@@ -49,20 +49,6 @@ class Table:
 Text: TypeAlias = "str | Table | Iterable[Text]"
 
 
-def show(value: object, *text: Text, as_json: bool) -> None:
-    """Print the result of a verb, for programs or for people.
-
-    Args:
-        value: For JSON.
-        text: The same for people; an iterator is read only if it is shown.
-        as_json: Which of both.
-    """
-    if as_json:
-        print_json(value)
-    else:
-        print_text(*text)
-
-
 def print_text(*text: Text) -> None:
     """Print lines and tables, each at once."""
     for item in text:

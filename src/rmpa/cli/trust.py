@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from rmpa.cli.output import Text
     from rmpa.config.module_name import ModuleName
     from rmpa.config.read import Loaded
-    from rmpa.trust.authority import MeshAuthority
-    from rmpa.trust.membership import Membership
+    from rmpa.trust.membership import Membership, MeshAuthority
 
 _T = TypeVar("_T")
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
@@ -130,7 +129,7 @@ class Module:
             StartError: Trust is off here, this module is not the authority, or a file is broken.
         """
         membership = self.membership()
-        from rmpa.trust.authority import MeshAuthority
+        from rmpa.trust.membership import MeshAuthority
 
         if not self.store.is_authority:
             place = self.store.load_authority()
@@ -316,7 +315,7 @@ def trust_init(module: Module, options: Options, label: str) -> None:
       rmpa trust init --name base --label 'warehouse 3'
     """
     module.refuse_member("removes it")
-    from rmpa.trust.authority import found_mesh
+    from rmpa.trust.membership import found_mesh
 
     found_mesh(module.store, module.name, label or module.name, time.time())
     status, start = _status(module), keep_member_name(module)

@@ -131,7 +131,7 @@ def _sign(module: Module, request: Path, out: Path, invitee: str, options: Optio
     """Answer a join by files."""
     check_library()
     from rmpa.trust import certificates
-    from rmpa.trust.authority import request_der
+    from rmpa.trust.membership import request_der
     from rmpa.trust.tokens import fingerprint_of
 
     try:
@@ -279,8 +279,7 @@ def _join_by_token(module: Module, text: str) -> MemberFiles:
 def _write_request(module: Module, out: Path, options: Options) -> None:
     from rmpa.trust import certificates
     from rmpa.trust import store as files_of
-    from rmpa.trust.authority import request_pem
-    from rmpa.trust.membership import new_key, private_key
+    from rmpa.trust.membership import new_key, private_key, request_pem
 
     pem = new_key()
     request = certificates.make_request(private_key(pem, files_of.REQUEST_KEY), module.name)

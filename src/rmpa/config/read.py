@@ -16,10 +16,9 @@ from urllib.parse import urlsplit
 from rmpa.config import limits
 from rmpa.config.module_name import NAME_FILE, NameSource, choose_name, kept_name, state_dir
 from rmpa.config.peer_rules import peer_warnings, permission_problems
-from rmpa.config.reference import json_schema
 from rmpa.config.rules import contract_warnings
 from rmpa.config.schema import REMOVED
-from rmpa.config.settings import SETTINGS, Settings
+from rmpa.config.settings import SETTINGS, Settings, json_schema
 from rmpa.config.values import BadValue, JsonSchema, Place, did_you_mean, shown, suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from

@@ -1,12 +1,15 @@
 """The agent's settings: each is declared once here; ``config.schema`` says what follows from a declaration.
 
 ``config.read`` reads them from the file, the environment and the command line. The reference for users,
-docs/settings.md, is made from this module by ``scripts/write-reference``.
+docs/settings.md, is made from this module by ``scripts/write-reference``. The JSON Schema is made here.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass, is_dataclass
+from enum import StrEnum
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits
@@ -61,6 +64,7 @@ from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.config.values import JsonSchema
     from rmpa.core.contract import ContractRule
 
 
@@ -427,3 +431,57 @@ TABLES: Final = {
     "control": "Who on this machine may use the agent's control socket, which the commands ask.",
     "log": "What the log says, and how.",
 }
+
+
+def toml_value(value: object) -> str:
+    """A setting's value as it stands in ``rmpa.toml``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return f"{value:.15g}"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, Multicast) and not value.enabled:
+        return "false"
+    return json.dumps(str(value), ensure_ascii=False)
+
+
+@cache
+def json_schema() -> JsonSchema:
+    """The JSON Schema (draft 7) of ``rmpa.toml``; ``config.read`` checks keys and types by it."""
+    root: JsonSchema = {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "rmpa.toml",
+        "description": "The settings of one RMPA agent.",
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {},
+    }
+    for it in SETTINGS:
+        inside = root["properties"]
+        for depth, name in enumerate(it.key[:-1], 1):
+            about = TABLES[".".join(it.key[:depth])]
+            empty = {"type": "object", "description": about, "additionalProperties": False, "properties": {}}
+            inside = inside.setdefault(name, empty)["properties"]
+        entry = it.type.json_schema | {"description": it.help.replace("`", "")}
+        if not it.is_list_of_tables and not it.shown_default and it.default != "":
+            entry["default"] = json_value(it.default)
+        if it.key:
+            inside[it.key[-1]] = entry
+    return root
+
+
+def json_value(value: object) -> object:
+    """A setting's value as JSON has it: addresses as text, rules as objects of the keys that they have."""
+    if isinstance(value, tuple):
+        return [json_value(element) for element in value]
+    if isinstance(value, Multicast | HostPort):
+        return str(value) if value != Multicast(enabled=False) else False
+    if is_dataclass(value) and not isinstance(value, type):
+        return {key: json_value(part) for key, part in asdict(value).items() if part is not None}
+    return value.value if isinstance(value, StrEnum) else value
+
+
+def schema_text() -> str:
+    """The JSON Schema as it is printed and stands in docs/."""
+    return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"

@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.runtime.loop import SystemClock
     from rmpa.runtime.tls import TlsHandshake
-    from rmpa.trust.authority import MeshAuthority
-    from rmpa.trust.membership import Membership
+    from rmpa.trust.membership import Membership, MeshAuthority
     from rmpa.trust.tokens import Token
 
 _log = logging.getLogger(__name__)

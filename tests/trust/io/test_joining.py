@@ -28,10 +28,17 @@ from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import SystemClock
 from rmpa.trust import certificates
 from rmpa.trust import store as files_of
-from rmpa.trust.authority import MeshAuthority, found_mesh, request_der, request_pem
 from rmpa.trust.certificates import make_request
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
-from rmpa.trust.membership import Membership, new_key, private_key
+from rmpa.trust.membership import (
+    Membership,
+    MeshAuthority,
+    found_mesh,
+    new_key,
+    private_key,
+    request_der,
+    request_pem,
+)
 from rmpa.trust.permissions import TrustError
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, TrustStore, join_context, member_context
 from rmpa.trust.tokens import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
