@@ -169,7 +169,7 @@ def node_ping(node: str, count: int | None, interval: float, everything: bool, o
     master = options.master()
     found = _named(master, (node,) if node else (), everything=everything)
     if everything:
-        answers = [_ping(master, one, 1, as_json=options.as_json) for one in found]
+        answers = [_ping(master, one, 1, options) for one in found]
         return 0 if all(answers) else 1
     require_peer(master, Graph(), found[0])
     answered = sent = 0
@@ -178,11 +178,11 @@ def node_ping(node: str, count: int | None, interval: float, everything: bool, o
             if sent:
                 time.sleep(interval)
             sent += 1
-            answered += _ping(master, found[0], sent, as_json=options.as_json)
+            answered += _ping(master, found[0], sent, options)
     return 0 if answered else 1
 
 
-def _ping(master: Master, wanted: GraphName, number: int, *, as_json: bool) -> bool:
+def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> bool:
     """Ping a node once and print the result; return whether it answered."""
 
     async def here() -> NodePing:
@@ -195,17 +195,12 @@ def _ping(master: Master, wanted: GraphName, number: int, *, as_json: bool) -> b
         far = wanted.peer is not None
         answer = _ask_peer(master, wanted, "node.ping", NodePing) if far else asyncio.run(here())
     except RmpaError as error:
-        if as_json:
-            print_json(about | {"error": str(error)})
-        else:
-            print_text(f"{wanted}: seq={number} {error}")
+        options.show(about | {"error": str(error)}, f"{wanted}: seq={number} {error}")
         return False
     taken = time.monotonic() - begin if far else answer.time
-    if as_json:
-        print_json(about | {"time": taken, "node_time": answer.time, "uri": answer.uri, "pid": answer.pid})
-    else:
-        there = f" ({answer.time * 1e3:.3f} ms there)" if far else ""
-        print_text(f"{wanted} ({answer.uri}): seq={number} time={taken * 1e3:.3f} ms{there} pid={answer.pid}")
+    there = f" ({answer.time * 1e3:.3f} ms there)" if far else ""
+    text = f"{wanted} ({answer.uri}): seq={number} time={taken * 1e3:.3f} ms{there} pid={answer.pid}"
+    options.show(about | {"time": taken, "node_time": answer.time, "uri": answer.uri, "pid": answer.pid}, text)
     return True
 
 

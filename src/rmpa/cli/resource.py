@@ -37,19 +37,10 @@ _ANSWER: Final = 3.0
 _LOOK: Final = 1.0
 # By state, or by level of an alarm.
 _COLOURS: Final = {
-    "active": "green",
-    "inactive": "yellow",
-    "unconfigured": "yellow",
-    "finalized": "red",
-    "OK": "green",
-    "WARN": "yellow",
-    "ERROR": "red",
+    **dict.fromkeys(("active", "OK"), "green"),
+    **dict.fromkeys(("inactive", "unconfigured", "WARN"), "yellow"),
+    **dict.fromkeys(("finalized", "ERROR"), "red"),
     "STALE": "magenta",
-}
-_SILENT: Final[dict[str, Any]] = {
-    "level": "STALE",
-    "message": "it has sent no quality while we listened",
-    "values": {},
 }
 
 
@@ -305,7 +296,8 @@ def alarm_list(everything: bool, options: Options) -> None:
         found = []
         for one in graph.seen:
             statuses = heard[one].status if one in heard else ()
-            health = status_of(statuses[0]) if statuses else _SILENT
+            silent = {"level": "STALE", "message": "it has sent no quality while we listened", "values": {}}
+            health = status_of(statuses[0]) if statuses else silent
             if everything or health["level"] != "OK":
                 found.append((one, health))
         rows = [(str(one), health["level"], health["message"]) for one, health in found]

@@ -28,7 +28,7 @@ from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import FrameType, TracebackType
+    from types import FrameType
 
     from rmpa.resource.declare import Parameter
     from rmpa.resource.resource import Resource
@@ -264,9 +264,7 @@ class ModuleAgent:
         self.process = subprocess.Popen(command, start_new_session=True, preexec_fn=tie, env=environ)  # noqa: S603, PLW1509
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
     def core(self) -> str:

@@ -123,7 +123,7 @@ class TcpSocket:
 
 def ask_listening_ports() -> set[int] | None:
     """TCP ports in state LISTEN; ``None`` where the kernel does not report them. It takes some 0.1 ms."""
-    found = listening_sockets()
+    found = _dump(_LISTEN)
     return None if found is None else {of.local[1] for of in found}
 
 
@@ -136,16 +136,8 @@ def listening_addresses(port: int) -> frozenset[str] | None:
     """
     if port not in _TCP_PORTS:
         return frozenset()
-    found = listening_sockets(port)
+    found = _dump(_LISTEN, port)
     return None if found is None else frozenset(of.local[0] for of in found)
-
-
-def listening_sockets(port: int = 0) -> list[TcpSocket] | None:
-    """The TCP sockets in state LISTEN, at one port or at any; ``None`` where the kernel does not report them.
-
-    It takes some 0.1 ms.
-    """
-    return _dump(_LISTEN, port)
 
 
 def program_at(port: int) -> str:

@@ -334,14 +334,15 @@ def issue(
         hosts: Names and addresses of its page, as the authority grants them.
     """
     authority = x509.load_der_x509_certificate(ca)
-    key = _load_key(request.public_key)
+    issuer = _elliptic(authority.public_key())
+    key = _elliptic(serialization.load_der_public_key(request.public_key))
     names = (*server_names(request.name), "127.0.0.1", *hosts)
     begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + lifetime)
     certificate = (
         _builder(_name(request.name), authority.subject, key, serial, begin, end, ca=False)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
         .add_extension(_subject_alternative(request.name, names), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_authority_key(authority)), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer), critical=False)
         .sign(ca_key, hashes.SHA256())
     )
     return certificate.public_bytes(serialization.Encoding.DER)
@@ -442,16 +443,9 @@ def ca_public_key(ca: bytes) -> ec.EllipticCurvePublicKey:
         TrustError: It cannot be read, or has no such key.
     """
     try:
-        return _authority_key(x509.load_der_x509_certificate(ca))
+        return _elliptic(x509.load_der_x509_certificate(ca).public_key())
     except _UNREADABLE as error:
         raise TrustError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
-
-
-def _authority_key(authority: x509.Certificate) -> ec.EllipticCurvePublicKey:
-    key = authority.public_key()
-    if not isinstance(key, ec.EllipticCurvePublicKey):
-        raise TypeError("its key is not of an elliptic curve")
-    return key
 
 
 def _module_name(holder: x509.Certificate | x509.CertificateSigningRequest) -> str:
@@ -481,10 +475,9 @@ def _hosts_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> froz
     return frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
 
 
-def _load_key(data: bytes) -> ec.EllipticCurvePublicKey:
-    key = serialization.load_der_public_key(data)
+def _elliptic(key: object) -> ec.EllipticCurvePublicKey:
     if not isinstance(key, ec.EllipticCurvePublicKey):
-        raise TypeError("the key is not of an elliptic curve")
+        raise TypeError("its key is not of an elliptic curve")
     return key
 
 
