@@ -15,15 +15,7 @@ import click
 
 from rmpa.cli.options import Options, argument, config_option, flag, json_verb
 from rmpa.cli.output import Table, duration, warn
-from rmpa.config.module_name import (
-    GATEWAY_SUFFIX,
-    NameSource,
-    choose_name,
-    keep_name,
-    kept_name,
-    note_state_dir,
-    state_dir,
-)
+from rmpa.config import module_name
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.config.read import load_settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
@@ -172,14 +164,14 @@ def find_module(
             raise ConfigError(source, problem)
     loaded = load_settings(options, environ, host_name=socket.gethostname())
     agents = find_agents(environ)
-    names = {**loaded.names, NameSource.AGENT_VARIABLE: environ.get("RMPA_AGENT", "")}
+    names = {**loaded.names, module_name.NameSource.AGENT_VARIABLE: environ.get("RMPA_AGENT", "")}
     if name:
-        names[NameSource.OPTION] = name
-    chosen = choose_name(names, *running_agents(agents, environ))
+        names[module_name.NameSource.OPTION] = name
+    chosen = module_name.choose_name(names, *running_agents(agents, environ))
     loaded = replace(loaded, settings=replace(loaded.settings, name=chosen.name))
     path = next((agent.path for agent in agents if agent.name == chosen.name), None)
     if path is None:
-        return Module(chosen, loaded, state_dir(environ, loaded.settings.state_dir))
+        return Module(chosen, loaded, module_name.state_dir(environ, loaded.settings.state_dir))
     with ControlClient(path) as client:
         trust, config_file = client.call("trust", TrustStatus, what="status"), client.agent().config_file
     # The agent may have been started with another state directory than this shell has.
@@ -210,14 +202,14 @@ def keep_member_name(module: Module) -> str:
 
     The name of another module that has keys itself stays. A gateway's is none of a module.
     """
-    if module.name.endswith(GATEWAY_SUFFIX):
+    if module.name.endswith(module_name.GATEWAY_SUFFIX):
         return f"rmpa gateway --name {module.name}"
     usual = ""
     try:
-        kept = kept_name(module.place)
+        kept = module_name.kept_name(module.place)
         if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
-            keep_name(module.place, module.name, instead=True)
-        note_state_dir(os.environ, module.place)
+            module_name.keep_name(module.place, module.name, instead=True)
+        module_name.note_state_dir(os.environ, module.place)
         config = {"config": module.loaded.settings.config_file}
         usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
     except RmpaError as error:

@@ -12,20 +12,7 @@ from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config import limits
-from rmpa.config.peer_rules import (
-    MODULE_GROUPS,
-    PEER_RULES,
-    PERMISSION_DEFAULT,
-    PERMISSION_RULES,
-    SERVICE_RULES,
-    TRANSPORT,
-    ModuleGroup,
-    PeerRule,
-    PermissionRule,
-    PolicySettings,
-    ServiceRule,
-)
+from rmpa.config import limits, peer_rules
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
 from rmpa.config.schema import setting, settings_of, table
 from rmpa.config.values import (
@@ -85,12 +72,12 @@ class ServiceSettings:
     )
     transport: Transport = setting(
         DEFAULT_TRANSPORT,
-        TRANSPORT,
+        peer_rules.TRANSPORT,
         "The path of calls, unless a [[service]] says another; the words are those of bridge.transport.",
     )
-    rules: tuple[ServiceRule, ...] = setting(
+    rules: tuple[peer_rules.ServiceRule, ...] = setting(
         (),
-        SERVICE_RULES,
+        peer_rules.SERVICE_RULES,
         "Time-outs and transports of single services; of each, the first that fits holds.",
         key="service",
     )
@@ -218,13 +205,13 @@ class TrustSettings:
 
     default: str = setting(
         "deny",
-        PERMISSION_DEFAULT,
+        peer_rules.PERMISSION_DEFAULT,
         "What holds where no [[permission]] fits: deny; or allow, and every member of the mesh may do everything.",
         live=True,
     )
-    groups: tuple[ModuleGroup, ...] = setting(
+    groups: tuple[peer_rules.ModuleGroup, ...] = setting(
         (),
-        MODULE_GROUPS,
+        peer_rules.MODULE_GROUPS,
         "Names for sets of modules, each a list of globs over modules' names.",
         shown_default="none",
         live=True,
@@ -248,9 +235,9 @@ class TrustSettings:
         "Start without trust beside keys of other modules; a module with keys of its own is secured all the same.",
         option="--insecure",
     )
-    rules: tuple[PermissionRule, ...] = setting(
+    rules: tuple[peer_rules.PermissionRule, ...] = setting(
         (),
-        PERMISSION_RULES,
+        peer_rules.PERMISSION_RULES,
         "What other modules may do here; a deny that fits wins over an allow.",
         key="permission",
         live=True,
@@ -328,10 +315,10 @@ class Settings:
         key="discovery.multicast",
         option="--multicast",
     )
-    policy: PolicySettings = table(PolicySettings, "bridge", live=True)
+    policy: peer_rules.PolicySettings = table(peer_rules.PolicySettings, "bridge", live=True)
     transport: Transport = setting(
         DEFAULT_TRANSPORT,
-        TRANSPORT,
+        peer_rules.TRANSPORT,
         "The path of topics' messages, unless a [[contract]] says another. relay: through the agents; "
         "auto: from node to node where it can be; direct: likewise, with a warning where it cannot.",
         key="bridge.transport",
@@ -345,8 +332,12 @@ class Settings:
         option="--prefix-peers",
         live=True,
     )
-    peers: tuple[PeerRule, ...] = setting(
-        (), PEER_RULES, "Names and policy for single peers; all that fit apply, in order.", key="peer", live=True
+    peers: tuple[peer_rules.PeerRule, ...] = setting(
+        (),
+        peer_rules.PEER_RULES,
+        "Names and policy for single peers; all that fit apply, in order.",
+        key="peer",
+        live=True,
     )
     contracts: tuple[ContractRule, ...] = setting(
         (),
@@ -397,9 +388,9 @@ class Settings:
         return Contracts(self.contracts, self.transport)
 
     @property
-    def naming(self) -> tuple[PeerRule, ...]:
+    def naming(self) -> tuple[peer_rules.PeerRule, ...]:
         """The rules for peers' names: ``[[peer]]``, and behind them the prefix that ``prefix_peers`` gives to all."""
-        return (*self.peers, PeerRule("*", f"/{PEER}")) if self.prefix_peers else self.peers
+        return (*self.peers, peer_rules.PeerRule("*", f"/{PEER}")) if self.prefix_peers else self.peers
 
     @property
     def allows_direct(self) -> bool:

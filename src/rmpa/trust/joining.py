@@ -14,26 +14,12 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
-from rmpa.trust import certificates, limits
+from rmpa.trust import certificates, limits, tokens
 from rmpa.trust import store as files_of
 from rmpa.trust.certificates import DenyList, KeyList, read_document
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, join_context, member_context
-from rmpa.trust.tokens import (
-    LENGTH,
-    TOKEN_PROBLEMS,
-    CertificateGrant,
-    Join,
-    JoinMessage,
-    JoinRefused,
-    Renew,
-    decode_message,
-    encode_message,
-    fingerprint_of,
-    message_length,
-    proof_of,
-)
 
 if TYPE_CHECKING:
     import socket
@@ -84,7 +70,7 @@ class JoinServer:
         """
         loop, tls, data = asyncio.get_running_loop(), handshake.tls, b""
         async with asyncio.timeout(limits.JOIN_STEP_TIMEOUT):
-            size = LENGTH.size
+            size = tokens.LENGTH.size
             while len(data) < size:
                 try:
                     data += tls.read(_READ)
@@ -93,13 +79,17 @@ class JoinServer:
                     if not raw:
                         raise ConnectionError("closed the connection before its question was whole") from None
                     handshake.receive(raw)
-                if len(data) >= LENGTH.size:
-                    size = LENGTH.size + message_length(data, limits.JOIN_REQUEST_MAX)
-            answer = self.answer(decode_message(data[LENGTH.size : size]), tls.getpeercert(binary_form=True), host)
-            tls.write(encode_message(answer))
+                if len(data) >= tokens.LENGTH.size:
+                    size = tokens.LENGTH.size + tokens.message_length(data, limits.JOIN_REQUEST_MAX)
+            answer = self.answer(
+                tokens.decode_message(data[tokens.LENGTH.size : size]), tls.getpeercert(binary_form=True), host
+            )
+            tls.write(tokens.encode_message(answer))
             await loop.sock_sendall(sock, handshake.take_output())
 
-    def answer(self, asked: JoinMessage, presented: bytes | None, host: str) -> CertificateGrant | JoinRefused:
+    def answer(
+        self, asked: tokens.JoinMessage, presented: bytes | None, host: str
+    ) -> tokens.CertificateGrant | tokens.JoinRefused:
         """Answer a question; what it changes is written to files before.
 
         Args:
@@ -110,30 +100,32 @@ class JoinServer:
         Raises:
             RemoteProtocolError: It is no question.
         """
-        what = "renewal" if isinstance(asked, Renew) else "join"
+        what = "renewal" if isinstance(asked, tokens.Renew) else "join"
         try:
-            if isinstance(asked, Join):
+            if isinstance(asked, tokens.Join):
                 return self._join(asked, host)
-            if not isinstance(asked, Renew) or presented is None:
+            if not isinstance(asked, tokens.Renew) or presented is None:
                 raise RemoteProtocolError("a join or renewal that begins with something else than its question")
             before = self._authority.judge_renewal(presented)
             grant = self._authority.grant(asked.request, before.name)
             _log.info("= %s at %s has a new certificate; it was away", before.name, host)
         except TrustError as error:
-            refused = JoinRefused(error.reason.label, str(error))
+            refused = tokens.JoinRefused(error.reason.label, str(error))
         except StartError as error:
-            refused = JoinRefused("clock" if self._authority.membership.wall() is None else "authority", str(error))
+            refused = tokens.JoinRefused(
+                "clock" if self._authority.membership.wall() is None else "authority", str(error)
+            )
         else:
             return grant
         return self._refuse(what, host, refused)
 
-    def _refuse(self, what: str, host: str, refused: JoinRefused) -> JoinRefused:
+    def _refuse(self, what: str, host: str, refused: tokens.JoinRefused) -> tokens.JoinRefused:
         """Log what each connection can repeat, within limits."""
         text = f"refused a {what} by {host} ({refused.reason}): {refused.text}"
         self._refusals.refuse(self._clock.now(), f"trust.{what}_refused", host, text)
         return refused
 
-    def _join(self, asked: Join, host: str) -> CertificateGrant | JoinRefused:
+    def _join(self, asked: tokens.Join, host: str) -> tokens.CertificateGrant | tokens.JoinRefused:
         """Let a module join: its token is used, also after a crash, before a certificate is issued."""
         book, authority = self._authority.book, self._authority
         name = certificates.read_request(asked.request).name
@@ -141,13 +133,15 @@ class JoinServer:
         problem = book.judge(asked.token, name, authority.wall())
         # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
         server = self._authority.membership.files.certificate
-        proof = proof_of(invitation.key if invitation is not None else b"", asked.request, server)
+        proof = tokens.proof_of(invitation.key if invitation is not None else b"", asked.request, server)
         if problem:
-            refused = JoinRefused(problem, f"{name} cannot join: the token {TOKEN_PROBLEMS[problem]}")
+            refused = tokens.JoinRefused(problem, f"{name} cannot join: the token {tokens.TOKEN_PROBLEMS[problem]}")
         elif not hmac.compare_digest(proof, asked.proof):
-            refused = JoinRefused("token", "the request is not signed with the token's key")
+            refused = tokens.JoinRefused("token", "the request is not signed with the token's key")
         elif self._is_linked(name) or authority.has_issued(name, invitation.name if invitation is not None else ""):
-            refused = JoinRefused("taken", f"a module named {name} is a member: choose another --name, or revoke it")
+            refused = tokens.JoinRefused(
+                "taken", f"a module named {name} is a member: choose another --name, or revoke it"
+            )
         else:
             book.use(asked.token, name, authority.wall())
             authority.save_tokens()
@@ -165,7 +159,7 @@ class JoinServer:
         """What came of a token so far, as ``rmpa trust invite`` shows it."""
         return self._steps.get(token_id, JoinStep(step=0, state="waiting"))
 
-    def _step(self, token_id: bytes, state: str, module: str, refused: JoinRefused | None = None) -> None:
+    def _step(self, token_id: bytes, state: str, module: str, refused: tokens.JoinRefused | None = None) -> None:
         while len(self._steps) >= limits.TOKENS_MAX:
             del self._steps[next(iter(self._steps))]
         reason, text = (refused.reason, refused.text) if refused is not None else ("", "")
@@ -198,8 +192,8 @@ def _refused(reason: str, text: str) -> PeerRefused:
 
 
 async def _ask(
-    address: str, port: int, context: ssl.SSLContext, question: Callable[[bytes], JoinMessage]
-) -> tuple[CertificateGrant, bytes]:
+    address: str, port: int, context: ssl.SSLContext, question: Callable[[bytes], tokens.JoinMessage]
+) -> tuple[tokens.CertificateGrant, bytes]:
     """Ask the authority; return its answer and its certificate (DER).
 
     Args:
@@ -231,18 +225,18 @@ async def _ask(
             raise RemoteProtocolError(f"the module at {where} is not the authority of its mesh")
         server = tls.getpeercert(binary_form=True) or b""
         async with asyncio.timeout(limits.JOIN_STEP_TIMEOUT):
-            writer.write(encode_message(question(server)))
-            size = message_length(await reader.readexactly(LENGTH.size), limits.JOIN_ANSWER_MAX)
-            answer = decode_message(await reader.readexactly(size))
+            writer.write(tokens.encode_message(question(server)))
+            size = tokens.message_length(await reader.readexactly(tokens.LENGTH.size), limits.JOIN_ANSWER_MAX)
+            answer = tokens.decode_message(await reader.readexactly(size))
     except (OSError, TimeoutError, asyncio.IncompleteReadError):
         raise UnreachableError("authority", where, "it did not answer; its log may say why") from None
     finally:
         writer.close()
         with contextlib.suppress(OSError):
             await writer.wait_closed()
-    if isinstance(answer, JoinRefused):
+    if isinstance(answer, tokens.JoinRefused):
         raise _refused(answer.reason, answer.text)
-    if not isinstance(answer, CertificateGrant):
+    if not isinstance(answer, tokens.CertificateGrant):
         raise RemoteProtocolError("the authority answers by something else than a certificate")
     return answer, server
 
@@ -260,8 +254,8 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
     pem = new_key()
     request = certificates.make_request(private_key(pem, files_of.KEY), name)
 
-    def question(server: bytes) -> Join:
-        return Join(token.token_id, request, proof_of(token.key, request, server))
+    def question(server: bytes) -> tokens.Join:
+        return tokens.Join(token.token_id, request, tokens.proof_of(token.key, request, server))
 
     grant, server = await _ask(str(token.address), token.port, join_context(), question)
     try:
@@ -273,7 +267,7 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
     return MemberFiles(pem, grant.certificate, grant.ca, grant.keys, grant.deny)
 
 
-def check_grant(grant: CertificateGrant, name: str, request: bytes) -> None:
+def check_grant(grant: tokens.CertificateGrant, name: str, request: bytes) -> None:
     """Check that a grant, whose CA is the right one, is for this module and its request (DER).
 
     Raises:
@@ -294,11 +288,11 @@ async def renew_at_authority(membership: Membership, address: str, port: int) ->
     store = membership.store
     files = store.path(files_of.CERTIFICATE), store.path(files_of.KEY)
 
-    def question(server: bytes) -> Renew:
+    def question(server: bytes) -> tokens.Renew:
         name = certificates.verify(server, membership.files.ca, None).name
         if name != membership.keys.authority:
             raise RemoteProtocolError(f"the module at {address}:{port} is {name}, not the authority")
-        return Renew(membership.request())
+        return tokens.Renew(membership.request())
 
     context = member_context(*files, membership.files.ca, ALPN_JOIN, server_side=False)
     grant, _ = await _ask(address, port, context, question)
@@ -336,7 +330,7 @@ def status_of(
         agent=agent,
         is_authority=authority is not None,
         authority=name,
-        fingerprint=fingerprint_of(membership.files.ca).hex(),
+        fingerprint=tokens.fingerprint_of(membership.files.ca).hex(),
         issued=int(certificate.issued),
         expires=int(certificate.expires),
         renew_at=int(certificate.renew_at),
