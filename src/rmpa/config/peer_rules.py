@@ -13,37 +13,16 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.config import limits
+from rmpa.config import limits, values
 from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting
-from rmpa.config.values import (
-    PEER,
-    PEER_GLOB,
-    SERVICE_GLOB,
-    SOME_PEER,
-    TIMEOUT,
-    TOPIC_GLOB,
-    TYPE_GLOB,
-    BadValue,
-    Place,
-    ValueType,
-    did_you_mean,
-    glob_over,
-    list_of,
-    member_of,
-    read_at,
-    read_text,
-    text_like,
-    text_type,
-    word_of,
-)
 from rmpa.core.contract import Transport
 from rmpa.core.identity import NEVER_CROSSING, is_global_name, matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-TRANSPORT: Final = member_of(Transport, "a transport")
-_WITH_PEER: Final = ("/**", f"/{PEER}/**")
+TRANSPORT: Final = values.member_of(Transport, "a transport")
+_WITH_PEER: Final = ("/**", f"/{values.PEER}/**")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +33,14 @@ class PolicySettings:
     must let it cross. A ``[[peer]]`` has the same four keys for its peers.
     """
 
-    allow: tuple[str, ...] = setting(("/**",), list_of(TOPIC_GLOB), "Topics that may cross; `[]` lets none cross.")
-    deny: tuple[str, ...] = setting((), list_of(TOPIC_GLOB), "Topics that stay home, besides the built-in ones.")
-    allow_types: tuple[str, ...] = setting(("**",), list_of(TYPE_GLOB), "Message types that may cross.")
-    deny_types: tuple[str, ...] = setting((), list_of(TYPE_GLOB), "Message types that stay home.")
+    allow: tuple[str, ...] = setting(
+        ("/**",), values.list_of(values.TOPIC_GLOB), "Topics that may cross; `[]` lets none cross."
+    )
+    deny: tuple[str, ...] = setting(
+        (), values.list_of(values.TOPIC_GLOB), "Topics that stay home, besides the built-in ones."
+    )
+    allow_types: tuple[str, ...] = setting(("**",), values.list_of(values.TYPE_GLOB), "Message types that may cross.")
+    deny_types: tuple[str, ...] = setting((), values.list_of(values.TYPE_GLOB), "Message types that stay home.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +49,12 @@ class ServiceRule:
 
     names: tuple[str, ...] = setting(
         NEEDED,
-        list_of(SERVICE_GLOB, if_empty="name some services"),
+        values.list_of(values.SERVICE_GLOB, if_empty="name some services"),
         "Globs over services, by their names here.",
     )
-    timeout: float | None = setting(None, TIMEOUT, "How long a call may take: seconds, or a text such as 5 min.")
+    timeout: float | None = setting(
+        None, values.TIMEOUT, "How long a call may take: seconds, or a text such as 5 min."
+    )
     transport: Transport | None = setting(
         None, TRANSPORT, "relay: through the agents; direct, auto: from node to node where it can be."
     )
@@ -78,10 +63,10 @@ class ServiceRule:
 _SERVICE_EXAMPLE: Final = 'one has names = ["/plan/**"] and timeout = "5 min", or transport = "direct"'
 
 
-def _make_service(values: dict[str, Any]) -> ServiceRule:
-    if len(values) == 1:
-        raise BadValue("a rule without timeout and transport", _SERVICE_EXAMPLE)
-    return ServiceRule(**values)
+def _make_service(given: dict[str, Any]) -> ServiceRule:
+    if len(given) == 1:
+        raise values.BadValue("a rule without timeout and transport", _SERVICE_EXAMPLE)
+    return ServiceRule(**given)
 
 
 SERVICE_RULES: Final = rules_of(keys_of(ServiceRule), _make_service, _SERVICE_EXAMPLE)
@@ -93,11 +78,11 @@ Renames = tuple[tuple[str, str], ...]
 
 
 def _read_prefix(raw: object) -> str:
-    prefix = read_text(raw).strip()
+    prefix = values.read_text(raw).strip()
     if prefix.strip("/") == "":
-        raise BadValue(f"{prefix!r} puts nothing in front", "leave it out, or name a namespace")
+        raise values.BadValue(f"{prefix!r} puts nothing in front", "leave it out, or name a namespace")
     if prefix != (better := "/" + prefix.strip("/")):
-        raise BadValue(f"{prefix!r} is not a namespace", better=better)
+        raise values.BadValue(f"{prefix!r} is not a namespace", better=better)
     _check_name(prefix)
     return prefix
 
@@ -105,46 +90,48 @@ def _read_prefix(raw: object) -> str:
 def _read_renames(raw: Mapping[str, str]) -> Renames:
     """A table ``remap_in`` or ``remap_out``: the name after, by the name before."""
     if len(raw) > limits.REMAPS_MAX:
-        raise BadValue(f"{len(raw)} rules", f"at most {limits.REMAPS_MAX}; rename namespaces")
+        raise values.BadValue(f"{len(raw)} rules", f"at most {limits.REMAPS_MAX}; rename namespaces")
 
     def read(renaming: tuple[str, str]) -> tuple[str, str]:
         before, after = map(_read_end, renaming)
         if before.endswith("/**") is not after.endswith("/**"):
             remedy = "a namespace becomes a namespace: both end with /**, or none"
-            raise BadValue(f"{before} and {after} do not fit each other", remedy)
+            raise values.BadValue(f"{before} and {after} do not fit each other", remedy)
         return before, after
 
-    return tuple(read_at(renaming[0], read, renaming) for renaming in raw.items())
+    return tuple(values.read_at(renaming[0], read, renaming) for renaming in raw.items())
 
 
 def _read_end(raw: object) -> str:
     """One end of a renaming: a name, or a namespace followed by ``/**``."""
-    end = read_text(raw).strip()
+    end = values.read_text(raw).strip()
     stem = end.removesuffix("/**")
     if re.search(r"[*?]", stem):
-        raise BadValue(f"{end!r} is not a name", "a rule renames /one/name, or all of a /namespace/**")
+        raise values.BadValue(f"{end!r} is not a name", "a rule renames /one/name, or all of a /namespace/**")
     if stem and not stem.startswith("/"):
-        raise BadValue(f"{end!r} is not a global name", better=f"/{end}")
+        raise values.BadValue(f"{end!r} is not a global name", better=f"/{end}")
     if stem or end != "/**":
         _check_name(stem)
     return end
 
 
 def _check_name(name: str) -> None:
-    filled = name.replace(PEER, SOME_PEER)
+    filled = name.replace(values.PEER, values.SOME_PEER)
     if name == "/" or not is_global_name(filled):
-        raise BadValue(
+        raise values.BadValue(
             f"{name!r} is not a ROS name", "one looks like /robot1/odom; {peer} stands for the peer's name"
         )
     if len(filled) > limits.CROSSING_NAME_MAX:
-        raise BadValue(f"a name of {len(filled)} characters", f"at most {limits.CROSSING_NAME_MAX} cross the mesh")
+        raise values.BadValue(
+            f"a name of {len(filled)} characters", f"at most {limits.CROSSING_NAME_MAX} cross the mesh"
+        )
     for pattern, why in NEVER_CROSSING.items():
         if matches(pattern, filled):
-            raise BadValue(f"{name} never crosses: {why}", "leave this rule out")
+            raise values.BadValue(f"{name} never crosses: {why}", "leave this rule out")
 
 
-_RENAMES: Final = ValueType(_read_renames, {"type": "object", "additionalProperties": {"type": "string"}})
-_PEER_TOPICS: Final = list_of(glob_over("topic", *_WITH_PEER))
+_RENAMES: Final = values.ValueType(_read_renames, {"type": "object", "additionalProperties": {"type": "string"}})
+_PEER_TOPICS: Final = values.list_of(values.glob_over("topic", *_WITH_PEER))
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,9 +142,11 @@ class PeerRule:
     our names with ``{peer}``.
     """
 
-    name: str = setting(NEEDED, PEER_GLOB, "The peers, by a glob over their names.")
+    name: str = setting(NEEDED, values.PEER_GLOB, "The peers, by a glob over their names.")
     prefix: str = setting(
-        "", text_type(_read_prefix, f"/{PEER}"), "A namespace for their names here; {peer} is the peer's name."
+        "",
+        values.text_type(_read_prefix, f"/{values.PEER}"),
+        "A namespace for their names here; {peer} is the peer's name.",
     )
     remap_in: Renames = setting((), _RENAMES, "Their names, and what they are here.")
     remap_out: Renames = setting((), _RENAMES, "Our names, and what they are there.")
@@ -167,14 +156,14 @@ class PeerRule:
 _POLICY_KEYS: Final = {
     "allow": Setting(_PEER_TOPICS, "Topics that may cross, on top of [bridge], by their names here."),
     "deny": Setting(_PEER_TOPICS, "Topics that stay home."),
-    "allow_types": Setting(list_of(TYPE_GLOB), "Message types that may cross."),
-    "deny_types": Setting(list_of(TYPE_GLOB), "Message types that stay home."),
+    "allow_types": Setting(values.list_of(values.TYPE_GLOB), "Message types that may cross."),
+    "deny_types": Setting(values.list_of(values.TYPE_GLOB), "Message types that stay home."),
 }
 
 
-def _make_peer(values: dict[str, Any]) -> PeerRule:
-    policy = PolicySettings(**{key: values.pop(key) for key in _POLICY_KEYS if key in values})
-    return PeerRule(**values, policy=policy)
+def _make_peer(given: dict[str, Any]) -> PeerRule:
+    policy = PolicySettings(**{key: given.pop(key) for key in _POLICY_KEYS if key in given})
+    return PeerRule(**given, policy=policy)
 
 
 PEER_RULES: Final = rules_of(
@@ -184,13 +173,13 @@ PEER_RULES: Final = rules_of(
 )
 
 
-def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[tuple[Place, str]]:
+def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[tuple[values.Place, str]]:
     """Rules that can be used but are probably mistakes: where, and what about it."""
     for index, rule in enumerate(rules):
         if rule == PeerRule(rule.name):
             yield (index,), "a rule that sets nothing"
-        if rule.prefix and PEER not in rule.prefix and re.search(r"[*?]", rule.name):
-            text = f"{rule.prefix} is one place for every peer that {rule.name} fits; /{PEER} would keep them apart"
+        if rule.prefix and values.PEER not in rule.prefix and re.search(r"[*?]", rule.name):
+            text = f"{rule.prefix} is one place for every peer that {rule.name} fits; /{values.PEER} would keep them apart"
             yield (index, "prefix"), text
 
 
@@ -225,7 +214,7 @@ class Access(StrEnum):
 ACTION_CLIENT: Final = "action"
 # The key of a rule about actions of the other module, whose clients are here.
 ACTION_SERVER: Final = "action_serve"
-_GROUP_NAME: Final = text_like(
+_GROUP_NAME: Final = values.text_like(
     "[A-Za-z][A-Za-z0-9_]{0,63}",
     "a group's name",
     "one has a letter, then letters, digits and _",
@@ -256,24 +245,24 @@ class PermissionRule:
 
     modules: tuple[str, ...] = setting(
         (),
-        list_of(PEER_GLOB, if_empty="leave modules out, or name some"),
+        values.list_of(values.PEER_GLOB, if_empty="leave modules out, or name some"),
         "The modules, by globs over their names.",
     )
     groups: tuple[str, ...] = setting(
         (),
-        list_of(_GROUP_NAME, if_empty="leave groups out, or name some"),
+        values.list_of(_GROUP_NAME, if_empty="leave groups out, or name some"),
         "The groups of [trust.groups] whose modules it is about, too.",
     )
     effect: Effect = setting(
         Effect.ALLOW,
-        member_of(Effect, "an effect"),
+        values.member_of(Effect, "an effect"),
         "allow, which is the default, or deny, which wins where both fit.",
     )
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-def _globs_over(what: str) -> ValueType[tuple[str, ...]]:
-    return list_of(glob_over(what, *_WITH_PEER), if_empty="leave the key out, or name some")
+def _globs_over(what: str) -> values.ValueType[tuple[str, ...]]:
+    return values.list_of(values.glob_over(what, *_WITH_PEER), if_empty="leave the key out, or name some")
 
 
 _NAME_KEYS: Final = {
@@ -290,14 +279,14 @@ _NAME_KEYS: Final = {
 NAME_KEYS: Final = tuple(_NAME_KEYS)
 
 
-def _make_permission(values: dict[str, Any]) -> PermissionRule:
-    names = {key: values.pop(key) for key in NAME_KEYS if key in values}
-    rule = PermissionRule(**values, names=names)
+def _make_permission(given: dict[str, Any]) -> PermissionRule:
+    names = {key: given.pop(key) for key in NAME_KEYS if key in given}
+    rule = PermissionRule(**given, names=names)
     if not rule.modules and not rule.groups:
-        raise BadValue("a rule without modules and groups", 'modules = ["*"] makes it one for every module')
+        raise values.BadValue("a rule without modules and groups", 'modules = ["*"] makes it one for every module')
     if not names:
         example = 'one has modules = ["joystick"] and publish = ["/cmd_vel"]'
-        raise BadValue(f"a rule that {'denies' if rule.effect is Effect.DENY else 'allows'} nothing", example)
+        raise values.BadValue(f"a rule that {'denies' if rule.effect is Effect.DENY else 'allows'} nothing", example)
     return rule
 
 
@@ -307,37 +296,37 @@ PERMISSION_RULES: Final = rules_of(
     most=limits.PERMISSION_RULES_MAX,
     instead="make groups of modules",
 )
-_GROUP: Final = list_of(PEER_GLOB, if_empty="leave the group out, or name some modules")
+_GROUP: Final = values.list_of(values.PEER_GLOB, if_empty="leave the group out, or name some modules")
 
 
 def _read_groups(raw: object) -> tuple[ModuleGroup, ...]:
     if raw == ():
         return ()
     if not isinstance(raw, dict):
-        raise BadValue(f"{raw!r} is not a table", 'operators = ["joystick", "laptop*"] is a group')
+        raise values.BadValue(f"{raw!r} is not a table", 'operators = ["joystick", "laptop*"] is a group')
     if len(raw) > limits.GROUPS_MAX:
-        raise BadValue(f"{len(raw)} groups", f"at most {limits.GROUPS_MAX}")
+        raise values.BadValue(f"{len(raw)} groups", f"at most {limits.GROUPS_MAX}")
     return tuple(
-        ModuleGroup(read_at(name, _GROUP_NAME.read, name), read_at(name, _GROUP.read, modules))
+        ModuleGroup(values.read_at(name, _GROUP_NAME.read, name), values.read_at(name, _GROUP.read, modules))
         for name, modules in raw.items()
     )
 
 
-MODULE_GROUPS: Final = ValueType(_read_groups, {"type": "object", "additionalProperties": _GROUP.json_schema})
-PERMISSION_DEFAULT: Final = word_of(
+MODULE_GROUPS: Final = values.ValueType(_read_groups, {"type": "object", "additionalProperties": _GROUP.json_schema})
+PERMISSION_DEFAULT: Final = values.word_of(
     [str(effect) for effect in Effect], "a default", "deny, or allow: every member may do everything", "EFFECT"
 )
 
 
 def permission_problems(
     rules: Sequence[PermissionRule], groups: Sequence[ModuleGroup]
-) -> Iterator[tuple[Place, str, str]]:
+) -> Iterator[tuple[values.Place, str, str]]:
     """Problems that only show when all settings are known: ``(place in [[permission]], problem, remedy)``."""
     known = [group.name for group in groups]
     for index, rule in enumerate(rules):
         for place, name in enumerate(rule.groups):
             if name not in known:
-                near = did_you_mean(name, known)
+                near = values.did_you_mean(name, known)
                 there = f"the groups are {', '.join(known)}" if known else "there are none"
                 remedy = f"did you mean {near}?" if near else f"make it in [trust.groups]; {there}"
                 yield (index, "groups", place), f"there is no group {name!r}", remedy

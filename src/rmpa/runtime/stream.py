@@ -454,13 +454,10 @@ class Stream:
         """Read the bytes that were received with a record but found no room, as the loop does not see them."""
         self._reading_held = True
         try:
-            while self._is_holding():
+            while self._secure is not None and self._secure.readable and not self.closed:
                 self._readable(held=True)
         finally:
             self._reading_held = False
-
-    def _is_holding(self) -> bool:
-        return self._secure is not None and self._secure.readable and not self.closed
 
     def _heard(self) -> None:
         """Note that bytes came now."""
