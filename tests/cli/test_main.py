@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa import __version__
-from rmpa.cli import graph
+from rmpa.cli import agent
 from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
 from tests.cli.conftest import DEADLINE, with_core
 
@@ -237,6 +237,6 @@ def test_an_agent_that_hangs_does_not_hold_up_the_shell(monkeypatch: pytest.Monk
         end.wait(DEADLINE)
         return ["late"]
 
-    monkeypatch.setitem(graph._FIND, "peer", hang)
-    assert graph.complete_names("peer", click.Context(cli), "") == []
+    monkeypatch.setitem(agent._FIND, "peer", hang)
+    assert agent.complete_names("peer", click.Context(cli), "") == []
     end.set()

@@ -104,7 +104,7 @@ VERBS: Final = {
     "config show": ("agent", "Print each setting that `rmpa up` would take here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
-    "completion": ("graph", "Print the script that completes rmpa's commands in a shell."),
+    "completion": ("agent", "Print the script that completes rmpa's commands in a shell."),
 }
 # What to use in place of a command that is gone, by its words behind ``rmpa``.
 REMOVED_VERBS: Final = {

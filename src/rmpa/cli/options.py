@@ -74,7 +74,7 @@ def completes(kind: str) -> Callable[[click.Context, click.Parameter, str], list
 
     def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
         # By its name, as commands are: it asks the agent by the modules of the commands, which import this one.
-        found: list[str] = importlib.import_module("rmpa.cli.graph").complete_names(kind, ctx, incomplete)
+        found: list[str] = importlib.import_module("rmpa.cli.agent").complete_names(kind, ctx, incomplete)
         return found
 
     return complete

@@ -179,8 +179,8 @@ def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[tuple[values.Place, str
         if rule == PeerRule(rule.name):
             yield (index,), "a rule that sets nothing"
         if rule.prefix and values.PEER not in rule.prefix and re.search(r"[*?]", rule.name):
-            text = f"{rule.prefix} is one place for every peer that {rule.name} fits; /{values.PEER} would keep them apart"
-            yield (index, "prefix"), text
+            text = f"{rule.prefix} is one place for every peer that {rule.name} fits"
+            yield (index, "prefix"), f"{text}; /{values.PEER} would keep them apart"
 
 
 # --- [[permission]] and [trust.groups] ------------------------------------------------------------------------------
