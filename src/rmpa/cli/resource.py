@@ -296,7 +296,8 @@ def alarm_list(everything: bool, options: Options) -> None:
         found = []
         for one in graph.seen:
             statuses = heard[one].status if one in heard else ()
-            silent = {"level": "STALE", "message": "it has sent no quality while we listened", "values": {}}
+            message = "it has sent no quality while we listened"
+            silent: dict[str, Any] = {"level": "STALE", "message": message, "values": {}}
             health = status_of(statuses[0]) if statuses else silent
             if everything or health["level"] != "OK":
                 found.append((one, health))
