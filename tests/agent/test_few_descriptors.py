@@ -97,8 +97,8 @@ async def test_subscribers_are_served_again(caplog: pytest.LogCaptureFixture) ->
 
 @pytest.mark.usefixtures("fresh")
 async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_limits, "TCPROS_RETRY_FIRST", 0.01)
-    monkeypatch.setattr(ros_limits, "TCPROS_RETRY_MAX", 0.02)
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_FIRST", 0.01)
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_MAX", 0.02)
     core = RosCore("127.0.0.1", 0)
     await core.start()
     lost: list[str] = []

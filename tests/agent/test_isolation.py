@@ -33,6 +33,7 @@ from rmpa.config.values import Multicast
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.membership import HEARTBEAT_INTERVAL
 from rmpa.observe.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.core.embedded import RosCore
@@ -326,7 +327,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
         with ControlClient(path, timeout=DEADLINE) as client:
             for _ in range(4):
                 client.snapshot()
-                time.sleep(2 * discovery_limits.HEARTBEAT_INTERVAL / 4)
+                time.sleep(2 * HEARTBEAT_INTERVAL / 4)
 
     await world.beside(work)
     assert world.near.network.endpoint is not None

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from rmpa.agent import agent
-from rmpa.agent.agent import Network, is_displaced
+from rmpa.agent.agent import JOIN_RETRY, Network, is_displaced
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
 from rmpa.discovery.network import Interface
-from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.virtual import VirtualLoop, run
 
 if TYPE_CHECKING:
@@ -93,7 +92,7 @@ def test_a_move_goes_on_until_the_agent_is_in_the_network_again(joined: Callable
         await sut.start()
         Endpoint.failing = 2
         made[0].displaced()
-        await asyncio.sleep(2 * mesh_limits.JOIN_RETRY + 10.0)
+        await asyncio.sleep(2 * JOIN_RETRY + 10.0)
         assert [one.closed for one in made] == [True, True, True, False]
         assert sut.endpoint is not None
         assert made[-1].started

@@ -13,7 +13,6 @@ from rmpa.agent.agent import Agent
 from rmpa.config.settings import Settings
 from rmpa.config.values import Multicast
 from rmpa.observe.control_client import ControlClient
-from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.node import Node
 from rmpa.runtime import limits as runtime_limits
@@ -75,7 +74,9 @@ def collections() -> Iterator[list[int]]:
 async def test_no_collection_runs_while_messages_flow(
     pair: tuple[Agent, Agent], collections: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ros_limits, "NODE_MASTER_CHECK", DEADLINE)  # two XML-RPC calls a second of our own nodes
+    monkeypatch.setattr(
+        "rmpa.ros.node.node.NODE_MASTER_CHECK", DEADLINE
+    )  # two XML-RPC calls a second of our own nodes
     a, b = pair
     async with Node("talker", master_uri=a.core.uri) as talker, Node("hearer", master_uri=b.core.uri) as hearer:
         heard = sent = 0

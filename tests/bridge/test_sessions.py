@@ -15,7 +15,7 @@ from rmpa.bridge.graph_part import GraphPart
 from rmpa.bridge.messages import Advertise, Source, TopicOffer, decode, encode
 from rmpa.bridge.policy import PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
-from rmpa.bridge.sessions import Part, PeerSession, PeerSessions, PeerState
+from rmpa.bridge.sessions import AWAY_GRACE, Part, PeerSession, PeerSessions, PeerState
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import TrustSettings
@@ -191,7 +191,7 @@ def test_a_module_at_the_address_of_another_ends_its_session_in_a_plain_mesh_alo
     ("silent", "crashed", "outages", "grace"),
     [
         (True, False, (), GRACE),
-        (True, True, (), mesh_limits.AWAY_GRACE),
+        (True, True, (), AWAY_GRACE),
         (False, False, (), 0.0),
         (True, False, (3.0, 9.0), 9.0),
     ],

@@ -145,7 +145,7 @@ def test_the_contract_is_what_is_explained(rules: tuple[ContractRule, ...], topi
 
 
 def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "CONTRACTS_REMEMBERED", 3)
+    monkeypatch.setattr("rmpa.core.contract.CONTRACTS_REMEMBERED", 3)
     contracts = Contracts((rule("/1", depth=1),))
     for number in range(10):
         assert contracts.of(f"/{number}", "a/B").depth == (1 if number == 1 else limits.ROUTE_QUEUE_MESSAGES)

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits
-from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.counters import LOG_INTERVAL, Counters, RefusalLog
 
 if TYPE_CHECKING:
     import pytest
@@ -30,7 +30,7 @@ def test_one_line_a_kind_and_interval(caplog: pytest.LogCaptureFixture) -> None:
         log.refuse(now, "beacon.malformed", "10.0.0.1", "text")
     log.refuse(2.0, "beacon.malformed", "10.0.0.2", "other address")
     log.refuse(2.0, "beacon.version", "10.0.0.1", "other kind")
-    log.refuse(limits.LOG_INTERVAL, "beacon.malformed", "10.0.0.1", "again")
+    log.refuse(LOG_INTERVAL, "beacon.malformed", "10.0.0.1", "again")
     assert [r.getMessage() for r in caplog.records] == [
         "! text",
         "! other address",
@@ -47,7 +47,7 @@ def test_forged_addresses_do_not_flood_the_log(caplog: pytest.LogCaptureFixture)
         log.refuse(number * 1e-4, "beacon.malformed", f"10.0.{number >> 8}.{number & 255}", "text")
     assert len(caplog.records) == limits.LOG_LINES_MAX
     log.refuse(0.5, "beacon.version", "10.0.0.1", "another name has lines of its own")
-    log.refuse(limits.LOG_INTERVAL, "beacon.malformed", "10.9.9.9", "later")
+    log.refuse(LOG_INTERVAL, "beacon.malformed", "10.9.9.9", "later")
     assert [record.getMessage() for record in caplog.records[-2:]] == [
         "! another name has lines of its own",
         f"! later ({5000 - limits.LOG_LINES_MAX} more like this since the last line)",

@@ -10,7 +10,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.membership import BURST_OFFSETS, MembershipProtocol
 
 if TYPE_CHECKING:
     from rmpa.discovery.announcing import OutgoingBeacon
@@ -71,14 +71,14 @@ def multicasts(outputs: list[OutgoingBeacon]) -> list[Beacon]:
 def test_a_thousand_agents_that_start_at_once_do_not_answer_each_other() -> None:
     agent = Agent()
     sent = []
-    for offset in limits.BURST_OFFSETS:
+    for offset in BURST_OFFSETS:
         sent += agent.run(1000.0 + offset + 0.01 - agent.now)
         for number in range(MEMBERS):
             agent.hear(number, BeaconKind.ANNOUNCE)
     sent += agent.run(3.0)
     assert len(agent.membership.peers()) == MEMBERS
-    assert len(answers(sent)) <= (limits.MANY_MEMBERS + 1) * len(limits.BURST_OFFSETS)
-    assert len(multicasts(sent)) <= len(limits.BURST_OFFSETS) + 1
+    assert len(answers(sent)) <= (limits.MANY_MEMBERS + 1) * len(BURST_OFFSETS)
+    assert len(multicasts(sent)) <= len(BURST_OFFSETS) + 1
 
 
 def test_a_newcomer_gets_the_answers_of_a_large_mesh_spread_over_seconds() -> None:

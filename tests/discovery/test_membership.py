@@ -13,8 +13,10 @@ import pytest
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits, membership
+from rmpa.discovery.announcing import CANDIDATE_LIFETIME, CANDIDATE_RETRY_MAX, CANDIDATES_BURST, CANDIDATES_PER_SECOND
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.membership import MembershipProtocol, PeerEvent
+from rmpa.discovery.endpoints import GOODBYE_LATE, LEASE_MAX, LEASE_MIN
+from rmpa.discovery.membership import BURST_AGAIN_OFFSETS, BURST_JITTER, BURST_OFFSETS, MembershipProtocol, PeerEvent
 
 if TYPE_CHECKING:
     from rmpa.discovery.announcing import OutgoingBeacon
@@ -88,7 +90,7 @@ def unicasts(outputs: list[OutgoingBeacon], kind: BeaconKind) -> list[tuple[str,
 def test_burst_is_followed_by_heartbeats_only() -> None:
     harness = Harness()
     kinds = [(o.beacon.kind, o.beacon.sequence) for o in harness.run(4.9) if o.address is None]
-    assert kinds == [(BeaconKind.ANNOUNCE, n) for n in range(1, len(limits.BURST_OFFSETS) + 1)]
+    assert kinds == [(BeaconKind.ANNOUNCE, n) for n in range(1, len(BURST_OFFSETS) + 1)]
     later = harness.run(10.0)
     assert [o.beacon.kind for o in later] == [BeaconKind.HEARTBEAT] * 2
 
@@ -96,7 +98,7 @@ def test_burst_is_followed_by_heartbeats_only() -> None:
 def test_jitter_stays_in_its_bounds() -> None:
     membership = MembershipProtocol(who(1), rng=lambda: 0.999, multicast=True)
     membership.start(T0)
-    assert membership.next_timer() == pytest.approx(T0 + 0.1 + limits.BURST_JITTER, abs=0.001)
+    assert membership.next_timer() == pytest.approx(T0 + 0.1 + BURST_JITTER, abs=0.001)
     membership.handle_timer(T0 + 1)
     assert membership.next_timer() == pytest.approx(T0 + 4.5, abs=0.01)
 
@@ -174,7 +176,7 @@ def test_silence_for_the_lease_loses_an_unlinked_peer(one: Harness) -> None:
     assert one.membership.peers() == []
 
 
-@pytest.mark.parametrize(("asked", "granted"), [(0.0, limits.LEASE_MIN), (4e6, limits.LEASE_MAX)])
+@pytest.mark.parametrize(("asked", "granted"), [(0.0, LEASE_MIN), (4e6, LEASE_MAX)])
 def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
     one.hear(Speaker(who(2))(lease=asked))
     one.run(granted - 0.1)
@@ -231,7 +233,7 @@ def test_a_forged_goodbye_is_refuted_by_a_later_beacon(one: Harness) -> None:
     one.hear(speaker())
     one.hear(Speaker(who(2), speaker.sequence + 1000)(BeaconKind.GOODBYE))
     assert one.membership.events()[-1] == PeerEvent("lost", who(2), reason=membership.GOODBYE)
-    one.run(limits.GOODBYE_LATE)
+    one.run(GOODBYE_LATE)
     one.hear(speaker())
     assert [event.change for event in one.membership.events()] == ["found"]
 
@@ -548,7 +550,7 @@ def test_a_handshake_without_addresses_changes_nothing(one: Harness) -> None:
 
 def test_gossip_leads_to_announcements_that_end(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
-    sent = one.membership.outputs() + one.run(limits.CANDIDATE_LIFETIME)
+    sent = one.membership.outputs() + one.run(CANDIDATE_LIFETIME)
     greeted = [a for a in unicasts(sent, BeaconKind.ANNOUNCE) if a == ("10.0.0.3", 40003)]
     assert 5 <= len(greeted) <= 10
     assert ("10.0.0.3", 40003) not in unicasts(one.run(100), BeaconKind.ANNOUNCE)
@@ -561,7 +563,7 @@ def test_announcements_go_on_while_gossip_mentions_the_address(one: Harness) -> 
         one.hear(speaker(BeaconKind.HEARTBEAT, who(3).guid))
         one.run(5)
     one.membership.outputs()
-    assert ("10.0.0.3", 40003) in unicasts(one.run(limits.CANDIDATE_RETRY_MAX), BeaconKind.ANNOUNCE)
+    assert ("10.0.0.3", 40003) in unicasts(one.run(CANDIDATE_RETRY_MAX), BeaconKind.ANNOUNCE)
 
 
 def test_candidate_that_answers_is_found_by_gossip(one: Harness) -> None:
@@ -600,7 +602,7 @@ def test_gossiped_address_of_an_unknown_peer_is_contacted(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False, source=("172.16.0.2", 40002))
     assert "peer2" in one.present()
     one.membership.outputs()
-    assert unicasts(one.run(limits.CANDIDATE_LIFETIME / 2), BeaconKind.ANNOUNCE) == []
+    assert unicasts(one.run(CANDIDATE_LIFETIME / 2), BeaconKind.ANNOUNCE) == []
 
 
 def test_gossip_is_bounded(one: Harness) -> None:
@@ -609,7 +611,7 @@ def test_gossip_is_bounded(one: Harness) -> None:
         guids = [Guid.of(IPv4Address(0x0A020000 + 100 * i + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
         one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
     greeted = unicasts(one.membership.outputs(), BeaconKind.ANNOUNCE)
-    assert len(greeted) == limits.CANDIDATES_BURST
+    assert len(greeted) == CANDIDATES_BURST
     assert one.membership.counters["gossip.full"]
 
 
@@ -679,7 +681,7 @@ def test_without_multicast_nothing_is_shouted() -> None:
 def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
     one.membership.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
     sent = [o for o in one.run(1) if o.address is None]
-    assert [o.beacon.kind for o in sent] == [BeaconKind.ANNOUNCE] * len(limits.BURST_AGAIN_OFFSETS)
+    assert [o.beacon.kind for o in sent] == [BeaconKind.ANNOUNCE] * len(BURST_AGAIN_OFFSETS)
     assert sent[0].beacon.identity.addresses == (IPv4Address("10.8.0.1"),)
 
 
@@ -749,8 +751,8 @@ def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
             guids = [Guid.of(IPv4Address(0x0A020000 + 64 * part + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
             one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
         sent += len(unicasts(one.membership.outputs() + one.run(1.0), BeaconKind.ANNOUNCE))
-        assert sent <= limits.CANDIDATES_BURST + (second + 1) * limits.CANDIDATES_PER_SECOND
-    assert sent >= 40 * limits.CANDIDATES_PER_SECOND
+        assert sent <= CANDIDATES_BURST + (second + 1) * CANDIDATES_PER_SECOND
+    assert sent >= 40 * CANDIDATES_PER_SECOND
 
 
 def test_in_a_full_membership_a_stranger_takes_the_place_of_one_that_missed_a_heartbeat(one: Harness) -> None:

@@ -10,8 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 
-from rmpa.mesh import limits
-from rmpa.mesh.reliable import Outgoing, ReliableReceiver, ReliableSender
+from rmpa.mesh.reliable import ACK_DELAY, Outgoing, ReliableReceiver, ReliableSender
 
 MASK = 0xFFFFFFFF
 
@@ -223,7 +222,7 @@ class Pair:
                 self.haunt()
             while self.data:
                 self.arrive()
-            self.tick(limits.ACK_DELAY)
+            self.tick(ACK_DELAY)
             while self.acks:
                 self.hear()
         self.check()

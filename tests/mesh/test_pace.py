@@ -10,7 +10,7 @@ import pytest
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.keepalive import rest_lease
+from rmpa.mesh.keepalive import ACCEPTOR_KEEPALIVE_FACTOR, WAKE_PINGS, rest_lease
 from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time
 
 
@@ -128,7 +128,7 @@ def test_keepalives_at_rest_are_rarer_with_more_peers(peers: int, interval: floa
     """Three of them and a second fit into the lease."""
     assert rest_lease(peers) == pytest.approx(lease) == 3 * interval + 1
     assert lease <= limits.LINK_LEASE_MAX
-    assert 2 * interval * limits.ACCEPTOR_KEEPALIVE_FACTOR < lease
+    assert 2 * interval * ACCEPTOR_KEEPALIVE_FACTOR < lease
 
 
 def test_a_link_at_rest_takes_the_pace_of_a_mesh_that_grows_and_shrinks() -> None:
@@ -182,7 +182,7 @@ def test_the_clock_is_measured_anew_as_soon_as_a_rest_ends(who: int) -> None:
         assert before is not None
         assert now[1] < before[1] / 3, "the old one is of seconds ago"
         pongs = [event for event in each.events[heard[each] :] if event[0] == "pong"]
-        assert len(pongs) >= limits.WAKE_PINGS, "one of several is quick even on a busy path"
+        assert len(pongs) >= WAKE_PINGS, "one of several is quick even on a busy path"
 
 
 @pytest.mark.parametrize("who", [0, 1])

@@ -12,7 +12,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Hello, Refusal, Refuse
-from rmpa.mesh.peering import Peering, PeeringOutput
+from rmpa.mesh.peering import DIAL_FALLBACK, LINK_STABLE, PURSUITS_PER_SECOND, REFUSED_RETRY, Peering, PeeringOutput
 from tests.mesh.worlds import HIGH, LOW
 
 DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))
@@ -75,7 +75,7 @@ def test_many_peers_that_fall_silent_share_the_attempts() -> None:
     first = {guid: at for at, (guid, _) in reversed(made)}
     assert len(first) == 64
     assert max(first.values()) < 1.0
-    assert len(made) < limits.PURSUIT * limits.PURSUITS_PER_SECOND
+    assert len(made) < limits.PURSUIT * PURSUITS_PER_SECOND
 
 
 def test_higher_guid_dials_later() -> None:
@@ -84,7 +84,7 @@ def test_higher_guid_dials_later() -> None:
     high.peer_found(LOW, 0.0)
     assert dials(low.take()) == [HIGH.guid.endpoint]
     assert dials(high.take()) == []
-    assert until_dial(high, 0.0) == (limits.DIAL_FALLBACK, LOW.guid.endpoint)
+    assert until_dial(high, 0.0) == (DIAL_FALLBACK, LOW.guid.endpoint)
 
 
 def test_all_addresses_are_dialled_before_a_pause() -> None:
@@ -139,11 +139,11 @@ def test_flapping_link_is_dialled_slower_than_a_stable_one() -> None:
         now, _ = until_dial(low, now)
         pauses.append(now - before)
         low.link_up(link, HIGH, now, dialled=True, endpoint=HIGH.guid.endpoint)
-        now += 0.01 if link < 7 else limits.LINK_STABLE
+        now += 0.01 if link < 7 else LINK_STABLE
         low.link_down(link, "lost", now)
     assert pauses[5] > 1.0
     now, _ = until_dial(low, now)
-    assert now - (before + pauses[-1]) <= limits.LINK_STABLE + limits.BACKOFF_FIRST
+    assert now - (before + pauses[-1]) <= LINK_STABLE + limits.BACKOFF_FIRST
 
 
 def test_where_it_worked_is_dialled_first() -> None:
@@ -212,7 +212,7 @@ def test_lasting_refusal_is_reported_once_and_retried_slowly(code: Refusal) -> N
             assert due is not None
             now = due
             low.handle_timer(now)
-        assert now == 0 or now - before >= limits.REFUSED_RETRY
+        assert now == 0 or now - before >= REFUSED_RETRY
         low.dial_refused(HIGH.guid, Refuse(code, "do this"), now)
         assert low.peers()[0].state == "refused"
     assert said + sum(o[0] == "refused" for o in low.take()) == 1
@@ -303,7 +303,7 @@ class Crossing:
         self.wires: dict[tuple[int, str], list[Refuse | str]] = {(1, "high"): ["hello"], (2, "low"): ["hello"]}
         self.used: dict[str, int | None] = {"low": None, "high": None}
         self.sides["low"].peer_found(HIGH, 0.0)
-        self.sides["high"].peer_found(LOW, -limits.DIAL_FALLBACK)
+        self.sides["high"].peer_found(LOW, -DIAL_FALLBACK)
         self.sides["high"].handle_timer(0.0)
         for side in self.sides.values():
             assert len(dials(side.take())) == 1
@@ -525,7 +525,7 @@ def test_a_full_mesh_neither_dials_nor_accepts_one_more_until_discovery_has_give
     assert peering.judge(hello_of(stranger(2)), 3.0) is None
     peering.peer_gone(stranger(2).guid)
     assert peering.judge(hello_of(stranger(4)), 4.0) is None
-    assert until_dial(peering, 4.0)[0] < 4.0 + limits.REFUSED_RETRY
+    assert until_dial(peering, 4.0)[0] < 4.0 + REFUSED_RETRY
 
 
 def test_a_module_for_which_there_is_no_place_says_so_once() -> None:

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh import limits
-from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
+from rmpa.mesh.reliable import ACK_DELAY, ReliableReceiver, ReliableSender, ResumeTable
 from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload, taken
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
@@ -335,12 +335,12 @@ def test_it_acknowledges_after_a_delay() -> None:
     assert receiver.due_ack(1e9) is None
     receiver.accept(1, 7, 50.0)
     receiver.accept(2, 7, 50.005)
-    assert receiver.next_timer() == 50.0 + limits.ACK_DELAY
+    assert receiver.next_timer() == 50.0 + ACK_DELAY
     assert receiver.due_ack(50.009) is None
-    assert receiver.due_ack(50.0 + limits.ACK_DELAY) == 2
+    assert receiver.due_ack(50.0 + ACK_DELAY) == 2
     assert receiver.due_ack(60.0) is None
     receiver.accept(3, 7, 60.0)
-    assert receiver.next_timer() == 60.0 + limits.ACK_DELAY
+    assert receiver.next_timer() == 60.0 + ACK_DELAY
 
 
 def test_many_messages_or_bytes_are_acknowledged_at_once() -> None:
@@ -378,7 +378,7 @@ def test_sequences_wrap(first: int) -> None:
         else:
             while pair.data:
                 pair.arrive()
-            pair.tick(limits.ACK_DELAY)
+            pair.tick(ACK_DELAY)
             pair.hear() if pair.acks else None
         pair.check()
     pair.drain()

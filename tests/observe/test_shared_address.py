@@ -7,7 +7,7 @@ import pytest
 
 from rmpa.discovery import limits
 from rmpa.observe.peer_info import PeerInfo
-from rmpa.observe.snapshot_builder import mark_shared_addresses
+from rmpa.observe.snapshot_builder import ADDRESS_SHARED_MARGIN, mark_shared_addresses
 
 
 def peer(name: str, guid: str, state: str = "linking", since: float = 30.0, beacon: float | None = 2.0) -> PeerInfo:
@@ -47,7 +47,7 @@ def test_this_machines_own_address() -> None:
         peer("c", "10.0.0.2:38211#1", "refused"),
         peer("c", "10.0.0.2:38211#1", since=limits.ADDRESS_SHARED_AFTER / 2),
         peer("killed", "10.0.0.2:38211#1", since=10.0, beacon=12.0),
-        peer("killed", "10.0.0.2:38211#1", since=10.0, beacon=10.0 - limits.ADDRESS_SHARED_MARGIN),
+        peer("killed", "10.0.0.2:38211#1", since=10.0, beacon=10.0 - ADDRESS_SHARED_MARGIN),
         peer("unheard", "10.0.0.2:38211#1", beacon=None),
     ],
 )

@@ -10,7 +10,6 @@ from rmpa.resource.descriptor import Descriptor, describe
 from rmpa.resource.node import ResourceNode, run_all
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import Runtime, RuntimePart
-from rmpa.ros import limits
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, UnknownTypeError
 from rmpa.ros.types.installed import packages_below
@@ -162,7 +161,7 @@ FOO: Final = MessageType.learn(NAME, f"Header header\nint32 a\n\n{_HEADER}")
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(limits, "TYPE_LOOK", 0.05)
+    monkeypatch.setattr("rmpa.resource.node.TYPE_LOOK", 0.05)
     FOO.deserialize(FOO.serialize(FOO.make()))
     yield
     packages_below.cache_clear()

@@ -6,8 +6,8 @@ import asyncio
 import math
 import socket
 
+from rmpa.bridge.topics.part import STALE_TICK
 from rmpa.core.outbox import Outbox
-from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime import limits
 from rmpa.runtime.loop import AgentLoop
 from rmpa.runtime.stream import Stream
@@ -44,11 +44,11 @@ def run(silence: float, tick: float | None) -> float:
 
 
 def test_a_silence_that_was_watched_ends_with_the_next_bytes() -> None:
-    assert run(3 * limits.STALE_AGE, mesh_limits.STALE_TICK) > 0.0
+    assert run(3 * limits.STALE_AGE, STALE_TICK) > 0.0
 
 
 def test_a_pause_is_none() -> None:
-    assert run(0.0, mesh_limits.STALE_TICK) == -math.inf
+    assert run(0.0, STALE_TICK) == -math.inf
 
 
 def test_silence_ends_where_a_pause_of_this_process_begins() -> None:
@@ -68,7 +68,7 @@ def test_silence_ends_where_a_pause_of_this_process_begins() -> None:
         try:
             until = loop.time() + 2 * limits.STALE_AGE
             while loop.time() < until:
-                await asyncio.sleep(mesh_limits.STALE_TICK)
+                await asyncio.sleep(STALE_TICK)
             paused = loop.time()
             while loop.time() < paused + 2 * limits.STALE_AGE:
                 pass  # as a process that gets no CPU

@@ -11,14 +11,15 @@ from typing import Any, Final
 
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.endpoints import LEASE_MAX
+from rmpa.discovery.membership import HEARTBEAT_INTERVAL
 from tests.simulation.network import Network, Weather, World
 from tests.simulation.roster_peer import RosterPeer, stranger
 
-CALM: Final = core_limits.PEER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
+CALM: Final = core_limits.PEER_LEASE + 2 * HEARTBEAT_INTERVAL + 2.0
 """Seconds after healing within which all rosters agree: a lease for dead peers, two heartbeats for new ones."""
-AFTER_FORGERY: Final = discovery_limits.LEASE_MAX + CALM
+AFTER_FORGERY: Final = LEASE_MAX + CALM
 """The same where forged beacons asked for the longest lease."""
 
 MakePeer = Callable[..., Any]

@@ -13,7 +13,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.limits import KIB
-from rmpa.mesh import limits
+from rmpa.mesh.io.dial import LINK_UNACKED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -229,7 +229,7 @@ class SimSocket:
         world = self._network.world
         if self._stalled is None:
             self._stalled = world.now
-        if world.now - self._stalled >= limits.LINK_UNACKED:
+        if world.now - self._stalled >= LINK_UNACKED:
             self._packets.clear()
             self._pumping = False
             self.fail(errno.ETIMEDOUT)

@@ -10,7 +10,6 @@ import os
 
 import pytest
 
-from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 from tests.simulation.rests_scenario import RestsScenario
@@ -52,7 +51,7 @@ def test_where_both_can_dial_one_side_dialled_both_lanes(seed: int, count: int) 
 
 @pytest.mark.parametrize("seed", range(4 * FACTOR))
 def test_crossing_dials_leave_one_link(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
+    monkeypatch.setattr("rmpa.mesh.peering.DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
     scenario = MeshScenario(seed, 3, keep=True, calm=True)
     scenario.network.weather = Weather(delay=(0.1, 0.3))
     scenario.network.slowness = (1.0,)

@@ -30,7 +30,6 @@ from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, Guid, Identity, is_own
 from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
-from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.peering import REPLACED
@@ -67,6 +66,9 @@ if TYPE_CHECKING:
     from rmpa.ros.core.external import Core
 
 _log = logging.getLogger(__name__)
+
+# Delay before an agent whose addresses have changed tries again to listen at the new address.
+JOIN_RETRY: Final = 1.0
 
 
 class NetworkEndpoint:
@@ -247,7 +249,7 @@ class Network:
                 except RmpaError as error:
                     _log.warning("! cannot join with the new address yet: %s", error)
                     with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._over.wait(), mesh_limits.JOIN_RETRY)
+                        await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
         finally:
             self._moving = None
 

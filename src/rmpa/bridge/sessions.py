@@ -7,7 +7,7 @@ import itertools
 import logging
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.wire.xmlrpc import RosReply
+
+# A peer whose agent died keeps its proxies in the local graph for this long: it may be started again at once.
+AWAY_GRACE: Final = 0.5
 
 
 # The state that the bridge keeps for one run of a peer, across its links.
@@ -312,7 +315,7 @@ class PeerSessions:
         call_each(self._parts, lambda part: part.link_down(session))
         session.link.routes.clear()
         if link.silent:
-            session.wait = mesh_limits.AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
+            session.wait = AWAY_GRACE if link.crashed else mesh_limits.SILENT_GRACE
             self._timer.arm()
         else:
             self._grace_over(session)

@@ -18,9 +18,12 @@ from rmpa.core.identity import matches
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+# (topic, type) pairs whose contract is cached; the oldest is dropped first.
+CONTRACTS_REMEMBERED: Final = 4096
+
 _Number = TypeVar("_Number", int, float)
+# These types have the bounds that hold in settings and in the messages of peers.
 Depth = Annotated[int, Meta(ge=1, le=limits.CONTRACT_DEPTH_MAX)]
-"""These types have the bounds that hold in settings and in the messages of peers."""
 Seconds = Annotated[float, Meta(ge=limits.CONTRACT_TIME_MIN, le=limits.CONTRACT_TIME_MAX)]
 Rate = Annotated[float, Meta(ge=limits.CONTRACT_RATE_MIN, le=limits.CONTRACT_RATE_MAX)]
 Outage = Annotated[float, Meta(ge=limits.OUTAGE_MIN, le=limits.OUTAGE_MAX)]
@@ -63,17 +66,20 @@ class Priority(StrEnum):
 
 
 class Transport(StrEnum):
-    """The path of the messages: through both agents, or from node to node where that can be (docs/contracts.md)."""
+    """The path of the messages: through both agents, or from node to node where that can be (docs/contracts.md).
+
+    Attributes:
+        DIRECT: From node to node; a warning where a condition fails and the agents relay instead.
+        AUTO: As ``DIRECT``, without a warning.
+    """
 
     RELAY = "relay"
     DIRECT = "direct"
-    """From node to node; a warning where a condition fails and the agents relay instead."""
     AUTO = "auto"
-    """As ``DIRECT``, without a warning."""
 
 
+# ``[bridge] transport`` and ``[services] transport`` where nothing sets them.
 DEFAULT_TRANSPORT: Final = Transport.RELAY
-"""``[bridge] transport`` and ``[services] transport`` where nothing sets them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,11 +125,13 @@ class Contract:
         return replace(self, transport=other.transport) == other
 
 
+# The names of a contract's fields, in order.
 KEYS: Final = tuple(item.name for item in fields(Contract))
-"""The names of a contract's fields, in order."""
 _DEFAULT: Final = Contract()
+# Fields that only agents can keep where they differ from the default; the others are ``needs_agents``' own.
 _AGENTS_WORDS: Final = ("reliability", "durability", "history", "depth")
-"""Fields that only agents can keep where they differ from the default; the others are ``needs_agents``' own."""
+# Which word of a field is the stronger one. Of the transports ``relay`` is the strongest, because it keeps the
+# messages with the agents; ``direct`` wants its warning.
 _RANKS: Final = {
     "reliability": tuple(Reliability).index,
     "durability": tuple(Durability).index,
@@ -131,8 +139,6 @@ _RANKS: Final = {
     "priority": (Priority.NORMAL, Priority.LOW, Priority.HIGH).index,
     "transport": (Transport.AUTO, Transport.DIRECT, Transport.RELAY).index,
 }
-"""Which word of a field is the stronger one. Of the transports ``relay`` is the strongest, because it keeps the
-messages with the agents; ``direct`` wants its warning."""
 
 
 def combine(offered: Contract, requested: Contract) -> Contract:
@@ -230,7 +236,7 @@ class Contracts:
     ) -> None:
         self._rules = rules
         self._default = replace(_DEFAULT, transport=default_transport)
-        self._find = lru_cache(limits.CONTRACTS_REMEMBERED)(self._combined)
+        self._find = lru_cache(CONTRACTS_REMEMBERED)(self._combined)
 
     def of(self, topic: str, type_name: str) -> Contract:
         """The contract of a topic. ``type_name`` may be empty or ``*`` while it is not known."""

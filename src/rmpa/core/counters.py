@@ -24,6 +24,12 @@ if TYPE_CHECKING:
 
     from _typeshed import SupportsWrite
 
+# A refusal of one kind from one address is logged at most once in this time; the rest are counted.
+LOG_INTERVAL: Final = 5.0
+
+# The limit of open files that users are advised to set: enough for some ten thousand nodes.
+_OPEN_FILES_ADVICE: Final = 65_536
+
 
 class Counters:
     """Named counters of one room, shown in snapshots (``beacon.malformed``, ``link.refused.version``)."""
@@ -44,7 +50,7 @@ class Counters:
 
 
 class RefusalLog:
-    """Counts each refusal, and logs each kind (name and address) at most once in ``limits.LOG_INTERVAL`` seconds.
+    """Counts each refusal, and logs each kind (name and address) at most once in ``LOG_INTERVAL`` seconds.
 
     At most ``limits.LOG_LINES_MAX`` lines of one name are written in that time, over all addresses.
 
@@ -58,10 +64,10 @@ class RefusalLog:
     def __init__(self, logger: logging.Logger, counters: Counters) -> None:
         self._logger = logger
         self._counters = counters
+        # By kind: when it was logged last, and how many are suppressed since then; the oldest line first.
         self._last: dict[tuple[str, str], tuple[float, int]] = {}
-        """By kind: when it was logged last, and how many are suppressed since then; the oldest line first."""
+        # By name: the start of the interval, the lines written in it, and the lines suppressed in it.
         self._lines: dict[str, tuple[float, int, int]] = {}
-        """By name: the start of the interval, the lines written in it, and the lines suppressed in it."""
 
     def count(self, name: str) -> None:
         """Count ``name`` without a line in the log."""
@@ -79,11 +85,11 @@ class RefusalLog:
         self._counters.add(name)
         kind = name, who
         last, suppressed = self._last.get(kind, (float("-inf"), 0))
-        if now - last < limits.LOG_INTERVAL:
+        if now - last < LOG_INTERVAL:
             self._last[kind] = (last, suppressed + 1)
             return
         since, lines, hidden = self._lines.get(name, (now, 0, 0))
-        if now - since >= limits.LOG_INTERVAL:
+        if now - since >= LOG_INTERVAL:
             since, lines = now, 0
         if lines >= limits.LOG_LINES_MAX:
             self._lines[name] = (since, lines, hidden + 1)
@@ -192,7 +198,6 @@ class SampleSummary:
     minimum: float
     maximum: float
     p50: float
-    p95: float
     p99: float
 
     @classmethod
@@ -200,11 +205,11 @@ class SampleSummary:
         """The summary of some samples; the standard deviation is the population's, as in ``rostopic hz``."""
         data = sorted(samples)
         if not data:
-            return cls(0, *[math.nan] * 7)
+            return cls(0, *[math.nan] * 6)
         mean = math.fsum(data) / len(data)
         # Computed as the distance between two points: ``math.dist`` sums in C, ten times as fast as a loop.
         sd = math.dist(data, [mean] * len(data)) / math.sqrt(len(data))
-        return cls(len(data), mean, sd, data[0], data[-1], *(percentile(data, percent) for percent in (50, 95, 99)))
+        return cls(len(data), mean, sd, data[0], data[-1], *(percentile(data, percent) for percent in (50, 99)))
 
 
 def percentile(ordered: list[float], percent: float) -> float:
@@ -220,8 +225,8 @@ def percentile(ordered: list[float], percent: float) -> float:
 # Many timers of one protocol machine in a heap.
 
 
+# The heap, which also holds moved and cancelled entries, is rebuilt above this plus twice the live entries.
 _SPARE: Final = 64
-"""The heap, which also holds moved and cancelled entries, is rebuilt above this plus twice the live entries."""
 
 
 _K = TypeVar("_K")
@@ -294,7 +299,6 @@ class Backoff:
     def __init__(self, first: float, cap: float, rng: Callable[[], float]) -> None:
         self._first = first
         self.cap = cap
-        """The longest delay, from the next one on."""
         self._rng = rng
         self._next = first
 
@@ -391,7 +395,7 @@ class Yielder(Protocol):
 
 def remedy(pid: int | None = None) -> str:
     """How to raise the limit permanently; with a process id also how to raise it for that process at once."""
-    enough = limits.OPEN_FILES_ADVICE
+    enough = _OPEN_FILES_ADVICE
     text = (
         f"raise it: LimitNOFILE={enough} of a systemd unit, "
         f"`ulimit -n {enough}` as root in the shell that starts the agent"

@@ -127,17 +127,17 @@ def _is_unicast(first: int) -> bool:
 
 
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
+# Topics that stay in their module under every policy, and why.
 NEVER_CROSSING: Final = {
     "/rosout": "log messages stay home: a bridged /rosout would loop",
     "/rosout_agg": "log messages stay home: a bridged /rosout would loop",
     "/clock": "time stays home: two clocks in one graph make it jump",
     "/rmpa/**": "the agent's own topics stay home",
 }
-"""Topics that stay in their module under every policy, and why."""
+# The regular expression of a resolved name, ``/like/this``.
 GLOBAL_NAME: Final = r"/([A-Za-z0-9_]+(/[A-Za-z0-9_]+)*)?"
-"""The regular expression of a resolved name, ``/like/this``."""
+# The regular expression of a message or service type, ``package/Name``.
 TYPE_NAME: Final = r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*"
-"""The regular expression of a message or service type, ``package/Name``."""
 _GLOBAL: Final = re.compile(GLOBAL_NAME)
 _TYPE: Final = re.compile(TYPE_NAME)
 
@@ -212,10 +212,10 @@ def matches(pattern: str, name: str) -> bool:
 # expressions out with ``SERIAL_MASK`` and ``SERIAL_HALF``, because a call takes longer than the arithmetic.
 
 
+# ``number & SERIAL_MASK`` wraps a number.
 SERIAL_MASK: Final = UINT32_MAX
-"""``number & SERIAL_MASK`` wraps a number."""
+# A number that is this far or farther ahead of another number counts as the earlier one of the two.
 SERIAL_HALF: Final = 1 << 31
-"""A number that is this far or farther ahead of another number counts as the earlier one of the two."""
 
 
 def serial_add(number: int, count: int) -> int:
@@ -238,8 +238,8 @@ def is_earlier(number: int, than: int) -> bool:
     return number - than & SERIAL_MASK >= SERIAL_HALF
 
 
+# The regular expression of a ROS base name (REP 144).
 BASE_NAME: Final = r"[A-Za-z][A-Za-z0-9_]*"
-"""The regular expression of a ROS base name (REP 144)."""
 _NAME: Final = re.compile(BASE_NAME)
 
 
@@ -325,8 +325,8 @@ class Identity:
 
 # Names of the agent and of its proxies in the local graph.
 
+# The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``.
 OWN_NODE: Final = "/rmpa"
-"""The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``."""
 
 
 def is_own(node: str) -> bool:

@@ -17,63 +17,54 @@ INT32_MIN: Final = -(1 << 31)
 INT32_MAX: Final = (1 << 31) - 1
 UINT32_MAX: Final = (1 << 32) - 1
 
-
-# --- process ----------------------------------------------------------------------------------------------------
-OPEN_FILES_ADVICE: Final = 65_536
-"""The limit of open files that users are advised to set: enough for some ten thousand nodes."""
-
 # --- identity ---------------------------------------------------------------------------------------------------
+# Random id of one run of one agent: 128 bits, so that two runs never share one.
 INSTANCE_ID_BYTES: Final = 16
-"""Random id of one run of one agent: 128 bits, so that two runs never share one."""
+# Characters in a peer's name: a host name's label is at most 63.
 PEER_NAME_MAX: Final = 64
-"""Characters in a peer's name: a host name's label is at most 63."""
+# Highest domain id: ROS 2's own bound, so that the same ROS_DOMAIN_ID works for both.
 DOMAIN_MAX: Final = 232
-"""Highest domain id: ROS 2's own bound, so that the same ROS_DOMAIN_ID works for both."""
 
 # --- settings ---------------------------------------------------------------------------------------------------
-CONTRACTS_REMEMBERED: Final = 4096
-"""(topic, type) pairs whose contract is cached; the oldest is dropped first."""
+# Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LANE_QUEUE_BYTES`` bounds their bytes.
 CONTRACT_DEPTH_MAX: Final = 100_000
-"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LANE_QUEUE_BYTES`` bounds their bytes."""
+# Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches.
 CONTRACT_TIME_MIN: Final = 0.001
-"""Shortest deadline, lifespan and lease: a timer that is due more often would delay the messages it watches."""
+# Longest deadline, lifespan and lease, a day: more is a mistake in the unit.
 CONTRACT_TIME_MAX: Final = 86_400.0
-"""Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
+# Lowest ``max_rate`` in messages a second: one in a quarter of an hour.
 CONTRACT_RATE_MIN: Final = 0.001
-"""Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
+# Highest ``max_rate`` in messages a second: more than any topic reaches.
 CONTRACT_RATE_MAX: Final = 1_000_000.0
-"""Highest ``max_rate`` in messages a second: more than any topic reaches."""
+# Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner.
 OUTAGE_MIN: Final = 1.0
-"""Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner."""
+# Longest ``outage`` of a contract, a day; as the other times of a contract.
 OUTAGE_MAX: Final = 86_400.0
-"""Longest ``outage`` of a contract, a day; as the other times of a contract."""
 
 # --- discovery --------------------------------------------------------------------------------------------------
+# A peer without a link is gone when it was silent for three heartbeats and a second.
 PEER_LEASE: Final = 16.0
-"""A peer without a link is gone when it was silent for three heartbeats and a second."""
+# Peers that may be known at one time: a hostile sender of forged GUIDs cannot fill the memory (2 KB each).
 PEERS_MAX: Final = 4096
-"""Peers that may be known at one time: a hostile sender of forged GUIDs cannot fill the memory (2 KB each)."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------
+# Bytes of one message that are sent before another message of its lane: 10 ms of a 100 Mbit/s link. Longer messages
+# are sent in several data frames.
 FRAGMENT_BYTES: Final = 128 * KIB
-"""Bytes of one message that are sent before another message of its lane: 10 ms of a 100 Mbit/s link. Longer messages
-are sent in several data frames."""
+# Waiting bytes that are committed for one write: nothing overtakes them, and they are not dropped.
 COMMIT_BYTES: Final = 64 * KIB
-"""Waiting bytes that are committed for one write: nothing overtakes them, and they are not dropped."""
+# Messages of one topic that may wait for one slow link.
 ROUTE_QUEUE_MESSAGES: Final = 1000
-"""Messages of one topic that may wait for one slow link."""
+# Messages with more bytes than this are forwarded while they are still being received.
 CUT_THROUGH_BYTES: Final = 96 * KIB
-"""Messages with more bytes than this are forwarded while they are still being received."""
+# How long a reliable route's messages are kept after its link was lost, unless a contract sets ``outage``: a robot
+# drives through a shadow, an access point restarts. Longer is left to contracts: a module that is off seems to
+# publish for as long, and afterwards its subscribers get all of the old messages. Latched topics of a peer that fell
+# silent stay as long.
 RESUME_WINDOW: Final = 30.0
-"""How long a reliable route's messages are kept after its link was lost, unless a contract sets ``outage``: a
-robot drives through a shadow, an access point restarts. Longer is left to contracts: a module that is off
-seems to publish for as long, and afterwards its subscribers get all of the old messages. Latched topics of a peer
-that fell silent stay as long."""
 
 # --- logging ----------------------------------------------------------------------------------------------------
-LOG_INTERVAL: Final = 5.0
-"""A refusal of one kind from one address is logged at most once in this time; the rest are counted."""
+# Log lines about one kind of refusal in 5 s, over all addresses, because source addresses can be forged.
 LOG_LINES_MAX: Final = 20
-"""Log lines about one kind of refusal in this time, over all addresses, because source addresses can be forged."""
+# Kinds of refusal remembered to bound the log; the oldest is forgotten first.
 LOG_KINDS_MAX: Final = 1024
-"""Kinds of refusal remembered to bound the log; the oldest is forgotten first."""

@@ -19,15 +19,15 @@ from typing import Final
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
 
+# The key of entries that are never dropped and go in front of all others.
 URGENT: Final = -1
-"""The key of entries that are never dropped and go in front of all others."""
 
+# Flag of a fragment: the first of its message.
 FIRST: Final = 1
-"""Flag of a fragment: the first of its message."""
+# Flag of a fragment: the last of its message.
 LAST: Final = 2
-"""Flag of a fragment: the last of its message."""
+# Flag of a fragment: the rest of its message will never come.
 ABORT: Final = 4
-"""Flag of a fragment: the rest of its message will never come."""
 
 
 @dataclass(slots=True, eq=False)
@@ -61,8 +61,8 @@ class QueuedMessage:
     dropped: bool = False
 
 
+# Maps ``(message, length, flags)`` to the header of a fragment; ``length`` is the fragment's payload in bytes.
 Framer = Callable[[QueuedMessage, int, int], bytes]
-"""Maps ``(message, length, flags)`` to the header of a fragment; ``length`` is the fragment's payload in bytes."""
 
 
 @dataclass(slots=True)
@@ -98,6 +98,11 @@ class Outbox:
         max_bytes: Bytes that may wait, over all keys except ``URGENT``.
         frame: Makes the headers of fragments; without it an opened message is sent without headers.
         fragment: Bytes of one opened message that are sent in one turn.
+
+    Attributes:
+        urgent_bytes: Bytes of the uncommitted urgent entries. The outbox does not bound them; its owner must.
+        dropped: Entries dropped so far because a bound was reached, by key.
+        expired: Entries dropped so far because they were too old, by key.
     """
 
     def __init__(
@@ -119,13 +124,10 @@ class Outbox:
         self._committed: deque[memoryview] = deque()
         self._committed_bytes = 0
         self.urgent_bytes = 0
-        """Bytes of the uncommitted urgent entries. The outbox does not bound them; its owner must."""
         self._data_bytes = 0
         self._begun_bytes = 0
         self.dropped: Counter[int] = Counter()
-        """Entries dropped so far because a bound was reached, by key."""
         self.expired: Counter[int] = Counter()
-        """Entries dropped so far because they were too old, by key."""
 
     def __bool__(self) -> bool:
         """Whether there is something to send now."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rmpa.core.counters import Backoff, TimerQueue, TokenBucket
 from rmpa.core.identity import serial_add
@@ -17,6 +17,22 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Guid, Identity
     from rmpa.discovery.beacon import Address
     from rmpa.discovery.endpoints import EndpointTable, PeerInstance
+
+# Longest time between two announcements to an address known from gossip.
+CANDIDATE_RETRY_MAX: Final = 10.0
+# An address that no gossip had for this long (four heartbeats) is given up.
+CANDIDATE_LIFETIME: Final = 20.0
+# Announcements to addresses known from gossip that may be sent at once.
+CANDIDATES_BURST: Final = 256
+# Announcements a second to all addresses known from gossip, beyond one for each: gossiped peers may be forged.
+CANDIDATES_PER_SECOND: Final = 25.0
+
+# Addresses remembered for ``ANSWER_INTERVAL``; the oldest is forgotten first.
+_ANSWER_ADDRESSES_MAX: Final = 1024
+# Addresses kept that are known only from gossip; further ones are ignored until there is room.
+_CANDIDATES_MAX: Final = 1024
+# Delay before the second announcement to an address known from gossip; it doubles each time.
+_CANDIDATE_RETRY_FIRST: Final = 0.5
 
 
 class AddressLimit:
@@ -60,15 +76,15 @@ class GossipCandidates:
         self._gossiped: dict[Address, float] = {}
         self._backoffs: dict[Address, Backoff] = {}
         self._due: TimerQueue[Address] = TimerQueue()
-        self._allowed = TokenBucket(limits.CANDIDATES_PER_SECOND, limits.CANDIDATES_BURST)
+        self._allowed = TokenBucket(CANDIDATES_PER_SECOND, CANDIDATES_BURST)
         self._resume = float("-inf")
 
     def add(self, address: Address, now: float) -> bool:
         """Gossip mentions ``address``; return ``False`` if there is no room for it."""
         if address not in self._gossiped:
-            if len(self._gossiped) >= limits.CANDIDATES_MAX:
+            if len(self._gossiped) >= _CANDIDATES_MAX:
                 return False
-            self._backoffs[address] = Backoff(limits.CANDIDATE_RETRY_FIRST, limits.CANDIDATE_RETRY_MAX, self._rng)
+            self._backoffs[address] = Backoff(_CANDIDATE_RETRY_FIRST, CANDIDATE_RETRY_MAX, self._rng)
             self._due.set(address, now)
         self._gossiped[address] = now
         return True
@@ -85,7 +101,7 @@ class GossipCandidates:
         """The addresses that get an announcement now, longest wait first; those beyond the rate go on waiting."""
         due: list[Address] = []
         while now >= self._resume and (address := self._due.pop(now)) is not None:
-            if now - self._gossiped[address] >= limits.CANDIDATE_LIFETIME:
+            if now - self._gossiped[address] >= CANDIDATE_LIFETIME:
                 self.answered(address)
             elif self._allowed.take(now):
                 due.append(address)
@@ -102,13 +118,17 @@ class GossipCandidates:
 
 
 class OutgoingBeacon(NamedTuple):
-    """A beacon to send."""
+    """A beacon to send.
+
+    Attributes:
+        address: Where to; ``None``: to the group, on every usable interface.
+        key: Of a secured mesh: the low 16 bits of the number of the group key that the receiver has; 0: the present
+            one.
+    """
 
     beacon: Beacon
     address: Address | None = None
-    """Where to; ``None``: to the group, on every usable interface."""
     key: int = 0
-    """Of a secured mesh: the low 16 bits of the number of the group key that the receiver has; 0: the present one."""
 
 
 class BeaconSender:
@@ -120,24 +140,24 @@ class BeaconSender:
         lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where answers that were held back are counted.
         multicast: Whether to send to the group at all.
+
+    Attributes:
+        closed: Whether nothing is sent any more: a goodbye was the last beacon.
     """
 
     def __init__(
         self, identity: Identity, endpoints: EndpointTable, lease: float, counters: Counters, *, multicast: bool
     ) -> None:
         self.identity = identity
-        """This agent's own, as the next beacon will carry it."""
         self.multicast = multicast
-        """Whether it sends to the group at all."""
         self.closed = False
-        """Whether nothing is sent any more: a goodbye was the last beacon."""
         self._endpoints = endpoints
         self._lease_ms = round(lease * 1000)
         self._counters = counters
         self._sequence = 0
         self._turn = 0
         self._answers = TokenBucket(limits.ANSWERS_PER_SECOND, limits.ANSWERS_PER_SECOND)
-        self._answered = AddressLimit(1, limits.ANSWER_ADDRESSES_MAX, limits.ANSWER_INTERVAL)
+        self._answered = AddressLimit(1, _ANSWER_ADDRESSES_MAX, limits.ANSWER_INTERVAL)
         self._outputs: list[OutgoingBeacon] = []
 
     def take(self) -> list[OutgoingBeacon]:

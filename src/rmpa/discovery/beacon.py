@@ -22,14 +22,14 @@ from rmpa.core.identity import Guid, Identity, dialable
 from rmpa.core.limits import UINT32_MAX
 from rmpa.discovery import limits
 
+# A numeric IPv4 address and a UDP port, as sockets have it.
 Address = tuple[str, int]
-"""A numeric IPv4 address and a UDP port, as sockets have it."""
 
 MAGIC: Final = b"RMPA"
 VERSION: Final = 2
 
+# Where the instance id stands in a beacon of any version 1: begin and end.
 RUN_AT: Final = (16, 32)
-"""Where the instance id stands in a beacon of any version 1: begin and end."""
 MALFORMED: Final = "beacon.malformed"
 OTHER_DOMAIN: Final = "beacon.other_domain"
 OTHER_VERSION: Final = "beacon.version"
@@ -40,16 +40,20 @@ _ENDPOINT: Final = struct.Struct(">4sH")
 
 
 class BeaconKind(IntEnum):
-    """Why a beacon was sent."""
+    """Why a beacon was sent.
+
+    Attributes:
+        ANNOUNCE: The sender has just started, or contacts an address that it learnt (seed, gossip); it asks for an
+            answer.
+        HEARTBEAT: The sender is still there.
+        ANSWER: The unicast reply to a peer that announced itself; it is not answered.
+        GOODBYE: The sender leaves.
+    """
 
     ANNOUNCE = 1
-    """The sender has just started, or contacts an address that it learnt (seed, gossip); it asks for an answer."""
     HEARTBEAT = 2
-    """The sender is still there."""
     ANSWER = 3
-    """The unicast reply to a peer that announced itself; it is not answered."""
     GOODBYE = 4
-    """The sender leaves."""
 
 
 @dataclass(eq=False)

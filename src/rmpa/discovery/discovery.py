@@ -44,13 +44,29 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# Seconds for which a socket is not read when packets without a proof come faster than they can be looked at.
+BEACONS_UNPROVED_PAUSE: Final = 0.05
+# How long a module that is not of this mesh is shown after its last beacon: six heartbeats.
+STRANGER_KEPT: Final = 30.0
+
+# Packets handled in one callback, 100 microseconds each; pending data is handled between them.
+_BEACONS_PER_WAKE: Final = 64
+# Packets a second without a valid proof that an agent of a secured mesh looks at: 37 microseconds each, 15 % of a
+# core. Above it the socket is not read for a while, and the kernel drops what does not fit its buffer: beacons of
+# members too, which are sent again, and which links do not need.
+_BEACONS_UNPROVED_PER_SECOND: Final = 4000.0
+# Refused beacons a second that are parsed for the names of their senders: 0.1 % of a core.
+_STRANGER_BEACONS_PER_SECOND: Final = 50.0
+# Source addresses whose packets are counted; the oldest is forgotten first.
+_BEACON_SOURCES_MAX: Final = 4096
+
 _INTERFACES: Final = 256
+# What is told of the senders of packets that are refused; others are only counted.
 _REFUSED: Final = {
     Verdict.UNTAGGED: TrustReason.UNSECURED,
     Verdict.UNKNOWN_KEY: TrustReason.KEY,
     Verdict.FORGED: TrustReason.FOREIGN,
 }
-"""What is told of the senders of packets that are refused; others are only counted."""
 
 
 @dataclass(slots=True)
@@ -84,6 +100,9 @@ class PacketFilter:
             own, are not limited in rate.
         trust: Of a secured mesh: only packets whose trailer is accepted are parsed; ``beacon.untagged``,
             ``beacon.forged`` and so on count the others.
+
+    Attributes:
+        overrun: Whether packets without a valid proof come faster than they can be looked at: pause the reading.
     """
 
     def __init__(
@@ -101,14 +120,13 @@ class PacketFilter:
         self._refusals = RefusalLog(_log, counters)
         # The limits, one for each kind of packet and each kind of sender: they are more than twelve fields together.
         self._unlinked: dict[int, TokenBucket] = {}
-        self._unproved = TokenBucket(limits.BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
-        self._sources = AddressLimit(limits.BEACONS_PER_SOURCE, limits.BEACON_SOURCES_MAX)
+        self._unproved = TokenBucket(_BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
+        self._sources = AddressLimit(limits.BEACONS_PER_SOURCE, _BEACON_SOURCES_MAX)
         self._old_key_sources = AddressLimit(trust_limits.OLD_KEY_PACKETS_PER_ADDRESS, trust_limits.OLD_KEYS_MAX)
         self._old_keys = TokenBucket(trust_limits.OLD_KEY_PACKETS_RATE, trust_limits.OLD_KEY_PACKETS_RATE)
         self._strangers: dict[tuple[str, int], Stranger] = {}
-        self._stranger_beacons = TokenBucket(limits.STRANGER_BEACONS_PER_SECOND, limits.STRANGER_BEACONS_PER_SECOND)
+        self._stranger_beacons = TokenBucket(_STRANGER_BEACONS_PER_SECOND, _STRANGER_BEACONS_PER_SECOND)
         self.overrun = False
-        """Whether packets without a valid proof come faster than they can be looked at: pause the reading."""
 
     def parse(
         self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0
@@ -147,7 +165,7 @@ class PacketFilter:
 
     def strangers(self, now: float) -> tuple[Stranger, ...]:
         """The modules whose beacons are refused and were heard lately, in the order in which they were found."""
-        for key in [key for key, one in self._strangers.items() if now - one.heard > limits.STRANGER_KEPT]:
+        for key in [key for key, one in self._strangers.items() if now - one.heard > STRANGER_KEPT]:
             del self._strangers[key]
         return tuple(self._strangers.values())
 
@@ -261,6 +279,9 @@ class Discovery:
         look: Lists the interfaces.
         resolve: Looks up the host name of a seed; runs in a thread.
         trust: Of a secured mesh: beacons are signed, and only those of members are heard.
+
+    Attributes:
+        interfaces: The interfaces in use.
     """
 
     def __init__(
@@ -278,7 +299,6 @@ class Discovery:
         self._trust = trust
         self.counters = Counters()
         self.interfaces: tuple[Interface, ...] = ()
-        """The interfaces in use."""
         self._identity = identity
         self._settings = settings
         self._udp = udp_socket
@@ -412,7 +432,7 @@ class Discovery:
             self._filter.overrun = False
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock.fileno())
-            loop.call_later(limits.BEACONS_UNPROVED_PAUSE, partial(self._listen, sock, multicast=multicast))
+            loop.call_later(BEACONS_UNPROVED_PAUSE, partial(self._listen, sock, multicast=multicast))
         self._flush()
 
     def _listen(self, sock: socket.socket, *, multicast: bool) -> None:
@@ -422,7 +442,7 @@ class Discovery:
     def _take(self, sock: socket.socket, *, multicast: bool) -> None:
         """Handle a bounded number of packets, with pending data between them: a flood must not delay data."""
         now = time.monotonic()
-        for _ in range(limits.BEACONS_PER_WAKE):
+        for _ in range(_BEACONS_PER_WAKE):
             yield_to_data()
             try:
                 data, source, index = network.receive(sock)

@@ -21,11 +21,24 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.beacon import Address, Beacon
 
+# Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A
+# beacon that comes later refutes the goodbye.
+GOODBYE_LATE: Final = 0.2
+# The shortest lease: with a shorter one a peer would come and go with every lost packet.
+LEASE_MIN: Final = 2.0
+# The longest lease: with a longer one a peer would be shown long after its end.
+LEASE_MAX: Final = 120.0
+
+# A packet of a replaced instance after this long is not a late one: two live peers share one GUID.
+_CONFLICT_AFTER: Final = 2.0
+# Runs remembered for one (address, port): the present one, the last one and two rivals.
+_ENDPOINT_RUNS_MAX: Final = 4
+
+# How a peer was heard first; ``gossip``: it answered an announcement to an address that another's gossip had.
 HeardBy: TypeAlias = Literal["multicast", "unicast", "gossip", "link"]
-"""How a peer was heard first; ``gossip``: it answered an announcement to an address that another's gossip had."""
 NEVER: Final = float("-inf")
+# The end of a link that has not ended.
 LINKED: Final = float("inf")
-"""The end of a link that has not ended."""
 
 
 @dataclass(slots=True)
@@ -98,7 +111,7 @@ class PeerInstance:
         if self.goodbye is not None:
             if beacon.kind is BeaconKind.GOODBYE:
                 return False
-            if now - self.heard < limits.GOODBYE_LATE:
+            if now - self.heard < GOODBYE_LATE:
                 last = self.goodbye
         return last is None or is_later(beacon.sequence, last)
 
@@ -110,7 +123,7 @@ class PeerInstance:
             return
         self.goodbye, self.doubted = None, False
         self.identity, self.sequence, self.source = beacon.identity, beacon.sequence, source
-        self.lease = min(max(beacon.lease_ms / 1000, limits.LEASE_MIN), limits.LEASE_MAX)
+        self.lease = min(max(beacon.lease_ms / 1000, LEASE_MIN), LEASE_MAX)
 
 
 @dataclass(slots=True)
@@ -118,7 +131,7 @@ class Endpoint:
     """The runs heard under one (address, port).
 
     Args:
-        runs: By instance id, at most ``limits.ENDPOINT_RUNS_MAX``.
+        runs: By instance id, at most ``_ENDPOINT_RUNS_MAX``.
         current: The live one.
         claimant: The newest other run. It becomes the live one unless a link or a conflict speaks against it.
         conflict: Whether two live runs claim the endpoint.
@@ -205,10 +218,10 @@ class Endpoint:
     @staticmethod
     def _insists(run: PeerInstance, current: PeerInstance) -> bool:
         """Whether a run was heard so long after the other one took its place that the packet was no late one."""
-        return run.heard - max(run.since, current.since) >= limits.CONFLICT_AFTER
+        return run.heard - max(run.since, current.since) >= _CONFLICT_AFTER
 
     def _add(self, run: PeerInstance) -> PeerInstance:
-        if len(self.runs) >= limits.ENDPOINT_RUNS_MAX:
+        if len(self.runs) >= _ENDPOINT_RUNS_MAX:
             oldest = min((r for r in self.runs.values() if r is not self.current), key=lambda r: r.heard)
             del self.runs[oldest.identity.instance]
         self.runs[run.identity.instance] = run
@@ -216,27 +229,32 @@ class Endpoint:
 
 
 class PeerView(NamedTuple):
-    """One peer, for display."""
+    """One peer, for display.
+
+    Attributes:
+        conflicts: Texts for the user.
+        present: Whether it is a member; ``False`` while a conflict prevents it.
+    """
 
     run: PeerInstance
     conflicts: tuple[str, ...]
-    """Texts for the user."""
     present: bool
-    """Whether it is a member; ``False`` while a conflict prevents it."""
 
 
 class EndpointTable(dict[int, Endpoint]):
     """The endpoints by place (``Guid.place``), with indexes: a packet never costs a look at every endpoint.
 
     After a change of an endpoint ``index`` must be called.
+
+    Attributes:
+        members: The peers that are members, without this agent, by place; only ``index`` changes it.
+        timers: When the first lease at a place is over.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.members: dict[int, PeerInstance] = {}
-        """The peers that are members, without this agent, by place; only ``index`` changes it."""
         self.timers: TimerQueue[int] = TimerQueue()
-        """When the first lease at a place is over."""
         self._names: dict[int, str] = {}
         self._by_name: defaultdict[str, set[int]] = defaultdict(set)
 

@@ -29,6 +29,29 @@ if TYPE_CHECKING:
     from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.endpoints import PeerView
 
+# When a starting agent announces itself, in seconds after its start: Wi-Fi loses multicast, so one beacon is not
+# enough.
+BURST_OFFSETS: Final = (0.0, 0.1, 0.3, 0.7)
+# Paper, section 4.3: "each five seconds a heartbeat will check that network is still alive".
+HEARTBEAT_INTERVAL: Final = 5.0
+# The shorter burst of beacons after a change of interfaces: most listeners know the agent already.
+BURST_AGAIN_OFFSETS: Final = (0.0, 0.2, 0.6)
+# The longest random delay of each but the first beacon of a burst: modules on one power switch start together.
+BURST_JITTER: Final = 0.05
+
+# The largest random part of the interval by which a heartbeat is sent early, because modules start together.
+_HEARTBEAT_JITTER: Final = 0.1
+# Newcomers of a large mesh that wait for an answer at one time, from which on one multicast answers all of them: it
+# costs each member one packet to read, as much as the answers would cost their senders.
+_ANSWERS_TOGETHER: Final = 8
+# Newly found peers are gathered for this long before peers without multicast are notified; the first at once.
+_DISSEMINATION_INTERVAL: Final = 0.5
+# Early heartbeats a second, of all members of a large mesh together: while a thousand agents start, each of them
+# finds new peers all the time.
+_DISSEMINATIONS_PER_SECOND: Final = 100.0
+# Unicast heartbeats, to linked and unlinked peers, in one run of the timer; each takes some 0.1 ms.
+_UNICAST_HEARTBEATS_AT_ONCE: Final = 8
+
 SILENCE: Final = "silent for its lease"
 GOODBYE: Final = "said goodbye"
 RESTARTED: Final = "started anew"
@@ -92,11 +115,11 @@ class MembershipProtocol:
         self._heartbeat_at: float | None = None
         self._disseminate_at: float | None = None
         self._disseminated_at = NEVER
+        # The peers that get a heartbeat by unicast now, by place.
         self._unicasts: dict[int, PeerInstance] = {}
-        """The peers that get a heartbeat by unicast now, by place."""
         self._unicast_at = NEVER
+        # The places of newcomers of a large mesh that wait for an answer, oldest first.
         self._late_answers: dict[int, None] = {}
-        """The places of newcomers of a large mesh that wait for an answer, oldest first."""
         self._late_answers_at = NEVER
         self._events: list[PeerEvent] = []
 
@@ -108,7 +131,7 @@ class MembershipProtocol:
         own = PeerInstance(identity, now, now, "link", linked_until=LINKED)
         self._endpoints[identity.guid.place] = Endpoint({identity.instance: own}, own, own=True)
         self._endpoints.index(identity.guid.place)
-        self._burst = self._burst_times(now, limits.BURST_OFFSETS)
+        self._burst = self._burst_times(now, BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
 
@@ -211,7 +234,7 @@ class MembershipProtocol:
         """Announce this agent again after a change of interfaces, with its present addresses."""
         if not self._sender.closed:
             self._sender.identity = replace(self._sender.identity, addresses=addresses)
-            self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
+            self._burst = self._burst_times(now, BURST_AGAIN_OFFSETS)
             self.handle_timer(now)
 
     def set_seeds(self, seeds: Iterable[Address]) -> None:
@@ -262,7 +285,7 @@ class MembershipProtocol:
                 self._send_multicast(BeaconKind.HEARTBEAT, now)
         if self._late_answers and self._late_answers_at <= now:
             self._send_late_answers(now)
-        for place in tuple(islice(self._unicasts, limits.UNICAST_HEARTBEATS_AT_ONCE)):
+        for place in tuple(islice(self._unicasts, _UNICAST_HEARTBEATS_AT_ONCE)):
             peer = self._unicasts.pop(place)
             gossip = self._sender.gossip(self._members(), peer, now)
             for address in peer.addresses:
@@ -443,9 +466,9 @@ class MembershipProtocol:
         """Schedule gossip about a found peer for the peers that multicast does not reach."""
         members = len(self._endpoints.members)
         if self._disseminate_at is None and self._heartbeat_at is not None and members > 1:
-            interval = limits.DISSEMINATION_INTERVAL
+            interval = _DISSEMINATION_INTERVAL
             if members > limits.MANY_MEMBERS:
-                interval = max(interval, members / limits.DISSEMINATIONS_PER_SECOND)
+                interval = max(interval, members / _DISSEMINATIONS_PER_SECOND)
             self._disseminate_at = max(now, self._disseminated_at + interval)
 
     def _answer_if_unknown(
@@ -476,7 +499,7 @@ class MembershipProtocol:
 
     def _send_late_answers(self, now: float) -> None:
         """Answer the newcomers of a large mesh that got no link meanwhile."""
-        if len(self._late_answers) >= limits.ANSWERS_TOGETHER:
+        if len(self._late_answers) >= _ANSWERS_TOGETHER:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
         for place in self._late_answers:
             if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
@@ -495,7 +518,7 @@ class MembershipProtocol:
         if was_candidate:
             peer.found_by = "gossip"
         elif beacon.kind is BeaconKind.ANSWER and self._sender.multicast and source not in self._seeds:
-            peer.multicast_at = now - limits.HEARTBEAT_INTERVAL
+            peer.multicast_at = now - HEARTBEAT_INTERVAL
 
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender."""
@@ -513,7 +536,7 @@ class MembershipProtocol:
         self._announce(self._candidates.take_due(now))
 
     def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
-        return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
+        return [now + offset + (BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
 
     def _next_heartbeat(self, now: float) -> float:
-        return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())
+        return now + HEARTBEAT_INTERVAL * (1.0 - _HEARTBEAT_JITTER * self._rng())

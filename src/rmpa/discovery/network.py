@@ -29,6 +29,18 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# How often interfaces are read where the kernel does not report changes.
+INTERFACE_LOOK: Final = 5.0
+
+# Delay after a reported change of interfaces before they are read, because the kernel reports several at once.
+_INTERFACE_SETTLE: Final = 0.2
+# A seed's host name is looked up again this often: addresses change.
+_SEED_RESOLVE_INTERVAL: Final = 60.0
+# Delay before a failed look-up of a seed's name is repeated; it doubles each time (no name server yet).
+_SEED_RETRY_FIRST: Final = 1.0
+# The longest delay between two look-ups after failures.
+_SEED_RETRY_MAX: Final = 30.0
+
 _RTMGRP_LINK: Final = 0x1
 _RTMGRP_IPV4_IFADDR: Final = 0x10
 _LOOPBACK: Final = IPv4Address("127.0.0.1")
@@ -117,7 +129,7 @@ def open_netlink() -> socket.socket | None:
         netlink = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, 0)
         netlink.bind((0, _RTMGRP_LINK | _RTMGRP_IPV4_IFADDR))
     except OSError as error:
-        _log.info("= netlink is refused (%s); interfaces are read every %g s", error, limits.INTERFACE_LOOK)
+        _log.info("= netlink is refused (%s); interfaces are read every %g s", error, INTERFACE_LOOK)
         if netlink is not None:
             netlink.close()
         return None
@@ -125,9 +137,9 @@ def open_netlink() -> socket.socket | None:
 
 
 async def watch_interfaces(look: Callable[[], bool]) -> None:
-    """Look at the interfaces now and after each change of them, ``limits.INTERFACE_SETTLE`` seconds later.
+    """Look at the interfaces now and after each change of them, ``_INTERFACE_SETTLE`` seconds later.
 
-    Where the kernel reports no changes, the interfaces are looked at every ``limits.INTERFACE_LOOK`` seconds.
+    Where the kernel reports no changes, the interfaces are looked at every ``INTERFACE_LOOK`` seconds.
 
     Args:
         look: Looks at them; returns whether that was possible. If not, it is called again after a while.
@@ -136,12 +148,12 @@ async def watch_interfaces(look: Callable[[], bool]) -> None:
     try:
         while True:
             if not look() or netlink is None:
-                await asyncio.sleep(limits.INTERFACE_LOOK)
+                await asyncio.sleep(INTERFACE_LOOK)
                 continue
             # The messages only mean that something changed; ENOBUFS means that some were lost, which is the same.
             with contextlib.suppress(OSError):
                 await asyncio.get_running_loop().sock_recv(netlink, 64 * KIB)
-            await asyncio.sleep(limits.INTERFACE_SETTLE)
+            await asyncio.sleep(_INTERFACE_SETTLE)
             with contextlib.suppress(OSError):
                 while netlink.recv(64 * KIB):
                     pass
@@ -175,7 +187,7 @@ async def follow_seed(
         resolve: Looks it up; runs in a thread.
         on_addresses: Called in the loop with the name and the addresses that it has now.
     """
-    backoff = Backoff(limits.SEED_RETRY_FIRST, limits.SEED_RETRY_MAX, random.random)
+    backoff = Backoff(_SEED_RETRY_FIRST, _SEED_RETRY_MAX, random.random)
     failed = False
     while True:
         try:
@@ -189,7 +201,7 @@ async def follow_seed(
             failed = False
             backoff.reset()
             on_addresses(host, addresses)
-            await asyncio.sleep(limits.SEED_RESOLVE_INTERVAL)
+            await asyncio.sleep(_SEED_RESOLVE_INTERVAL)
 
 
 # The UDP sockets of discovery. The group is joined, and sent to, on each interface by its index.

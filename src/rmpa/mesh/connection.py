@@ -36,12 +36,15 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# A timer that fires later than this shows that the process did not run. That time does not count as a peer's silence.
+_PAUSE_NOTICED: Final = 0.1
+
 _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(FrameKind.DATA)
+# Bytes that the first part of a message must have, because they contain the message's length.
 _FIRST_PART: Final = 4
-"""Bytes that the first part of a message must have, because they contain the message's length."""
+# The first byte of a TLS connection; a frame begins with 0, as it is shorter than 16 MiB.
 _TLS_HANDSHAKE: Final = 0x16
-"""The first byte of a TLS connection; a frame begins with 0, as it is shorter than 16 MiB."""
 
 
 class ConnectionState(IntEnum):
@@ -95,6 +98,18 @@ class ConnectionProtocol:
         secured: Whether the connection is inside TLS.
         label: The remote side's name, until it is known.
         counters: Counts data frames of routes that are not open, as ``route.unknown``.
+
+    Attributes:
+        name: The name of the remote side, or its address while that is not known.
+        remote: The remote side's hello or welcome; ``None`` before it is received.
+        since: Monotonic seconds at which the handshake ended.
+        malformed: Whether the remote side broke the protocol.
+        routes: The handler of each open route. Assigned once the peer, and so the receiver of its data, is known.
+        clock: Round-trip time and remote clock, as the pings of this connection show them.
+        abandoned: Whether this process was stopped for longer than the lease that it promised: the remote side has
+            ended the connection then, and given up what it asked in it. True until a ping from after that is
+            answered.
+        output: The bytes that ``take_output`` returns.
     """
 
     def __init__(
@@ -114,33 +129,23 @@ class ConnectionProtocol:
         self.dialled = dialled
         self.expected = expected
         self.lane = lane
-        """The lane (``frames.Lane``); for an accepted connection it is known after the remote side's hello."""
         self.name = label
-        """The name of the remote side, or its address while that is not known."""
         self.remote: Hello | None = None
-        """The remote side's hello or welcome; ``None`` before it is received."""
         self.since: float | None = None
-        """Monotonic seconds at which the handshake ended."""
         self.state = ConnectionState.HANDSHAKING
         self.malformed = False
-        """Whether the remote side broke the protocol."""
         self.routes: Mapping[int, DataHandler] = {}
-        """The handler of each open route. Assigned once the peer, and so the receiver of its data, is known."""
         self.clock = RemoteClock()
-        """Round-trip time and remote clock, as the pings of this connection show them."""
         phase = int.from_bytes(ours.instance[:2], "big") / 65536 * limits.IDLE_KEEPALIVE_INTERVAL
         lease = limits.BULK_LEASE if lane == Lane.BULK else limits.EXPRESS_LEASE
         self.keepalive = Keepalive(lease, now, acceptor=not dialled, phase=phase)
         self.abandoned = False
-        """Whether this process was stopped for longer than the lease that it promised: the remote side has ended the
-        connection then, and given up what it asked in it. True until a ping from after that is answered."""
         self.output = bytearray()
-        """The bytes that ``take_output`` returns."""
         self._proof: int | None = None
+        # Bytes that are still missing of a data frame whose first bytes were handed on.
         self._missing = 0
-        """Bytes that are still missing of a data frame whose first bytes were handed on."""
+        # Route, sequence, stamp and LAST flag of that frame.
         self._begun = (0, 0, 0, 0)
-        """Route, sequence, stamp and LAST flag of that frame."""
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._secured = secured
@@ -324,7 +329,7 @@ class ConnectionProtocol:
         if due is None or now < due:
             return
         keepalive = self.keepalive
-        if now - due > limits.PAUSE_NOTICED:
+        if now - due > _PAUSE_NOTICED:
             keepalive.excuse(now - due, now)
         if now - keepalive.sent > keepalive.lease:
             self.abandoned, self._proof = True, None

@@ -26,13 +26,13 @@ Buffer = bytes | bytearray | memoryview
 _HEADER: Final = struct.Struct(">IBBHIIQ")
 _STAMPS: Final = struct.Struct(">QQ")
 
+# ``(view, offset)`` to ``(length, kind, flags, reserved, route, sequence, stamp_ns)``, unchecked.
 unpack_header: Final = _HEADER.unpack_from
-"""``(view, offset)`` to ``(length, kind, flags, reserved, route, sequence, stamp_ns)``, unchecked."""
 
 _pack: Final = _HEADER.pack
 
+# The flags of a message in one piece.
 WHOLE: Final = FIRST | LAST
-"""The flags of a message in one piece."""
 
 
 class FrameKind(IntEnum):
@@ -53,10 +53,11 @@ class FrameKind(IntEnum):
     LANE = 13
 
 
+# Bit of a pace frame's route field: something at the sender depends on the connection, so neither side may rest. Bits
+# that are not known are ignored.
 PACE_NEEDED: Final = 1
-"""Bit of a pace frame's route field: something at the sender depends on the connection, so neither side may rest.
-Bits that are not known are ignored."""
 _SHORT: Final = (FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE, FrameKind.BYE)
+# The most bytes of payload that a frame of each kind may claim.
 PAYLOAD_MAX: Final[dict[int, int]] = {
     **dict.fromkeys(FrameKind, 0),
     **dict.fromkeys(_SHORT, limits.HELLO_PAYLOAD_MAX),
@@ -64,7 +65,6 @@ PAYLOAD_MAX: Final[dict[int, int]] = {
     FrameKind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
     FrameKind.DATA: limits.DATA_PAYLOAD_MAX,
 }
-"""The most bytes of payload that a frame of each kind may claim."""
 
 
 def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> bytes:
@@ -362,12 +362,12 @@ class Hello:
         return Identity(self.guid, self.instance, self.name, self.domain)
 
 
+# The answer to a module for which a mesh has no place; it may join when one becomes free.
 FULL: Final = Refuse(
     Refusal.FULL,
     f"this mesh has {limits.MODULES_MAX} modules and no place for one more: make further ones a site of their own "
     "(`rmpa gateway`, docs/sites.md)",
 )
-"""The answer to a module for which a mesh has no place; it may join when one becomes free."""
 
 
 def judge(

@@ -4,8 +4,25 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Final
 
 from rmpa.mesh import limits
+
+# Pings that follow each other when a link's rest ends: the best of them gives the latency of the first messages an
+# exact clock.
+WAKE_PINGS: Final = 5
+# The acceptor's keepalive interval, as a multiple of the dialler's: on an idle link only the dialler pings, and each
+# ping and pong is a sign of life.
+ACCEPTOR_KEEPALIVE_FACTOR: Final = 1.2
+
+# Interval of the pings that follow each other when a link's rest ends.
+_WAKE_PING_INTERVAL: Final = 0.02
+# Exchanges of ping and pong kept for a peer's clock, 4 to 16 s of keepalives; older ones have a large error
+# (CLOCK_DRIFT).
+_CLOCK_SAMPLES: Final = 16
+# Seconds by which the local wall clock must deviate from the monotonic one to count as set. A smaller step shows as a
+# contradiction between two exchanges.
+_CLOCK_STEP: Final = 0.05
 
 
 def rest_lease(peers: int) -> float:
@@ -38,31 +55,33 @@ class Keepalive:
             that the agent wakes once for all of them.
         acceptor: Whether the remote side dialled. The acceptor pings a little later than the dialler, so that on an
             idle connection it sends only pongs.
+
+    Attributes:
+        usual: The promise of this side while the link is in use, and the one that holds now.
+        rest_lease: What this side promises at rest; see the function ``rest_lease``.
+        remote_lease: Seconds of silence that the remote side promised last.
+        needed: Whether this side, and the remote one, needs the short lease.
+        heard: When bytes were last received, and when the handshake ended.
+        sent: When this side last sent a ping or a pong, and a ping.
+        excused: Seconds of the present silence during which this process did not run.
     """
 
     def __init__(self, lease: float, now: float, *, acceptor: bool, phase: float) -> None:
         self._acceptor = acceptor
         self._phase = phase
         self.usual = self.lease = lease
-        """The promise of this side while the link is in use, and the one that holds now."""
         self.rest_lease = limits.IDLE_LEASE
-        """What this side promises at rest; see the function ``rest_lease``."""
         self.remote_lease = limits.EXPRESS_LEASE
-        """Seconds of silence that the remote side promised last."""
         self.needed = self.remote_needs = True
-        """Whether this side, and the remote one, needs the short lease."""
         self.heard = self.up_at = now
-        """When bytes were last received, and when the handshake ended."""
         self.sent = self._pinged = now
-        """When this side last sent a ping or a pong, and a ping."""
         self.excused = 0.0
-        """Seconds of the present silence during which this process did not run."""
+        # Pings that still follow each other closely.
         self._burst = 0
-        """Pings that still follow each other closely."""
+        # When this side began to need a link at rest, while the remote side's promise has not come.
         self._woken: float | None = None
-        """When this side began to need a link at rest, while the remote side's promise has not come."""
+        # Seconds that the remote side has for it.
         self._within = 0.0
-        """Seconds that the remote side has for it."""
 
     def hear(self, now: float) -> None:
         """Renew the remote side's lease: bytes were received."""
@@ -77,7 +96,7 @@ class Keepalive:
         if self.needed or self.remote_needs:
             self.lease = self.usual
             if before > self.usual:
-                self._burst = limits.WAKE_PINGS  # the estimate of the remote clock is as old as the rest
+                self._burst = WAKE_PINGS  # the estimate of the remote clock is as old as the rest
         elif not self.rests or abs(self.rest_lease - before) >= before / 10:
             self.lease = self.rest_lease
         return self.lease != before
@@ -120,9 +139,9 @@ class Keepalive:
         the driver does not arm its timer again after each receive. The same timer checks whether the peer is gone, so
         its interval stays below ``quiet_after``.
         """
-        factor = limits.ACCEPTOR_KEEPALIVE_FACTOR if self._acceptor else 1.0
+        factor = ACCEPTOR_KEEPALIVE_FACTOR if self._acceptor else 1.0
         if self._burst:
-            next_ping = self._pinged + limits.WAKE_PING_INTERVAL
+            next_ping = self._pinged + _WAKE_PING_INTERVAL
         elif self.rests:
             next_ping = self._common_time(self.sent + factor * (self.lease - 1) / 3)
         else:
@@ -175,24 +194,26 @@ class Keepalive:
 
 
 class RemoteClock:
-    """The remote clock, by the exchange with the least error among the last ``limits.CLOCK_SAMPLES``.
+    """The remote clock, by the exchange with the least error among the last ``_CLOCK_SAMPLES``.
 
     Queues only make round trips longer, so the shortest has the least error; the error grows with age, because the
     two clocks drift apart (PHI of RFC 5905).
+
+    Attributes:
+        rtt: The last round trip, in seconds; ``None`` before the first.
     """
 
     def __init__(self) -> None:
         self._pings: dict[int, float] = {}
-        self._samples: deque[tuple[float, float, float]] = deque(maxlen=limits.CLOCK_SAMPLES)
-        """Of each exchange: its round trip on the wire, the offset of the remote wall clock, ± half of that, and when
-        it was: all in seconds."""
+        # Of each exchange: its round trip on the wire, the offset of the remote wall clock, ± half of that, and when
+        # it was: all in seconds.
+        self._samples: deque[tuple[float, float, float]] = deque(maxlen=_CLOCK_SAMPLES)
         self.rtt: float | None = None
-        """The last round trip, in seconds; ``None`` before the first."""
 
     def pinged(self, t1: int, now: float) -> None:
         """A ping with stamp ``t1`` (ns) is sent."""
         self._pings[t1] = now
-        while len(self._pings) > limits.CLOCK_SAMPLES:
+        while len(self._pings) > _CLOCK_SAMPLES:
             del self._pings[next(iter(self._pings))]
 
     def ponged(self, t1: int, t2: int, t3: int, t4: int, now: float) -> float | None:
@@ -205,7 +226,7 @@ class RemoteClock:
         if sent is None:
             return None
         rtt, offset = ((t4 - t1) - (t3 - t2)) / 1e9, ((t2 - t1) + (t3 - t4)) / 2e9
-        if abs((t4 - t1) / 1e9 - (now - sent)) > limits.CLOCK_STEP or rtt < 0:
+        if abs((t4 - t1) / 1e9 - (now - sent)) > _CLOCK_STEP or rtt < 0:
             self._samples.clear()
             return None
         estimate = self.estimate(now)

@@ -27,23 +27,38 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# The higher GUID waits this long for the lower one's dial, then dials itself (NAT, firewall).
+DIAL_FALLBACK: Final = 2.0
+# Dials a second to all peers together that fell silent (``limits.PURSUIT``), half a millisecond each: 64 peers whose
+# network failed at once are dialled every 0.5 s, and take less than a tenth of a core for ten seconds.
+PURSUITS_PER_SECOND: Final = 200.0
+# After the loss of a link that was up for at least this long, the back-off begins at the shortest delay.
+LINK_STABLE: Final = 5.0
+# Delay before another dial to a peer that refused for a reason that seldom passes by itself (version, domain).
+REFUSED_RETRY: Final = 5.0
+
+# How long the lower GUID refuses the dial of a peer to which it has sent a hello itself: more than a round trip. If
+# its own hello is not answered for longer, the peer's dial is accepted.
+_CROSSING_TIME: Final = 0.5
+
 SocketAddress = tuple[str, int]
 
+# Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause.
 _UNPROVEN: Final = frozenset({TrustReason.UNSECURED, TrustReason.CLOCK})
-"""Refusals without proof of the sender, or that pass once a clock is set: they are shown, and change no pause."""
+# Refusals that concern one endpoint only, because another agent, or this agent itself, answered there.
 _OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
-"""Refusals that concern one endpoint only, because another agent, or this agent itself, answered there."""
 
 
 _PASSING: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.BUSY, Refusal.NO_EXPRESS})
+# Refusals for reasons that seldom pass by themselves.
 _SELDOM_MENDED: Final = frozenset({*Refusal, *TrustReason}) - _UNPROVEN - _OTHER_PEER - _PASSING
-"""Refusals for reasons that seldom pass by themselves."""
 
 
+# Why a link is no longer used: the same run of the peer has another link from the same moment on.
 REPLACED: Final = "replaced by a newer link"
-"""Why a link is no longer used: the same run of the peer has another link from the same moment on."""
+# Why a link is no longer used: another run of the peer has taken its place.
 RESTARTED: Final = "the peer restarted"
-"""Why a link is no longer used: another run of the peer has taken its place."""
+# What the driver has to do, or the rooms above have to know; see ``Peering.take``.
 PeeringOutput = (
     tuple[Literal["dial"], Guid, tuple[SocketAddress, ...], bool]
     | tuple[Literal["close"], int, str]
@@ -51,7 +66,6 @@ PeeringOutput = (
     | tuple[Literal["down"], int, str]
     | tuple[Literal["refused"], Identity, Refuse]
 )
-"""What the driver has to do, or the rooms above have to know; see ``Peering.take``."""
 
 
 @dataclass(slots=True)
@@ -146,6 +160,9 @@ class Peering:
         ours: The identity of this agent.
         rng: Uniform numbers in [0, 1), for the jitter.
         alive: Returns whether bytes arrived on a link, given by its id, in the last ``limits.GHOST_QUIET`` seconds.
+
+    Attributes:
+        left_out: Whether a mesh that is full has refused this module, and no link has come up since.
     """
 
     def __init__(self, ours: Identity, *, rng: Callable[[], float], alive: Callable[[int], bool]) -> None:
@@ -155,11 +172,10 @@ class Peering:
         self._peers: dict[int, Peer] = {}
         self._outputs: list[PeeringOutput] = []
         self._timers: TimerQueue[int] = TimerQueue()
+        # Unverified peers whose dials are due, the one that has been due longest first.
         self._dial_queue: dict[int, None] = {}
-        """Unverified peers whose dials are due, the one that has been due longest first."""
         self._newest_next = True
         self.left_out = False
-        """Whether a mesh that is full has refused this module, and no link has come up since."""
         self._queue_at: float | None = None
         self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
@@ -292,7 +308,7 @@ class Peering:
         peer = next((peer for peer in self._peers.values() if peer.link == link_id), None)
         if peer is None:
             return
-        if silent or now - (peer.since or now) >= limits.LINK_STABLE:
+        if silent or now - (peer.since or now) >= LINK_STABLE:
             peer.backoff.reset()
         peer.link, peer.linked, peer.since, peer.last_error = None, None, now, reason
         self._outputs.append(("down", link_id, reason))
@@ -343,7 +359,7 @@ class Peering:
             self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse
-            pause = max(limits.REFUSED_RETRY, self._cap(peer))
+            pause = max(REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
         full = refuse.code == Refusal.FULL
         reported = self.left_out if full else refuse.code in peer.reported
@@ -415,7 +431,7 @@ class Peering:
 
     def _fallback(self, peer: Peer) -> float:
         """Seconds that this side waits for the peer's dial: none if it has the lower GUID, and dials first."""
-        return 0.0 if self._ours.guid < peer.run.guid else limits.DIAL_FALLBACK
+        return 0.0 if self._ours.guid < peer.run.guid else DIAL_FALLBACK
 
     def _forget_if_idle(self, peer: Peer) -> None:
         """Forget a peer that is gone, unless it has a link or an unanswered dial."""
@@ -446,7 +462,7 @@ class Peering:
         if self._fallback(peer) or not peer.verified or peer.link is not None or peer.hello_at is None:
             return False
         same_run = peer.run.instance == hello.instance
-        return same_run and now - peer.hello_at < limits.CROSSING_TIME
+        return same_run and now - peer.hello_at < _CROSSING_TIME
 
     def _replace(self, peer: Peer, reason: str, now: float) -> None:
         """Close a peer's link, if there is one: another link replaces it, or another run of the peer."""
@@ -496,7 +512,7 @@ class Peering:
     def _pause(self, peer: Peer, now: float) -> float:
         if now < peer.pursued_until:
             pursued = sum(now < each.pursued_until for each in self._peers.values())
-            return max(limits.REDIAL_PAUSE, pursued / limits.PURSUITS_PER_SECOND) * (0.5 + self._rng())
+            return max(limits.REDIAL_PAUSE, pursued / PURSUITS_PER_SECOND) * (0.5 + self._rng())
         peer.backoff.cap = self._cap(peer)
         return peer.backoff.delay()
 
@@ -531,7 +547,7 @@ class Peering:
         ones, and the peer that has waited longest, so that no peer waits forever.
         """
         if self._dial_queue and self._full():
-            self._queue_at = now + limits.REFUSED_RETRY
+            self._queue_at = now + REFUSED_RETRY
             return
         while self._dial_queue and self._dial_rate.take(now):
             queue = [self._peers[place] for place in self._dial_queue]

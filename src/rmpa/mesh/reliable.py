@@ -30,6 +30,10 @@ from rmpa.mesh import limits
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+# The longest delay of an acknowledgement after the first message that it covers. The sender of few messages keeps
+# them in memory for this much longer.
+ACK_DELAY: Final = 0.010
+
 
 class Outgoing(NamedTuple):
     """A message to be sent. One is made for each message, so it is a named tuple, which is the fastest to make.
@@ -60,6 +64,12 @@ class ReliableSender:
         window_bytes: Bytes that may be sent and not acknowledged; it should be at least twice ``limits.ACK_BYTES``.
         epoch: The epoch of this numbering; no other sender of this source to this peer may have had it.
         first: The first message's sequence.
+
+    Attributes:
+        overflowed: The number of dropped messages that the receiver did not get. A message that was dropped in flight
+            is added at ``resume``, if it did not arrive.
+        pending_bytes: The number of bytes kept.
+        confirmed: The last message that is known to have arrived, with all messages before it.
     """
 
     def __init__(
@@ -71,24 +81,19 @@ class ReliableSender:
         self._window_bytes = window_bytes
         self.epoch: Final = epoch
         self.first: Final = first & SERIAL_MASK
-        """The first message's sequence, for the receiver's ``begin``."""
         self.overflowed = 0
-        """The number of dropped messages that the receiver did not get. A message that was dropped in flight is added
-        at ``resume``, if it did not arrive."""
         self._unsent: deque[Outgoing] = deque()
         self._sent: deque[Outgoing] = deque()
+        # ``(sequence, size)`` of the messages that were dropped after they were sent, and may have arrived. All of
+        # them are older than the kept messages, and the window bounds their number.
         self._dropped_in_flight: deque[tuple[int, int]] = deque()
-        """``(sequence, size)`` of the messages that were dropped after they were sent, and may have arrived. All of
-        them are older than the kept messages, and the window bounds their number."""
         self.pending_bytes = 0
-        """The number of bytes kept."""
         self._in_flight_bytes = 0
         self._linked = True
         self._next = self.first
         self.confirmed = serial_add(first, -1)
-        """The last message that is known to have arrived, with all messages before it."""
+        # The highest sequence that was sent over any link, or reported as lost.
         self._highest = self.confirmed
-        """The highest sequence that was sent over any link, or reported as lost."""
 
     @property
     def last(self) -> int:
@@ -252,12 +257,14 @@ class ReliableReceiver:
     Args:
         epoch: The sender's, if known; else the first message's is taken.
         first: The sender's first sequence, if known.
+
+    Attributes:
+        next: The sequence that comes next; a receiver that takes a message with this one by itself adds 1.
     """
 
     def __init__(self, epoch: int | None = None, first: int | None = None) -> None:
         self._epoch = epoch
         self.next = first
-        """The sequence that comes next; a receiver that takes a message with this one by itself adds 1."""
         self._unacknowledged = 0
         self._unacknowledged_bytes = 0
         self._unacknowledged_since = 0.0
@@ -327,7 +334,7 @@ class ReliableReceiver:
             return None
         if self._unacknowledged >= limits.ACK_MESSAGES or self._unacknowledged_bytes >= limits.ACK_BYTES:
             return self._unacknowledged_since
-        return self._unacknowledged_since + limits.ACK_DELAY
+        return self._unacknowledged_since + ACK_DELAY
 
 
 # Reliable senders whose link is gone, kept in case their receivers come back.
@@ -342,13 +349,15 @@ class ResumeTable(Generic[_Key]):
     Each sender stays for a time of its own. At most ``limits.RESUMES_MAX`` senders stay, with
     ``limits.RESUME_BYTES_MAX`` bytes together: beyond a bound the sender that was parked longest leaves the table.
     While a sender is parked, its messages are offered by ``offer`` of this table.
+
+    Attributes:
+        pending_bytes: Bytes kept by all parked senders.
     """
 
     def __init__(self) -> None:
+        # The senders, and when each leaves the table; the one that was parked longest first.
         self._parked: dict[_Key, tuple[ReliableSender, float]] = {}
-        """The senders, and when each leaves the table; the one that was parked longest first."""
         self.pending_bytes = 0
-        """Bytes kept by all parked senders."""
 
     def __len__(self) -> int:
         return len(self._parked)

@@ -48,6 +48,9 @@ if TYPE_CHECKING:
     from rmpa.runtime.stream import Stream
     from rmpa.trust.permissions import TrustStatus
 
+# Seconds after the end of a peer's link in which its beacon may still be one from before.
+ADDRESS_SHARED_MARGIN: Final = 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class AgentParts:
@@ -510,7 +513,7 @@ def _shared_address(peer: PeerInfo, holders: Mapping[str, Sequence[PeerInfo]], o
     waits = peer.state == "linking" and peer.since_ago >= discovery_limits.ADDRESS_SHARED_AFTER
     if not others or not waits or peer.beacon_ago is None or address.startswith("127."):
         return ""
-    if peer.beacon_ago >= peer.since_ago - discovery_limits.ADDRESS_SHARED_MARGIN:
+    if peer.beacon_ago >= peer.since_ago - ADDRESS_SHARED_MARGIN:
         return ""  # an agent that was killed sends no beacons after its link has fallen
     return (
         f"its address {address} is also that of {' and '.join(others)}, and its port {port} does not answer there: "

@@ -15,7 +15,6 @@ from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
 from rmpa.resource.tasks import Tasks
-from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
@@ -31,6 +30,9 @@ if TYPE_CHECKING:
     from rmpa.resource.runtime import RuntimePart
 
 _log = logging.getLogger(__name__)
+
+# Time between two checks of a resource whether a publisher of a type that it needs has appeared.
+TYPE_LOOK: Final = 1.0
 _UNCONFIGURED, _INACTIVE, _ACTIVE, _FINALIZED = LifecycleState
 TRANSITIONS: Final = {
     "configure": ((_UNCONFIGURED,), _INACTIVE),
@@ -95,7 +97,7 @@ class ResourceNode:
                     logged.add(output.type_name)
                     _log.warning("! %s waits for the type of output %s: %s", name, output.name, output.problem)
             if any(output.known is None for output in missing):
-                await asyncio.sleep(limits.TYPE_LOOK)
+                await asyncio.sleep(TYPE_LOOK)
 
     async def _learn(self, output: Output) -> bool:
         name = self.runtime.node.name

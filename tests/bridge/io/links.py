@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, URGENT, Outbox
-from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.link import CONNECTION_URGENT_BYTES
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class Wire:
     """One direction of one connection: the lane's stream, the kernel's buffers and the other end's parser."""
 
     def __init__(self, deliver: Callable[[Frame], None]) -> None:
-        self.outbox = Outbox(1, mesh_limits.CONNECTION_URGENT_BYTES)
+        self.outbox = Outbox(1, CONNECTION_URGENT_BYTES)
         self.lost = False
         self._deliver = deliver
         self._flying = bytearray()

@@ -336,7 +336,7 @@ async def test_the_watcher_looks_by_itself_where_netlink_is_refused(
     monkeypatch: pytest.MonkeyPatch, agents: list[Agent], settings: Settings
 ) -> None:
     monkeypatch.setattr("rmpa.discovery.network.open_netlink", lambda: None)
-    monkeypatch.setattr(limits, "INTERFACE_LOOK", 0.05)
+    monkeypatch.setattr("rmpa.discovery.network.INTERFACE_LOOK", 0.05)
     there: list[Interface] = []
     base = Agent("base", settings, look=lambda: tuple(there))
     await start(agents, base)

@@ -9,7 +9,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.discovery import PacketFilter
+from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE, STRANGER_KEPT, PacketFilter
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 
@@ -198,7 +198,7 @@ def test_more_forged_packets_than_can_be_looked_at_ask_for_a_pause() -> None:
         door.hears(forged_beacon)
         asked.append(door.intake.overrun)
     assert asked.index(True) == limits.BEACONS_UNPROVED_BURST
-    door.hears(forged_beacon, now=10.0 + limits.BEACONS_UNPROVED_PAUSE)
+    door.hears(forged_beacon, now=10.0 + BEACONS_UNPROVED_PAUSE)
     assert not door.intake.overrun, "the pause is over"
 
 
@@ -235,4 +235,4 @@ def test_strangers_fill_no_table_and_no_time(caplog: pytest.LogCaptureFixture) -
     assert shown[0].identity == FRIEND, "one that was there before stays"
     assert len(shown) == limits.STRANGERS_SHOWN
     assert len(caplog.records) < limits.STRANGERS_SHOWN
-    assert not door.intake.strangers(15.0 + limits.STRANGER_KEPT)
+    assert not door.intake.strangers(15.0 + STRANGER_KEPT)

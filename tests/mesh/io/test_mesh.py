@@ -21,8 +21,18 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import KIB, MIB
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import Dialler, bound_queue, may_use_bbr, repeats_quickly
+from rmpa.mesh.io.dial import (
+    BULK_WINDOW_MAX,
+    BULK_WINDOW_MIN,
+    DIAL_ATTEMPTS,
+    EXPRESS_UNSENT_BYTES,
+    Dialler,
+    bound_queue,
+    may_use_bbr,
+    repeats_quickly,
+)
 from rmpa.mesh.io.link import PeerLink
+from rmpa.mesh.peering import DIAL_FALLBACK
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
@@ -79,7 +89,7 @@ async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytes
         one.mesh.peer_found(replace(other.identity, addresses=addresses))
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         assert one.link(other).remote_endpoint[0] == "127.0.0.4"
-        assert asyncio.get_running_loop().time() - began < sum(limits.DIAL_ATTEMPTS)
+        assert asyncio.get_running_loop().time() - began < sum(DIAL_ATTEMPTS)
     finally:
         stranger.close()
         await stranger.wait_closed()
@@ -297,7 +307,7 @@ async def test_stopped_peer_is_down_after_its_lease(
 
 
 async def test_unread_control_frames_close_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "CONNECTION_URGENT_BYTES", MIB)
+    monkeypatch.setattr("rmpa.mesh.io.link.CONNECTION_URGENT_BYTES", MIB)
     async with peers(1) as (one,):
         sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
         await until(lambda: bool(one.ups), "a link")
@@ -319,7 +329,7 @@ def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
                 while True:
                     sock.send(bytes(16 * KIB))
             unsent = fcntl.ioctl(sock, _SIOCOUTQNSD, bytes(4))
-    assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.EXPRESS_UNSENT_BYTES
+    assert int.from_bytes(unsent, sys.byteorder) <= 2 * EXPRESS_UNSENT_BYTES
     assert counters.as_dict() == {}
 
 
@@ -366,7 +376,7 @@ def test_without_bbr_the_window_follows_the_rate() -> None:
         bound_queue(sock)
         bound = sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
         assert bound != before
-        assert limits.BULK_WINDOW_MIN <= bound <= limits.BULK_WINDOW_MAX
+        assert BULK_WINDOW_MIN <= bound <= BULK_WINDOW_MAX
 
 
 async def test_a_bye_says_why() -> None:
@@ -457,7 +467,7 @@ async def test_silent_connections_from_one_address_are_bounded() -> None:
 async def test_both_dial_at_once_and_one_link_stays() -> None:
     async with peers(2, found=False) as (one, other):
         for a, b in ((one, other), (other, one)):
-            a.mesh._peering.peer_found(b.identity, asyncio.get_running_loop().time() - limits.DIAL_FALLBACK)
+            a.mesh._peering.peer_found(b.identity, asyncio.get_running_loop().time() - DIAL_FALLBACK)
         for peer in (one, other):
             peer.mesh._peering.handle_timer(asyncio.get_running_loop().time())
             peer.mesh._act()

@@ -15,6 +15,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse, pack_data_header, unpack_header
+from rmpa.mesh.io.dial import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 from tests.mesh.worlds import AnyRoute
 
@@ -67,8 +68,8 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
         for peer, far in ((one, other), (other, one)):
             express = peer.link(far)
             wanted = [
-                (express.connection, 46, 5, limits.EXPRESS_UNSENT_BYTES),
-                (bulk_of(express), 8, 2, limits.BULK_UNSENT_BYTES),
+                (express.connection, 46, 5, EXPRESS_UNSENT_BYTES),
+                (bulk_of(express), 8, 2, BULK_UNSENT_BYTES),
             ]
             for connection, dscp, priority, unsent in wanted:
                 sock = connection.sock
@@ -77,7 +78,7 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
                 assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT) == unsent
                 assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
                 unacked = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
-                assert unacked == round(limits.LINK_UNACKED * 1000)
+                assert unacked == round(LINK_UNACKED * 1000)
             assert not peer.mesh.counters["link.option_refused"]
 
 

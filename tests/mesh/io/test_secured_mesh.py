@@ -164,7 +164,7 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, answer: int | None
 ) -> None:
     """Anything may answer instead of TLS, by a refusal in plain or by other bytes, and is dialled again as before."""
-    monkeypatch.setattr(limits, "REFUSED_RETRY", 1000.0)
+    monkeypatch.setattr("rmpa.mesh.peering.REFUSED_RETRY", 1000.0)
     refuse = Frame(FrameKind.REFUSE, Refuse(answer or 0, "go away").serialize()).serialize()
     dials = 0
 
@@ -309,7 +309,7 @@ async def test_a_flood_of_strangers_costs_no_message_and_members_still_link(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, what: bytes
 ) -> None:
     """200 connections that say nothing, garbage, or the begin of a ClientHello, from the members' own address."""
-    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 1000.0)
+    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 1000.0)
     members = Member(lab, "arm"), Member(lab, "base"), Member(lab, "crane")
     async with meshes(*members, found=False) as (arm, base, crane):
         introduce([arm, base])
@@ -328,7 +328,7 @@ async def test_a_flood_of_strangers_costs_no_message_and_members_still_link(
 
 
 async def test_accepting_pauses_for_a_flood(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "UNPROVEN_BURST", 20)
+    monkeypatch.setattr("rmpa.mesh.io.securing.UNPROVEN_BURST", 20)
     monkeypatch.setattr(limits, "UNPROVEN_RATE", 0.1)
     async with meshes(Member(lab, "arm"), Member(lab, "base"), found=False) as (arm, base):
         for _ in range(22):
@@ -340,7 +340,7 @@ async def test_accepting_pauses_for_a_flood(lab: Authority, monkeypatch: pytest.
 
 async def test_silent_connections_leave_room_for_members(lab: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest ones of the busiest address are closed, so that a member need not wait until they are given up."""
-    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 1000.0)
+    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 1000.0)
     monkeypatch.setattr(limits, "PENDING_CONNECTIONS_MAX", limits.PENDING_PER_ADDRESS + 2)
     members = Member(lab, "arm"), Member(lab, "base")
     async with meshes(*members, found=False) as (arm, base):
@@ -362,7 +362,7 @@ async def test_silent_connections_leave_room_for_members(lab: Authority, monkeyp
 async def test_a_handshake_that_stands_still_or_is_none_is_given_up(
     lab: Authority, monkeypatch: pytest.MonkeyPatch, rest: bytes
 ) -> None:
-    monkeypatch.setattr(limits, "SECURING_TIMEOUT", 0.3)
+    monkeypatch.setattr("rmpa.mesh.io.securing.SECURING_TIMEOUT", 0.3)
     async with meshes(Member(lab, "base")) as (base,):
         sock = await _dial(base)
         sock.send(rest)

@@ -208,7 +208,7 @@ async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: py
 
 
 async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.01)
+    monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.01)
     async with Slave() as subscriber:
         async with Slave() as dead:
             core.call("registerPublisher", "/dead", "/t", STRING, dead.uri)
@@ -230,7 +230,7 @@ def lists_of(slave: Slave) -> list[XmlRpcValue]:
 @pytest.mark.trap(16)
 async def test_a_publisher_that_is_soon_back_is_told_twice(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     """rospy takes itself for connected while it has not read the end of its old connection."""
-    monkeypatch.setattr(limits, "PUBLISHERS_AGAIN", 0.05)
+    monkeypatch.setattr("rmpa.ros.core.embedded.PUBLISHERS_AGAIN", 0.05)
     uri = "http://127.0.0.1:1/"
     async with Slave() as subscriber:
         core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
@@ -243,8 +243,8 @@ async def test_a_publisher_that_is_soon_back_is_told_twice(core: RosCore, monkey
 
 
 async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "PUBLISHERS_AGAIN", 0.0)
-    monkeypatch.setattr(limits, "WITHDRAWN_LATELY", -1.0)
+    monkeypatch.setattr("rmpa.ros.core.embedded.PUBLISHERS_AGAIN", 0.0)
+    monkeypatch.setattr("rmpa.ros.core.embedded.WITHDRAWN_LATELY", -1.0)
     uri = "http://127.0.0.1:1/"
     async with Slave() as subscriber:
         core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
@@ -260,7 +260,7 @@ async def test_a_publisher_that_is_back_later_is_told_once(core: RosCore, monkey
 
 
 async def test_withdrawn_publishers_are_forgotten(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "WITHDRAWN_KEPT", 10)
+    monkeypatch.setattr("rmpa.ros.core.embedded.WITHDRAWN_KEPT", 10)
     for number in range(100):
         core.call("registerPublisher", "/p", f"/t{number}", STRING, "http://127.0.0.1:1/")
         core.call("unregisterPublisher", "/p", f"/t{number}", "http://127.0.0.1:1/")
@@ -276,7 +276,7 @@ async def test_a_live_node_survives_suspicion(core: RosCore) -> None:
 
 
 async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.05)
+    monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.05)
     async with Slave() as dead:
         core.call("registerPublisher", "/n", "/t", STRING, dead.uri)
     async with Slave() as again:
@@ -406,7 +406,7 @@ async def test_an_unregistered_rosout_comes_back(monkeypatch: pytest.MonkeyPatch
 
 async def test_rosout_yields_its_name_and_takes_it_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
-    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.05)
+    monkeypatch.setattr("rmpa.ros.core.embedded.ROSOUT_LOOK", 0.05)
     core = RosCore(port=0)
     await core.start()
     async with Slave("/rosout") as other, Logs(core) as logs:
@@ -429,7 +429,7 @@ async def test_rosout_yields_its_name_and_takes_it_back(monkeypatch: pytest.Monk
 
 async def test_rosout_starts_when_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
-    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.01)
+    monkeypatch.setattr("rmpa.ros.core.embedded.ROSOUT_LOOK", 0.01)
     core = RosCore(port=0)
     await core.start()
     start, failures = SlaveNode.start, 0

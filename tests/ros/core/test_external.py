@@ -13,7 +13,7 @@ from rmpa.core.errors import LocalProtocolError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.external import ExternalCore
+from rmpa.ros.core.external import MASTER_FAREWELL, MASTER_LOOK_IDLE, MASTER_RETRY, ExternalCore
 from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
@@ -95,7 +95,7 @@ async def test_what_is_called_arrives_in_order_and_is_gone_at_the_end(master: Ro
 async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None:
     told: list[GraphChange] = []
     core.on_change(told.append)
-    await asyncio.sleep(limits.MASTER_LOOK_IDLE)  # it looks seldom by now
+    await asyncio.sleep(MASTER_LOOK_IDLE)  # it looks seldom by now
     begin = asyncio.get_running_loop().time()
     async with a_node() as api:
         master.call("registerPublisher", "/n", "/t", STRING, api)
@@ -138,7 +138,7 @@ async def test_restarted_master_gets_all_registrations(
         port = master.port
         await master.close()
         await until(core.notes)
-        await asyncio.sleep(2 * limits.MASTER_RETRY)
+        await asyncio.sleep(2 * MASTER_RETRY)
         assert len([r for r in caplog.records if "is waited for" in r.getMessage()]) == 1, "said once"
         assert core.publishers("/u") == {"/n": api}
         master = await a_master(port)
@@ -149,7 +149,7 @@ async def test_restarted_master_gets_all_registrations(
 
 
 async def test_stopped_master_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "MASTER_TIMEOUT", 0.2)
+    monkeypatch.setattr("rmpa.ros.core.external.MASTER_TIMEOUT", 0.2)
     stopped = asyncio.Event()
     master = await a_master()
 
@@ -171,7 +171,7 @@ async def test_stopped_master_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) 
     stopped.set()
     core.call("unregisterPublisher", "/rmpa", "/t", OURS)
     asking = asyncio.create_task(core.ask("setParam", "/rmpa", "/key", 1))
-    async with asyncio.timeout(limits.MASTER_FAREWELL + 2.0):
+    async with asyncio.timeout(MASTER_FAREWELL + 2.0):
         await asyncio.sleep(0.01)
         await core.close()
         with pytest.raises(UnreachableError):
@@ -233,7 +233,7 @@ async def test_refused_registration_is_reported_and_dropped(
 async def test_writes_beyond_the_bound_are_found_by_the_next_look(
     master: RosCore, core: ExternalCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "MASTER_WRITES_MAX", 3)
+    monkeypatch.setattr("rmpa.ros.core.external.MASTER_WRITES_MAX", 3)
     for number in range(10):
         core.call("registerPublisher", "/rmpa", f"/t{number}", STRING, OURS)
     await until(lambda: len(master.state().publishers) == 10)
@@ -257,7 +257,7 @@ async def test_dead_node_is_hidden_and_shown_again_if_alive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.1)
-    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.01)
+    monkeypatch.setattr("rmpa.ros.core.liveness.NODE_RECHECK_DELAY", 0.01)
     monkeypatch.setattr(liveness.Liveness, "start", lambda _: None)  # only what is suspected is looked at
     master = await a_master()
     await master.liveness.close()  # a roscore has none: it keeps what is dead

@@ -21,7 +21,7 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core import state
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.state import StoredState, parse, serialize
+from rmpa.ros.core.state import CORE_STATE_GATHER, CORE_STATE_SHARE, StoredState, parse, serialize
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
@@ -249,7 +249,7 @@ async def test_the_file_is_for_its_user_alone(path: Path) -> None:
 async def test_unusable_place_is_reported_and_used_when_usable(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(limits, "CORE_STATE_RETRY", 0.05)
+    monkeypatch.setattr("rmpa.ros.core.state.CORE_STATE_RETRY", 0.05)
     path.parent.write_text("a file in the directory's place")
     async with running(path) as core:
         core.call("setParam", "/x", "/a", 1)
@@ -378,14 +378,14 @@ async def test_churn_is_gathered_and_a_large_state_is_written_more_rarely(
         monkeypatch.setattr(core.stored, "_rest", rest)
         core.call("setParam", "/x", "/a", 1)
         await until(lambda: saved(core) and len(rests) >= 2)
-        assert rests[-2:] == [limits.CORE_STATE_GATHER, 0.1 * limits.CORE_STATE_SHARE]
+        assert rests[-2:] == [CORE_STATE_GATHER, 0.1 * CORE_STATE_SHARE]
 
 
 @pytest.mark.parametrize("why", ["large", "full", "read-only"])
 async def test_what_cannot_be_written_is_reported_and_nothing_is_lost(
     path: Path, why: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(limits, "CORE_STATE_RETRY", 0.05)
+    monkeypatch.setattr("rmpa.ros.core.state.CORE_STATE_RETRY", 0.05)
     async with running(path) as core:
         core.call("setParam", "/x", "/before", 1)
         await until(lambda: saved(core))

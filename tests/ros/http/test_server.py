@@ -10,8 +10,9 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.ros import limits
-from rmpa.ros.http.rpc import call
+from rmpa.ros.http.rpc import XMLRPC_SLICE, call
 from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.wire.http import HTTP_HEADERS_MAX
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
 
 if TYPE_CHECKING:
@@ -173,7 +174,7 @@ async def test_a_malformed_call_gets_a_fault_and_the_connection_lives(server: Xm
         (post(CALL, b"Content-Encoding: gzip"), b"415", "http.encoding"),
         (b"garbage\r\n\r\n", b"400", "http.malformed"),
         (b"\x00\x01\x02\x03\r\n\r\n", b"400", "http.malformed"),
-        (b"POST / HTTP/1.1\r\nHost: x\r\nX: " + b"a" * (limits.HTTP_HEADERS_MAX + 1), b"431", "http.malformed"),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nX: " + b"a" * (HTTP_HEADERS_MAX + 1), b"431", "http.malformed"),
         (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: -1\r\n\r\n", b"400", "http.malformed"),
     ],
 )
@@ -303,7 +304,7 @@ async def test_large_calls_and_answers_take_many_turns_of_the_loop(server: XmlRp
     turn()
     assert await asking == [1, "127.0.0.1", [value]]
     size = len(serialize_call("echo", [value]))
-    assert turns > 1.2 * size / limits.XMLRPC_SLICE
+    assert turns > 1.2 * size / XMLRPC_SLICE
 
 
 async def test_caller_may_disconnect_while_its_large_call_is_read(server: XmlRpcServer) -> None:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
-from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.rpc import call
-from rmpa.ros.node.node import Node
+from rmpa.ros.node.endpoints import NODE_UNREGISTER_AT_ONCE
+from rmpa.ros.node.node import NODE_MASTER_CHECK, Node
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageError, MessageType
@@ -346,7 +346,7 @@ async def test_an_ending_node_unregisters_side_by_side(core: RosCore, monkeypatc
 async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
     core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "NODE_UNREGISTER_TIMEOUT", 0.1)
+    monkeypatch.setattr("rmpa.ros.node.endpoints.NODE_UNREGISTER_TIMEOUT", 0.1)
     one = node(core, "n")
     async with one:
         for number in range(20):
@@ -360,7 +360,7 @@ async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
         monkeypatch.setattr(one, "call_master", hanging)
         async with asyncio.timeout(DEADLINE):
             await one.close()
-    assert len(begun) == limits.NODE_UNREGISTER_AT_ONCE
+    assert len(begun) == NODE_UNREGISTER_AT_ONCE
     assert one.stopped.is_set()
 
 
@@ -383,7 +383,7 @@ async def test_closing_twice_is_closing_once(core: RosCore) -> None:
         await one.close()
     await one.close()
     assert one.stopped.is_set()
-    assert limits.NODE_MASTER_CHECK < 1
+    assert NODE_MASTER_CHECK < 1
 
 
 async def test_a_service_is_served_and_called(core: RosCore) -> None:

@@ -388,7 +388,7 @@ async def test_a_client_that_sends_ahead_without_end_is_closed(
 
 
 async def test_a_silent_client_is_closed(node: SlaveNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SERVICE_STALL", 0.05)
+    monkeypatch.setattr("rmpa.ros.node.service_server.SERVICE_STALL", 0.05)
     endpoint = serve(node, add)
     silent = await RawClient.call(node)
     half = await RawClient.call(node, persistent="1")

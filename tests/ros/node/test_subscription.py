@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 async def impatient(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
-    monkeypatch.setattr(limits, "TCPROS_RETRY_FIRST", 0.001)
-    monkeypatch.setattr(limits, "TCPROS_RETRY_MAX", 0.01)
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_FIRST", 0.001)
+    monkeypatch.setattr("rmpa.ros.node.subscription.TCPROS_RETRY_MAX", 0.01)
     yield
     while Said.made:
         Said.made.pop().close()

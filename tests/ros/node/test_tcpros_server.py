@@ -19,7 +19,7 @@ from rmpa.ros import limits
 from rmpa.ros.core.liveness import name_at
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
-from rmpa.ros.node.listeners import LoopbackAddresses, SharedListener, TcprosServer
+from rmpa.ros.node.listeners import LOOPBACK_REST, LoopbackAddresses, SharedListener, TcprosServer
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.tcpros import encode_header, frame_message
@@ -347,7 +347,7 @@ async def test_missing_device_is_an_error(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 async def test_addresses_that_lead_nowhere_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SHARED_PROBE_TIMEOUT", 0.05)
+    monkeypatch.setattr("rmpa.ros.node.listeners.SHARED_PROBE_TIMEOUT", 0.05)
 
     def deaf(sock: socket.socket, _on_accept: object, *, name: str) -> Acceptor:
         return Acceptor(sock, lambda accepted, _client: accepted.close(), name=name)
@@ -388,7 +388,7 @@ def test_a_freed_address_rests_even_for_the_same_node() -> None:
     second = addresses.take("/n", 10.0)
     assert second != first
     addresses.free(second, 11.0)
-    assert addresses.take("/n", 10.0 + limits.LOOPBACK_REST) == first
+    assert addresses.take("/n", 10.0 + LOOPBACK_REST) == first
 
 
 def test_freeing_what_is_not_in_use_changes_nothing() -> None:
@@ -397,7 +397,7 @@ def test_freeing_what_is_not_in_use_changes_nothing() -> None:
     first = addresses.take("/n", 0.0)
     addresses.free(first, 1.0)
     addresses.free(first, 50.0)
-    assert addresses.take("/n", 1.0 + limits.LOOPBACK_REST) == first
+    assert addresses.take("/n", 1.0 + LOOPBACK_REST) == first
 
 
 def test_of_too_many_resting_addresses_the_oldest_may_be_used_again(monkeypatch: pytest.MonkeyPatch) -> None:

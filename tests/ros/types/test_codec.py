@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.limits import MIB
-from rmpa.ros import limits
-from rmpa.ros.types.codec import MessageCodec, codec_for
+from rmpa.ros.types.codec import WRITTEN_MAX, MessageCodec, codec_for
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_specifications, known_types, parse_definition
 from rmpa.ros.types.messages import MessageError, MessageType
 from tests.ros.types.filled import filled
@@ -218,7 +217,7 @@ def test_definitions_that_grow_without_bytes_are_refused() -> None:
 @pytest.mark.parametrize("element", [{}, {"c": 1}])
 def test_defaults_cannot_fill_the_memory(element: dict[str, int]) -> None:
     codec = _codec(f"t/B[] a\n{SEPARATOR}\nMSG: t/B\nuint8[{15 * MIB}] b\nint8 c")
-    with pytest.raises(MessageError, match=f"longer than {limits.WRITTEN_MAX}"):
+    with pytest.raises(MessageError, match=f"longer than {WRITTEN_MAX}"):
         codec.write({"a": [element] * 20}, 0)
 
 

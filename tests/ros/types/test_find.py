@@ -10,7 +10,7 @@ from rmpa.ros import limits
 from rmpa.ros.types import find as header_types
 from rmpa.ros.types import installed
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError
-from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
+from rmpa.ros.types.find import TYPE_MISSING, find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, packages_below
 from rmpa.ros.types.messages import MessageType
 from tests.ros.types.workspaces import package
@@ -254,11 +254,11 @@ def test_a_missing_type_is_not_looked_for_at_each_message(tmp_path: Path, monkey
         type_of_header({"type": "new_msgs/C", "md5sum": sum_there})
     package(made, msg_B="int8 b")
     walks = looks.walks
-    looks.now += 0.99 * limits.TYPE_MISSING
+    looks.now += 0.99 * TYPE_MISSING
     with pytest.raises(UnknownTypeError):
         type_of_header(header)
     assert looks.walks == walks
-    looks.now += 0.02 * limits.TYPE_MISSING
+    looks.now += 0.02 * TYPE_MISSING
     assert type_of_header(header).md5sum == sum_there
 
 
@@ -271,7 +271,7 @@ def test_a_version_that_is_missing_is_remembered_too(tmp_path: Path, monkeypatch
         with pytest.raises(DefinitionError, match="has the md5 sum"):
             type_of_header(header)
         package(tmp_path / "my_msgs", msg_A="int8 b")
-    looks.now += 1.01 * limits.TYPE_MISSING
+    looks.now += 1.01 * TYPE_MISSING
     assert type_of_header(header).md5sum == header["md5sum"]
 
 

@@ -6,7 +6,15 @@ import pytest
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros import limits
-from rmpa.ros.wire.http import HttpRefusal, HttpRequest, RequestParser, ResponseParser, post_request, response_head
+from rmpa.ros.wire.http import (
+    HTTP_HEADERS_MAX,
+    HttpRefusal,
+    HttpRequest,
+    RequestParser,
+    ResponseParser,
+    post_request,
+    response_head,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -88,7 +96,7 @@ def test_what_cannot_be_answered_is_refused(data: bytes, status: int) -> None:
     ],
 )
 def test_headers_trailers_and_chunk_lines_are_bounded(start: bytes, statuses: list[int]) -> None:
-    parts = [ROSPY + start, *[b"x" * 1000] * (limits.HTTP_HEADERS_MAX // 1000 + 1)]
+    parts = [ROSPY + start, *[b"x" * 1000] * (HTTP_HEADERS_MAX // 1000 + 1)]
     assert [found.status for found in parse(*parts) if isinstance(found, HttpRefusal)] == statuses
 
 

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from rmpa.ros.node.subscription import TopicConnection
     from rmpa.runtime.tls import Buffer
 
+# Age at which a best-effort message on the bulk lane is dropped in favour of a newer one of its topic (on the express
+# lane it is ``runtime.limits.STALE_AGE``). If a link is too slow for a topic, the newest message is sent.
+BULK_STALE_AGE: Final = 0.5
+
 _SMALL: Final = mesh_limits.EXPRESS_MESSAGE_MAX
 
 
@@ -197,7 +201,7 @@ class RouteSender:
 
     def _set_bounds(self, link: PeerLink) -> None:
         lifespan = self.contract.lifespan
-        for lane, stale in ((link.express, runtime_limits.STALE_AGE), (link.bulk, mesh_limits.BULK_STALE_AGE)):
+        for lane, stale in ((link.express, runtime_limits.STALE_AGE), (link.bulk, BULK_STALE_AGE)):
             lane.set_terms(self.route, self._depth, lifespan or stale, strict=lifespan is not None)
 
 

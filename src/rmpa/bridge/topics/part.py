@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict, deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.data.quality import shown_seconds
 from rmpa.bridge.direct.grants import TopicGrants
@@ -42,6 +42,10 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
+
+# The longest time between two wake-ups of an agent that receives data: data that arrived since the last one was not
+# delayed by an outage.
+STALE_TICK: Final = 0.04
 
 
 class Topics(GraphPart, TopicEvents):
@@ -331,7 +335,7 @@ class Topics(GraphPart, TopicEvents):
             topics.detach(entry.wire, entry.route, keep=keep, missed=missed, last=last)
 
     def _tick_later(self) -> None:
-        self._ticker = asyncio.get_running_loop().call_later(mesh_limits.STALE_TICK, self._tick)
+        self._ticker = asyncio.get_running_loop().call_later(STALE_TICK, self._tick)
 
     def _tick(self) -> None:
         """Wake up regularly while routes are open, to distinguish a silent link from an agent that slept."""

@@ -31,6 +31,9 @@ class LaneSender:
     Args:
         name: ``express`` or ``bulk``, for people.
         on_wanted: Called when something is queued while the lane has no connection.
+
+    Attributes:
+        ended: Whether the link is closing: nothing is sent or queued any more.
     """
 
     def __init__(self, name: str, on_wanted: Callable[[], None] = _nothing) -> None:
@@ -38,10 +41,9 @@ class LaneSender:
         self._on_wanted = on_wanted
         self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LANE_QUEUE_BYTES, frame=pack_fragment_header)
         self.ended = False
-        """Whether the link is closing: nothing is sent or queued any more."""
         self._stream: Stream | None = None
+        # The messages that ``open`` has begun, by route.
         self._open: dict[int, QueuedMessage] = {}
-        """The messages that ``open`` has begun, by route."""
         self._loop = asyncio.get_running_loop()
 
     def connect(self, stream: Stream) -> None:

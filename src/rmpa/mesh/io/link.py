@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.counters import Backoff
 from rmpa.core.identity import SERIAL_MASK
+from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
@@ -32,13 +33,23 @@ if TYPE_CHECKING:
     from rmpa.mesh.peering import SocketAddress
     from rmpa.runtime.loop import SystemClock
 
+# Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
+# link is closed.
+CONNECTION_URGENT_BYTES: Final = 32 * MIB
 
+# Time-out of a ping on request (``rmpa peer ping``).
+_PING_TIMEOUT: Final = 2.0
+# Bytes in flight to a peer above which the next portion of the catalogue waits. A portion has some 6 KB, so data
+# waits for at most 12 ms on 10 Mbit/s. Sending all of 10,000 topics at once delayed data by 0.8 s.
+_TELL_BACKLOG: Final = 8 * KIB
+
+
+# Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread.
 _SILENCE: Final = frozenset(
     {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
 )
-"""Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread."""
+# Errors of a connection that the remote kernel ended: by a reset, EPIPE after the end of the stream had come.
 _ENDED_THERE: Final = frozenset({errno.ECONNRESET, errno.EPIPE})
-"""Errors of a connection that the remote kernel ended: by a reset, EPIPE after the end of the stream had come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +129,14 @@ class Connection(ConnectionProtocol):
         expected: The GUID that was dialled; ``None`` on an accepted connection.
         lane: What this side dials for; on an accepted connection the remote side's hello says it.
         secured: What encrypts ``sock``, and the remote side's certificate; ``None`` in a mesh without trust.
+
+    Attributes:
+        certificate: The remote side's certificate, as ``SSLObject.getpeercert`` returns it; ``None`` without trust.
+        link: The link that has this connection for one of its lanes.
+        crashed: Once ended: whether the remote kernel ended it without a bye, so that only the agent's process has
+            died.
+        silent: Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye.
+        over: Done when the socket is closed.
     """
 
     def __init__(
@@ -137,22 +156,17 @@ class Connection(ConnectionProtocol):
         self.sock = sock
         self.remote_endpoint = endpoint
         self.certificate: Final = None if secured is None else secured[1]
-        """The remote side's certificate, as ``SSLObject.getpeercert`` returns it; ``None`` without trust."""
         self.link: PeerLink | None = None
-        """The link that has this connection for one of its lanes."""
         self.crashed = False
-        """Once ended: whether the remote kernel ended it without a bye, so that only the agent's process has died."""
         self.silent = False
-        """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
         self._pings: dict[int, asyncio.Future[float]] = {}
         self.over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Done when the socket is closed."""
         self.stream = Stream(
             sock,
             on_bytes=self._receive,
             on_close=self._lost,
             # For control frames only: ``LaneSender.connect`` replaces it by the lane's outbox.
-            outbox=Outbox(1, limits.CONNECTION_URGENT_BYTES),
+            outbox=Outbox(1, CONNECTION_URGENT_BYTES),
             secure=None if secured is None else secured[0],
         )
         super().__init__(
@@ -183,7 +197,7 @@ class Connection(ConnectionProtocol):
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped.
 
-        If more than ``limits.CONNECTION_URGENT_BYTES`` wait, the remote side does not read, and the connection is
+        If more than ``CONNECTION_URGENT_BYTES`` wait, the remote side does not read, and the connection is
         closed.
         """
         if self.up:
@@ -191,7 +205,7 @@ class Connection(ConnectionProtocol):
             self._check_urgent()
 
     async def measure(self) -> float | None:
-        """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
+        """Measure one round trip now, in seconds; ``None`` if no answer came within ``_PING_TIMEOUT``."""
         if not self.up:
             return None
         stamp = self.ping(self.mesh.clock.now())
@@ -199,7 +213,7 @@ class Connection(ConnectionProtocol):
         self._pings[stamp] = answer
         self.flush()
         try:
-            return await asyncio.wait_for(answer, limits.PING_TIMEOUT)
+            return await asyncio.wait_for(answer, _PING_TIMEOUT)
         except TimeoutError:
             return None
         finally:
@@ -290,7 +304,7 @@ class Connection(ConnectionProtocol):
 
     def _check_urgent(self) -> None:
         waiting = self.stream.outbox.urgent_bytes
-        if waiting > limits.CONNECTION_URGENT_BYTES:
+        if waiting > CONNECTION_URGENT_BYTES:
             self.lost(f"{self.name} does not read: {waiting} bytes of control frames wait for it")
 
     def _lost(self, error: Exception | None) -> None:
@@ -334,6 +348,22 @@ class PeerLink:
     Args:
         connection: That of the express lane; its handshake is done.
         mesh: The mesh.
+
+    Attributes:
+        since: Monotonic seconds at which it came up.
+        bulk_connection: The connection of the bulk lane, while there is one.
+        bulk_wanted: Whether a message of either side has wanted the bulk lane.
+        backoff: The pauses between dials of the bulk lane.
+        redial: The task that dials the bulk lane, and the one that dials the silent peer anew, if there is one.
+        used: Whether this link carries the peer's data; of two links with one peer, only one is used.
+        routes: The handlers of the data that arrives, by route; both lanes look here while the link is used.
+        silent: Once the link is down: whether it ended without a bye, so that the peer may soon be linked again.
+        crashed: Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on.
+        mark: ``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data.
+        abort: ``(reason)``: closes at once, without a bye.
+        close: ``(reason)``: sends a bye, waits shortly for the last bytes to be sent, and closes.
+        ping: Measures one round trip now.
+        touched_at: Monotonic seconds of the last control frame in either direction.
     """
 
     def __init__(self, connection: Connection, mesh: LinkOwner) -> None:
@@ -345,38 +375,23 @@ class PeerLink:
         self.local_address: Final[str] = connection.sock.getsockname()[0]
         self.dialled: Final = connection.dialled
         self.since: Final = connection.since
-        """Monotonic seconds at which it came up."""
         self.connection: Final = connection
-        """The connection of the express lane."""
         self.bulk_connection: Connection | None = None
-        """The connection of the bulk lane, while there is one."""
         self.express: Final = LaneSender("express")
         self.bulk: Final = LaneSender("bulk", self.want_bulk)
         self.bulk_wanted = False
-        """Whether a message of either side has wanted the bulk lane."""
         self.backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, mesh.rng)
-        """The pauses between dials of the bulk lane."""
         self.bulk_dial: asyncio.Task[None] | None = None
         self.redial: asyncio.Task[None] | None = None
-        """The task that dials the bulk lane, and the one that dials the silent peer anew, if there is one."""
         self.used = False
-        """Whether this link carries the peer's data; of two links with one peer, only one is used."""
         self.routes: dict[int, DataHandler] = {}
-        """The handlers of the data that arrives, by route; both lanes look here while the link is used."""
         self.silent = False
-        """Once the link is down: whether it ended without a bye, so that the peer may soon be linked again."""
         self.crashed = False
-        """Once the link is down: whether the peer's agent died, or a better link took over; its nodes go on."""
         self.mark: Final = connection.send_mark
-        """``(kind, route, sequence)``: acknowledges messages of a route, before all waiting data."""
         self.abort: Final = connection.lost
-        """``(reason)``: closes at once, without a bye."""
         self.close: Final = connection.end
-        """``(reason)``: sends a bye, waits shortly for the last bytes to be sent, and closes."""
         self.ping: Final = connection.measure
-        """Measures one round trip now."""
         self.touched_at = mesh.clock.now()
-        """Monotonic seconds of the last control frame in either direction."""
         self._mesh = mesh
         self._needed = True
         self._bulk_in = self._bulk_out = 0  # bytes of the bulk lane's earlier connections
@@ -440,7 +455,7 @@ class PeerLink:
     def busy(self) -> bool:
         """Whether the express lane has a backlog, so that a further advertisement would delay later commands."""
         stream = self.connection.stream
-        return stream.pending_bytes > 0 or stream.unacknowledged > limits.TELL_BACKLOG
+        return stream.pending_bytes > 0 or stream.unacknowledged > _TELL_BACKLOG
 
     @property
     def dropped(self) -> int:

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# Refusals that are part of the normal course, and are not logged as warnings.
 _ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO_EXPRESS})
-"""Refusals that are part of the normal course, and are not logged as warnings."""
 
 _TRUST: Final = frozenset(TrustReason)
 
@@ -76,10 +76,10 @@ class Mesh(LinkOwner):
         self._peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
         self._timer = MachineTimer(self._peering.next_timer, self._due, now=self.clock.now)
         self._connections: dict[int, Connection] = {}
+        # The links, by the id of the express lane's connection.
         self._links: dict[int, PeerLink] = {}
-        """The links, by the id of the express lane's connection."""
+        # The dials that are under way.
         self._tasks: set[asyncio.Task[None]] = set()
-        """The dials that are under way."""
         self._security = security
         self._securing: Securing | None = None
         if security is not None:

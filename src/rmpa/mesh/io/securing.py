@@ -35,20 +35,34 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# The longest time from an accepted connection to the end of its TLS handshake in a secured mesh: two round trips and
+# 3 ms of work.
+SECURING_TIMEOUT: Final = 3.0
+# Connections that are no member's and may come at once: the tests of reachability of a large network.
+UNPROVEN_BURST: Final = 200
+
+# Connections a second, over all addresses, that are told that they do not speak TLS; the others are closed without an
+# answer, which takes half the time.
+_PLAIN_ANSWERS_RATE: Final = 20.0
+# Pause of accepting above ``limits.UNPROVEN_RATE``; a member's dial is repeated after 0.3 s.
+_UNPROVEN_PAUSE: Final = 0.05
+# How long a connection whose certificate was refused may still send, so that it reads the alert.
+_REFUSAL_LINGER: Final = 0.5
+
+# A verified certificate as ``SSLObject.getpeercert`` returns it.
 Certificate = Mapping[str, Any]
-"""A verified certificate as ``SSLObject.getpeercert`` returns it."""
+# What encrypts a connection behind its TLS handshake, and its certificate, verified but for name and deny list.
 SecuredSocket = tuple[SecureSocket, Certificate]
-"""What encrypts a connection behind its TLS handshake, and its certificate, verified but for name and deny list."""
 OnJoin = Callable[[socket.socket, TlsHandshake, str], Awaitable[None]]
 
 _READ: Final = 16 * 1024
+# First bytes of TLS records (RFC 8446, section 5.1); a plain frame begins with 0, as it is shorter than 16 MiB.
 _TLS_HANDSHAKE, _TLS_ALERT = 0x16, 0x15
-"""First bytes of TLS records (RFC 8446, section 5.1); a plain frame begins with 0, as it is shorter than 16 MiB."""
+# TLS alerts, by the ends of their names.
 _ALERTS: Final = {
     "UNKNOWN_CA": (TrustReason.FOREIGN, "our certificate is of another CA than its own"),
     "PROTOCOL_VERSION": (TrustReason.DOWNGRADE, "it does not use TLS 1.3"),
 }
-"""TLS alerts, by the ends of their names."""
 
 
 class SecuringError(ConnectionError):
@@ -122,20 +136,20 @@ async def secure_dialled(sock: socket.socket, security: Membership) -> SecuredSo
 
     Raises:
         SecuringError: One side refuses the other.
-        OSError: The connection ended, or the handshake took longer than ``limits.SECURING_TIMEOUT``.
+        OSError: The connection ended, or the handshake took longer than ``SECURING_TIMEOUT``.
     """
     handshake = TlsHandshake(security.client_context, server_side=False)
     handshake.receive(b"")
     loop = asyncio.get_running_loop()
     try:
-        async with asyncio.timeout(limits.SECURING_TIMEOUT):
+        async with asyncio.timeout(SECURING_TIMEOUT):
             await loop.sock_sendall(sock, handshake.take_output())
             first = await _received(sock)
             if first[0] not in (_TLS_HANDSHAKE, _TLS_ALERT):
                 raise await _plain_refusal(sock, first)
             await _shake(sock, handshake, first)
     except TimeoutError:
-        raise TimeoutError(f"no end of the TLS handshake within {limits.SECURING_TIMEOUT:g} s") from None
+        raise TimeoutError(f"no end of the TLS handshake within {SECURING_TIMEOUT:g} s") from None
     return _secured(sock, handshake)
 
 
@@ -220,10 +234,10 @@ class Securing:
     pause: Callable[[float], None]
 
     def __post_init__(self) -> None:
-        self._bad = TokenBucket(limits.UNPROVEN_RATE, limits.UNPROVEN_BURST)
+        self._bad = TokenBucket(limits.UNPROVEN_RATE, UNPROVEN_BURST)
+        # Connections without a finished handshake, each with its address; the oldest first.
         self._unproven: dict[asyncio.Task[None], str] = {}
-        """Connections without a finished handshake, each with its address; the oldest first."""
-        self._answers = TokenBucket(limits.PLAIN_ANSWERS_RATE, limits.PLAIN_ANSWERS_RATE)
+        self._answers = TokenBucket(_PLAIN_ANSWERS_RATE, _PLAIN_ANSWERS_RATE)
 
     def accept(self, sock: socket.socket, address: SocketAddress) -> None:
         """Do the handshake of a connection; the socket belongs to this object from here on."""
@@ -268,7 +282,7 @@ class Securing:
         """Leave a flood of connections that are no member's to the kernel for a moment."""
         if not self._bad.take(self.clock.now()):
             self.refusals.count("link.paused")
-            self.pause(limits.UNPROVEN_PAUSE)
+            self.pause(_UNPROVEN_PAUSE)
 
     async def _secure(self, sock: socket.socket, address: SocketAddress) -> None:
         host = address[0]
@@ -296,10 +310,10 @@ class Securing:
 
         Raises:
             SecuringError: One side refuses the other.
-            OSError: The connection ended, or the handshake took longer than ``limits.SECURING_TIMEOUT``.
+            OSError: The connection ended, or the handshake took longer than ``SECURING_TIMEOUT``.
             RmpaError: The question of a join is malformed.
         """
-        async with asyncio.timeout(limits.SECURING_TIMEOUT):
+        async with asyncio.timeout(SECURING_TIMEOUT):
             first = await asyncio.get_running_loop().sock_recv(sock, _READ)
             if not first:
                 self._note_bad()
@@ -341,6 +355,6 @@ async def _linger(sock: socket.socket) -> None:
     """Let the other side read the alert: closing with unread bytes is a reset, which overtakes it."""
     with contextlib.suppress(OSError):
         sock.shutdown(socket.SHUT_WR)
-        async with asyncio.timeout(limits.REFUSAL_LINGER):
+        async with asyncio.timeout(_REFUSAL_LINGER):
             while await asyncio.get_running_loop().sock_recv(sock, _READ):
                 pass

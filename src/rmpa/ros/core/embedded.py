@@ -37,18 +37,31 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# Seconds within which a publisher that was withdrawn and is registered again, with the same URI, has its topic's list
+# of publishers repeated: a busy subscriber may not have read yet that its old connection ended.
+WITHDRAWN_LATELY: Final = 5.0
+# Seconds from a publisher's return until the list is repeated, with those of the topics that return meanwhile.
+PUBLISHERS_AGAIN: Final = 2.0
+# Withdrawn publishers that are remembered; the oldest is forgotten first.
+WITHDRAWN_KEPT: Final = 16_384
+# Seconds between two checks whether the name /rosout is free again, and between attempts to start.
+ROSOUT_LOOK: Final = 1.0
+
+# Log messages queued for a slow reader of /rosout_agg.
+_ROSOUT_QUEUE: Final = 1000
+
 NODE: Final = "/rosout"
 TOPIC: Final = "/rosout"
 AGGREGATED: Final = "/rosout_agg"
+# Python's loggers, by the names that the rosout of a roscore gives to its own.
 _LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.embedded"}
-"""Python's loggers, by the names that the rosout of a roscore gives to its own."""
 LOG: Final = known_description("rosgraph_msgs/Log")
 DEFAULT_PORT: Final = 11311
 CALLER_ID: Final = "/rmpa_core"
+# The value of ``/rosdistro``, with the line break that roscore takes from ``rosversion -d``; programs strip it.
 ROS_DISTRO: Final = "noetic\n"
-"""The value of ``/rosdistro``, with the line break that roscore takes from ``rosversion -d``; programs strip it."""
+# The value of ``/rosversion``: the version of ros_comm whose master this core replaces.
 ROS_VERSION: Final = "1.15.15\n"
-"""The value of ``/rosversion``: the version of ros_comm whose master this core replaces."""
 
 
 class ReturnedPublishers:
@@ -77,12 +90,12 @@ class ReturnedPublishers:
         at = self._withdrawn.pop(key, None)
         if not change.added:
             self._withdrawn[key] = now
-            if len(self._withdrawn) > limits.WITHDRAWN_KEPT:
+            if len(self._withdrawn) > WITHDRAWN_KEPT:
                 del self._withdrawn[next(iter(self._withdrawn))]
-        elif at is not None and now - at <= limits.WITHDRAWN_LATELY:
+        elif at is not None and now - at <= WITHDRAWN_LATELY:
             self._returned[change.name] = None
             if self._timer is None:
-                self._timer = loop.call_later(limits.PUBLISHERS_AGAIN, self._due)
+                self._timer = loop.call_later(PUBLISHERS_AGAIN, self._due)
 
     def close(self) -> None:
         """Repeat nothing any more."""
@@ -155,7 +168,7 @@ class Rosout:
         )
         await node.start()
         self._node = node
-        aggregated = Publication(AGGREGATED, NODE, LOG, queue_messages=limits.ROSOUT_QUEUE)
+        aggregated = Publication(AGGREGATED, NODE, LOG, queue_messages=_ROSOUT_QUEUE)
         node.add_publication(aggregated)
 
         def pass_on(_publisher: PublisherConnection, framed: memoryview) -> None:
@@ -213,7 +226,7 @@ class Rosout:
                     told = True
                 with contextlib.suppress(TimeoutError):
                     # The end of a node that only subscribed to parameters is not reported, so it is polled for.
-                    async with asyncio.timeout(limits.ROSOUT_LOOK):
+                    async with asyncio.timeout(ROSOUT_LOOK):
                         await self._changed.wait()
                 self._changed.clear()
                 continue
@@ -221,7 +234,7 @@ class Rosout:
                 await self._begin()
             except (RmpaError, OSError) as error:
                 _log.error("! %s cannot be started again yet: %s", NODE, error)
-                await asyncio.sleep(limits.ROSOUT_LOOK)
+                await asyncio.sleep(ROSOUT_LOOK)
         self._core.counters.add("rosout.restarted")
         _log.info("= %s is back at %s", NODE, self.uri)
 
@@ -239,6 +252,9 @@ class RosCore(Core):
         state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
         keep: When the content of the file is restored; see ``CoreState``.
         temporary: Whether a node of this name is not stored, because its owner registers it anew.
+
+    Attributes:
+        stored: Stores the state for the next run, if ``state`` is given.
     """
 
     def __init__(
@@ -269,7 +285,6 @@ class RosCore(Core):
         self._returned = ReturnedPublishers(self._repeat_publishers)
         self.on_change(self._returned.graph_changed)
         self.stored: CoreState | None = None
-        """Stores the state for the next run, if ``state`` is given."""
         if state is not None:
             own = {NODE, CALLER_ID}
             self.stored = CoreState(

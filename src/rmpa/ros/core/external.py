@@ -18,17 +18,7 @@ from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError,
 from rmpa.ros import limits
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
-from rmpa.ros.master.mirror import (
-    REGISTRATIONS,
-    Call,
-    Mirror,
-    Survey,
-    lookup_calls,
-    one_call,
-    read_lookups,
-    read_survey,
-    survey_calls,
-)
+from rmpa.ros.master import mirror
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
@@ -43,6 +33,32 @@ if TYPE_CHECKING:
     from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)
+
+# Time between two polls while nothing changes.
+MASTER_LOOK_IDLE: Final = 0.5
+# Time between two polls of a roscore that does not answer: a restarted one has our registrations within a second.
+MASTER_RETRY: Final = 0.5
+# Time-out of one poll of or write to a roscore; one on a busy board answered in 0.3 s.
+MASTER_TIMEOUT: Final = 3.0
+# Registrations queued for a roscore; above it the queue is dropped, and the next poll finds what is missing.
+MASTER_WRITES_MAX: Final = 20_000
+# Time in which an ending agent unregisters at a roscore.
+MASTER_FAREWELL: Final = 2.0
+
+# Time for which another agent at the same roscore is told after its last registration was seen.
+_MASTER_OTHER_AGENT: Final = 10.0
+# Time between two polls of a roscore whose graph has just changed; a poll of 50 nodes costs it some milliseconds.
+_MASTER_LOOK_FIRST: Final = 0.1
+# The longest pause between two polls, so that a change is seen within a second.
+_MASTER_LOOK_MAX: Final = 0.8
+# The pause is at least this many times the duration of the poll: polls take at most a twentieth of its time.
+_MASTER_LOOK_SHARE: Final = 20
+# Delay of a poll out of turn, after a node is suspected to be dead or moved: one change is seldom alone.
+_MASTER_LOOK_SOON: Final = 0.02
+# Time-out for calls of a roscore with parameters, which may be megabytes.
+_MASTER_ASK_TIMEOUT: Final = 10.0
+# Registrations in one call to a roscore, some 10 ms of its work.
+_MASTER_WRITES_AT_ONCE: Final = 64
 LOOPBACK: Final = "127.0.0.1"
 
 
@@ -181,11 +197,11 @@ class ExternalCore(Core):
         self.counters = counters if counters is not None else Counters()
         self.uri, self.node_host, self.node_address = uri, node_host, node_address
         self._own_node = own_node
-        self._mirror = Mirror(yielder=yielding_to_data)
+        self._mirror = mirror.Mirror(yielder=yielding_to_data)
         self.liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
         self.registrations = self._mirror.registrations
         self.listeners = []
-        self._writes: deque[Call] = deque()
+        self._writes: deque[mirror.Call] = deque()
         self._written = asyncio.Event()
         self._written.set()
         self._wake = asyncio.Event()
@@ -194,14 +210,14 @@ class ExternalCore(Core):
         self._ending = False
         self._problem = "it was not asked yet"
         self._other_until = 0.0
+        # The slave API of a node of another agent that has taken the name of the agent's own node.
         self._other_agent = ""
-        """The slave API of a node of another agent that has taken the name of the agent's own node."""
         # What the next poll looks up, its encoded request, and the last answer: both are mostly unchanged.
         self._nodes: tuple[str, ...] = ()
         self._services: tuple[str, ...] = ()
         self._request = b""
         self._seen = b""
-        self._pace = limits.MASTER_LOOK_FIRST
+        self._pace = _MASTER_LOOK_FIRST
 
     # --- its life ---------------------------------------------------------------------------------------------
 
@@ -215,7 +231,7 @@ class ExternalCore(Core):
         self.liveness.start()
 
     async def close(self) -> None:
-        """Unregister all that the agent registered at the master, if it answers in ``limits.MASTER_FAREWELL``."""
+        """Unregister all that the agent registered at the master, if it answers in ``MASTER_FAREWELL``."""
         self._ending = True
         if not self._problem:
             for method, params in self._mirror.unregister_calls():
@@ -223,7 +239,7 @@ class ExternalCore(Core):
         self._wake.set()
         if self._task is not None:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(limits.MASTER_FAREWELL):
+                async with asyncio.timeout(MASTER_FAREWELL):
                     await asyncio.shield(self._task)
             if self._writes and not self._problem:
                 _log.warning("! the roscore at %s was not told of %d changes", self.uri, len(self._writes))
@@ -250,7 +266,7 @@ class ExternalCore(Core):
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Queue a registration or a write of a parameter, after all previous calls."""
         yield_to_data()
-        if method in REGISTRATIONS:
+        if method in mirror.REGISTRATIONS:
             reply = self._apply(method, params)
         elif method not in _PARAM_WRITES:
             return RosReply(-1, f"{method} is for the master itself to answer: it has to be asked", 0)
@@ -263,7 +279,7 @@ class ExternalCore(Core):
         return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        registers = method in REGISTRATIONS
+        registers = method in mirror.REGISTRATIONS
         if registers:
             reply = self._apply(method, params)
             if reply.code != 1:
@@ -271,7 +287,7 @@ class ExternalCore(Core):
         await self._written.wait()
         if self._problem and (registers or method in _PARAM_WRITES):
             raise UnreachableError("ROS master", self.uri, self._problem)
-        return await call_api(self.uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
+        return await call_api(self.uri, method, *params, timeout=_MASTER_ASK_TIMEOUT, use=Use.CORE)
 
     def _apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
         reply = self._mirror.apply(method, params)
@@ -297,7 +313,7 @@ class ExternalCore(Core):
             except Exception:  # noqa: BLE001 - a task's top: polling must go on
                 _log.exception("! looking at the roscore %s failed", self.uri)
                 self._seen = b""
-                self._next_poll = self._loop.time() + limits.MASTER_LOOK_MAX
+                self._next_poll = self._loop.time() + _MASTER_LOOK_MAX
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
                 if self._mirror.dead and (self._revival is None or self._revival.done()):
@@ -310,11 +326,11 @@ class ExternalCore(Core):
 
     def _poll_soon(self) -> None:
         if self._task is not None and not self._problem:
-            self._next_poll = min(self._next_poll, self._loop.time() + limits.MASTER_LOOK_SOON)
-            self._pace = limits.MASTER_LOOK_FIRST
+            self._next_poll = min(self._next_poll, self._loop.time() + _MASTER_LOOK_SOON)
+            self._pace = _MASTER_LOOK_FIRST
             self._wake.set()
 
-    def _write(self, write: Call) -> None:
+    def _write(self, write: mirror.Call) -> None:
         """Queue a call; drop it while the master does not answer.
 
         The first poll afterwards finds the registrations that the master lacks.
@@ -324,7 +340,7 @@ class ExternalCore(Core):
         self._writes.append(write)
         self._written.clear()
         self._wake.set()
-        if len(self._writes) > limits.MASTER_WRITES_MAX:
+        if len(self._writes) > MASTER_WRITES_MAX:
             # Dropping all is cheaper than choosing: the next poll finds what is missing.
             _log.warning("! the roscore at %s is slow: %d changes are told anew", self.uri, len(self._writes))
             self._drop_writes()
@@ -337,7 +353,7 @@ class ExternalCore(Core):
 
     async def _flush(self) -> None:
         while self._writes and not self._problem:
-            batch = [self._writes.popleft() for _ in range(min(len(self._writes), limits.MASTER_WRITES_AT_ONCE))]
+            batch = [self._writes.popleft() for _ in range(min(len(self._writes), _MASTER_WRITES_AT_ONCE))]
             self._seen = b""  # so that the next poll parses its answer even if the bytes are unchanged
             try:
                 await self._send(batch)
@@ -345,13 +361,13 @@ class ExternalCore(Core):
                 self._lost(error)
         self._written.set()
 
-    async def _send(self, batch: list[Call]) -> None:
+    async def _send(self, batch: list[mirror.Call]) -> None:
         """Send calls as one ``system.multicall``; if that fails as a whole, one by one."""
         try:
             # A master needs long to read parameters of megabytes.
             large = any(method in _PARAM_WRITES for method, _ in batch)
-            timeout = limits.MASTER_ASK_TIMEOUT if large else limits.MASTER_TIMEOUT
-            answers = await self._many([one_call(*write) for write in batch], timeout)
+            timeout = _MASTER_ASK_TIMEOUT if large else MASTER_TIMEOUT
+            answers = await self._many([mirror.one_call(*write) for write in batch], timeout)
         except (LocalProtocolError, RemoteProtocolError, RosFault) as error:
             if len(batch) == 1:
                 self._refused(batch[0], error)
@@ -368,7 +384,7 @@ class ExternalCore(Core):
                 case _:
                     self._refused(write, RosFault(1, brief(answer)))
 
-    def _refused(self, write: Call, error: Exception) -> None:
+    def _refused(self, write: mirror.Call, error: Exception) -> None:
         self.counters.add("master.refused")
         method, params = write
         _log.error("! the roscore at %s does not take %s%s: %s", self.uri, method, brief(params), error)
@@ -388,23 +404,23 @@ class ExternalCore(Core):
             self._lost(error)
         else:
             self.counters.add("master.looks")
-            self._pace = limits.MASTER_LOOK_FIRST if changed else min(self._pace * 1.5, limits.MASTER_LOOK_IDLE)
+            self._pace = _MASTER_LOOK_FIRST if changed else min(self._pace * 1.5, MASTER_LOOK_IDLE)
         took = self._loop.time() - begin
         # Reporting a large graph takes the master long; between polls it needs time for its own work.
-        pause = min(max(self._pace, limits.MASTER_LOOK_SHARE * took), limits.MASTER_LOOK_MAX)
-        self._next_poll = self._loop.time() + (limits.MASTER_RETRY if self._problem else pause)
+        pause = min(max(self._pace, _MASTER_LOOK_SHARE * took), _MASTER_LOOK_MAX)
+        self._next_poll = self._loop.time() + (MASTER_RETRY if self._problem else pause)
 
     async def _survey(self) -> bool:
         """Ask for the whole graph; return whether the answer differs from the last one."""
         seen = self._mirror.asked
         if not self._request:
-            calls = survey_calls(self._own_node, self._nodes, self._services)
+            calls = mirror.survey_calls(self._own_node, self._nodes, self._services)
             self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls]), every=1))
-        body = await exchange(self.uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
+        body = await exchange(self.uri, _MULTICALL, self._request, timeout=MASTER_TIMEOUT, use=Use.CORE)
         if body == self._seen and not self._problem:
             return False
         answer = await read_response(body)
-        survey = read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
+        survey = mirror.read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
         self._seen = body
         await self._complete(survey)
         if self._ending:
@@ -415,25 +431,25 @@ class ExternalCore(Core):
         self._take(survey, seen)
         return True
 
-    async def _complete(self, survey: Survey) -> None:
+    async def _complete(self, survey: mirror.Survey) -> None:
         """Look up the nodes and services that are new in a survey; later polls include them in their request."""
         nodes, services = survey.nodes(), survey.holders[RegistrationKind.SERVICE]
         new_nodes = [node for node in nodes if node not in survey.uris]
         new_services = [service for service in services if service not in survey.services]
         if new_nodes or new_services:
-            answer = await self._many(lookup_calls(self._own_node, new_nodes, new_services))
-            uris, places = read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data)
+            answer = await self._many(mirror.lookup_calls(self._own_node, new_nodes, new_services))
+            uris, places = mirror.read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data)
             survey.uris |= uris
             survey.services |= places
         if tuple(nodes) != self._nodes or tuple(services) != self._services:
             self._nodes, self._services = tuple(nodes), tuple(services)
             self._request, self._seen = b"", b""
 
-    def _take(self, survey: Survey, seen: int) -> None:
+    def _take(self, survey: mirror.Survey, seen: int) -> None:
         if other := self._mirror.taken(survey, self._own_node, seen):
             if not self._other_agent:
                 _log.error("! another agent (its node at %s) is at the roscore %s too: end one", other, self.uri)
-            self._other_agent, self._other_until = other, self._loop.time() + limits.MASTER_OTHER_AGENT
+            self._other_agent, self._other_until = other, self._loop.time() + _MASTER_OTHER_AGENT
         again = self._mirror.update(survey, seen)
         self._report_changes()
         if again and self._loop.time() >= self._other_until:
@@ -443,7 +459,7 @@ class ExternalCore(Core):
             self._written.clear()
 
     async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
-        answers = await call(self.uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
+        answers = await call(self.uri, _MULTICALL, calls, timeout=within or MASTER_TIMEOUT, use=Use.CORE)
         if not isinstance(answers, list) or len(answers) != len(calls):
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers

@@ -41,10 +41,26 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+# Time between the two refused connects that prove a node dead: it may be restarting its server.
+NODE_RECHECK_DELAY: Final = 0.2
+
+# Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds.
+_NODE_UNREACHABLE_CHECKS: Final = 4
+# With this many updates queued for a node, only the latest of each parameter is kept; with fewer all of them.
+_NOTIFY_COALESCE: Final = 64
+# Pause before an update is sent again to a node that did not answer.
+_NOTIFY_RETRY_FIRST: Final = 0.2
+# The longest pause between attempts, while the node is registered.
+_NOTIFY_RETRY_MAX: Final = 3.0
+# Seconds between two checks whether a node that was asked to end has ended.
+_NODE_KILL_LOOK: Final = 0.2
+# Connections of one node that are told: some 80 kB in one answer, and more than can be read.
+_NODE_CONNECTIONS_SHOWN: Final = 500
+
 _CALLER_ID: Final = "/rmpa_identify"
 _TOPICS_ASKED: Final = 2
+# Wake-ups in one interval over which the connects to nodes are spread.
 _PORTIONS: Final = 10
-"""Wake-ups in one interval over which the connects to nodes are spread."""
 
 
 # --- which node is at an address: its port may be another node's by now (ros_comm#2018, #2241) ---------------------
@@ -119,6 +135,10 @@ class Liveness:
     Args:
         nodes: All nodes with their slave APIs.
         on_dead: ``(node, api)`` of a node that refused two connects.
+
+    Attributes:
+        unreachable: The nodes to which connecting failed when it was last tried, by name; not to be changed by
+            others.
     """
 
     def __init__(self, *, nodes: Callable[[], dict[str, str]], on_dead: Callable[[str, str], None]) -> None:
@@ -126,14 +146,13 @@ class Liveness:
         self._on_dead = on_dead
         self._task: asyncio.Task[None] | None = None
         self._checks: dict[str, asyncio.Task[None]] = {}
+        # The latest call of ``ask_listening_ports`` in a thread.
         self._ports: asyncio.Future[set[int] | None] | None = None
-        """The latest call of ``ask_listening_ports`` in a thread."""
         self._closed = False
+        # The port of each slave API on this machine; ``None`` of the others.
         self._local_ports: dict[str, int | None] = {}
-        """The port of each slave API on this machine; ``None`` of the others."""
         self.unreachable: dict[str, Unreachable] = {}
-        """The nodes to which connecting failed when it was last tried, by name; not to be changed by others."""
-        self._slow = asyncio.Semaphore(limits.NODE_UNREACHABLE_CHECKS)
+        self._slow = asyncio.Semaphore(_NODE_UNREACHABLE_CHECKS)
 
     def start(self) -> None:
         """Begin to check."""
@@ -192,7 +211,7 @@ class Liveness:
             async with self._slow if node in self.unreachable else contextlib.nullcontext():
                 problem = await try_connect(api)
         except ConnectionRefusedError:
-            await asyncio.sleep(limits.NODE_RECHECK_DELAY)
+            await asyncio.sleep(NODE_RECHECK_DELAY)
             if await refuses(api) and self._nodes().get(node) == api:
                 _log.warning("= node %s at %s is dead: no process listens there", node, api)
                 self._on_dead(node, api)
@@ -307,7 +326,7 @@ async def node_connections(uri: str, caller_id: str, names: Mapping[str, str]) -
     except (RmpaError, RosFault):
         return None
     found = (NodeConnection(one.topic, one.inbound, names.get(one.other, one.other), one.connected) for one in links)
-    return tuple(islice(found, limits.NODE_CONNECTIONS_SHOWN))
+    return tuple(islice(found, _NODE_CONNECTIONS_SHOWN))
 
 
 async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
@@ -339,7 +358,7 @@ async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(limits.NODE_KILL_WAIT):
             while not await refuses(uri):  # noqa: ASYNC110 - the port of another process
-                await asyncio.sleep(limits.NODE_KILL_LOOK)
+                await asyncio.sleep(_NODE_KILL_LOOK)
             return True
     return False
 
@@ -355,13 +374,13 @@ async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
 #
 # rosmaster has three threads for all slaves, so three stopped nodes stop every notification; here each URI has its
 # own queue. For each topic only the latest list of publishers is queued. Parameter updates are all sent, until
-# ``limits.NOTIFY_COALESCE`` notifications wait; from then on a newer update of a parameter replaces an older one.
+# ``_NOTIFY_COALESCE`` notifications wait; from then on a newer update of a parameter replaces an older one.
 
 
+# The caller id of masters in calls to slaves.
 MASTER_ID = "/master"
-"""The caller id of masters in calls to slaves."""
+# By method, by what it tells of, and by a number that lets a newer notification replace an older one.
 _Queue: TypeAlias = OrderedDict[tuple[str, str, int], XmlRpcValue]
-"""By method, by what it tells of, and by a number that lets a newer notification replace an older one."""
 
 
 class Notifier:
@@ -389,7 +408,7 @@ class Notifier:
         api, method, name, value = slave_call
         queue = self._queues.setdefault(api, OrderedDict())
         number = 0
-        if method == "paramUpdate" and len(queue) < limits.NOTIFY_COALESCE:
+        if method == "paramUpdate" and len(queue) < _NOTIFY_COALESCE:
             number = self._serial = self._serial + 1
         # Moved to the end: updates of nested parameters overlap, so a newer one must also be sent later.
         queue.pop((method, name, number), None)
@@ -409,7 +428,7 @@ class Notifier:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _empty(self, api: str, queue: _Queue) -> None:
-        backoff = Backoff(limits.NOTIFY_RETRY_FIRST, limits.NOTIFY_RETRY_MAX, random.random)
+        backoff = Backoff(_NOTIFY_RETRY_FIRST, _NOTIFY_RETRY_MAX, random.random)
         try:
             while queue:
                 key = method, name, _ = next(iter(queue))

@@ -36,16 +36,26 @@ if TYPE_CHECKING:
     from rmpa.ros.master.api import MasterApi
 
 _log = logging.getLogger(__name__)
+
+# Changes are gathered this long before they are written: a starting node registers a dozen things.
+CORE_STATE_GATHER: Final = 0.3
+# After a write, a pause of this many times its processor time: a large state is written less often.
+CORE_STATE_SHARE: Final = 20
+# Pause before a failed write is tried again: the disk is full, or not mounted yet.
+CORE_STATE_RETRY: Final = 5.0
+
+# The longest pause after a write, in seconds.
+_CORE_STATE_REST: Final = 10.0
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 _CALLER_ID: Final = "/rmpa_identify"
 _SIMULATED: Final = "use_sim_time"
+# A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one.
 _DATE: Final = 1
-"""A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one."""
 _OF_A_CORE: Final = frozenset({"/run_id", "/rosdistro", "/rosversion"})
+# Names of nodes or parameters in a text for people.
 _SHOWN: Final = 3
-"""Names of nodes or parameters in a text for people."""
+# Nodes recorded in a row, before other pending data is served; each takes some 25 microseconds.
 _RECORDS: Final = 8
-"""Nodes recorded in a row, before other pending data is served; each takes some 25 microseconds."""
 
 
 class StoredState(msgspec.Struct):
@@ -148,9 +158,8 @@ class CoreState:
         self._up = self._gone = self._params = 0
         self._dropped = ""
         self._asking: set[asyncio.Task[None]] = set()
-        # What is written.
+        # Whether there is a file that could not be read: it is renamed before another one is written.
         self._unread = False
-        """Whether there is a file that could not be read: it is renamed before another one is written."""
         self._problem = ""
         self._written: tuple[int, object] = (-1, None)
         self._digest = 0
@@ -319,7 +328,7 @@ class CoreState:
         while True:
             await self._news.wait()
             self._news.clear()
-            await self._rest(limits.CORE_STATE_GATHER)
+            await self._rest(CORE_STATE_GATHER)
             ended = self._ending.is_set()
             try:
                 await self._write("" if ended else self._boot)
@@ -327,8 +336,8 @@ class CoreState:
                 _log.exception("! keeping the core's state failed")
             if ended:
                 return
-            rest = limits.CORE_STATE_RETRY if self._problem else self._took * limits.CORE_STATE_SHARE
-            await self._rest(min(rest, limits.CORE_STATE_REST))
+            rest = CORE_STATE_RETRY if self._problem else self._took * CORE_STATE_SHARE
+            await self._rest(min(rest, _CORE_STATE_REST))
             self.note_change()
 
     async def _rest(self, seconds: float) -> None:

@@ -2,7 +2,7 @@
 
 No connection is kept alive: each costs a Python node a thread, and opening one on loopback takes 50 microseconds.
 
-A document of some MiB takes seconds to parse. It is read in slices of ``limits.XMLRPC_SLICE``, and other pending data
+A document of some MiB takes seconds to parse. It is read in slices of ``XMLRPC_SLICE``, and other pending data
 is served between two slices; not in a thread, because a thread that computes takes the interpreter from the event
 loop for milliseconds at a time.
 """
@@ -33,6 +33,16 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
+
+# Bytes of XML parsed at once, some 100 microseconds; then pending data is served.
+XMLRPC_SLICE: Final = 2 * KIB
+
+# Seconds of silence before the first keepalive probe; this and the next two are roscpp's values.
+_TCP_KEEPALIVE_IDLE: Final = 60
+# Seconds between probes.
+_TCP_KEEPALIVE_INTERVAL: Final = 10
+# Unanswered probes before the connection is dead.
+_TCP_KEEPALIVE_COUNT: Final = 9
 _CHUNK: Final = 64 * KIB
 _LOOPBACK: Final = "127.0.0.1"
 _Document = TypeVar("_Document", bytes, bytearray, memoryview, str)
@@ -40,8 +50,8 @@ _Document = TypeVar("_Document", bytes, bytearray, memoryview, str)
 
 def slices(document: _Document) -> Iterator[_Document]:
     """A document in slices."""
-    for begin in range(0, len(document), limits.XMLRPC_SLICE):
-        yield document[begin : begin + limits.XMLRPC_SLICE]
+    for begin in range(0, len(document), XMLRPC_SLICE):
+        yield document[begin : begin + XMLRPC_SLICE]
 
 
 async def read_large(pieces: Iterable[Buffer]) -> DocumentReader:
@@ -149,9 +159,9 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
 def keep_alive(sock: socket.socket) -> None:
     """Let the kernel detect a machine that was switched off, with roscpp's timing."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, limits.TCP_KEEPALIVE_IDLE)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, limits.TCP_KEEPALIVE_INTERVAL)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, limits.TCP_KEEPALIVE_COUNT)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, _TCP_KEEPALIVE_IDLE)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, _TCP_KEEPALIVE_INTERVAL)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _TCP_KEEPALIVE_COUNT)
 
 
 def tcpros_info(sock: socket.socket) -> str:

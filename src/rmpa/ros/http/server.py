@@ -36,18 +36,26 @@ from rmpa.runtime.loop import yield_to_data
 
 _log = logging.getLogger(__name__)
 
+# Bytes a second: the connection of a slower call is closed where room is short; loopback carries 1 GB/s.
+_HTTP_PACE_MIN: Final = 64 * KIB
+# Time before the pace of a call is judged.
+_HTTP_SLOW_AFTER: Final = 1.0
+# Connections accepted in one turn of the event loop, 40 microseconds each.
+_HTTP_ACCEPTS: Final = 4
+# Length of the listen queue: all nodes of a robot register at once, and a refused SYN is repeated after 1 s.
+_HTTP_BACKLOG: Final = 1024
+
+# SO_LINGER: closing resets the connection, like a port where nothing listens.
 RESET: Final = struct.pack("ii", 1, 0)
-"""SO_LINGER: closing resets the connection, like a port where nothing listens."""
+# Bytes parsed at once: the granularity of the bound on headers; other pending data is served in between.
 _PIECE: Final = 16 * KIB
-"""Bytes parsed at once: the granularity of the bound on headers; other pending data is served in between."""
+# Seconds; the least duration in the pace of a call.
 _MOMENT: Final = 1e-3
-"""Seconds; the least duration in the pace of a call."""
 
+# ``(method, params, address of the client) -> value``, at once or awaited.
+#
+# A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
 Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
-"""``(method, params, address of the client) -> value``, at once or awaited.
-
-A ``RosFault`` raised becomes a fault. ``ResetConnection``, raised at once, resets the connection.
-"""
 
 
 class ResetConnection(Exception):  # noqa: N818 - the name says what the handler wants
@@ -112,7 +120,7 @@ class HttpConnection(asyncio.Protocol):
 
     def slow(self, now: float) -> bool:
         """Whether the client takes too long for its call or for reading the answer."""
-        return now - self.begun > limits.HTTP_SLOW_AFTER and self.pace(now) < limits.HTTP_PACE_MIN
+        return now - self.begun > _HTTP_SLOW_AFTER and self.pace(now) < _HTTP_PACE_MIN
 
     # --- asyncio's side ---------------------------------------------------------------------------------------
 
@@ -316,7 +324,6 @@ class XmlRpcServer:
         self._connections: dict[HttpConnection, None] = {}
         self._empty: asyncio.Future[None] | None = None
         self.port = 0
-        """The listening port; 0 before ``start``."""
 
     async def start(self) -> None:
         """Listen.
@@ -331,7 +338,7 @@ class XmlRpcServer:
             self.adopt,
             name=self._name,
             use=self._use,
-            at_once=limits.HTTP_ACCEPTS,
+            at_once=_HTTP_ACCEPTS,
             make_room=self._evict,
         )
         self._acceptor.start()
@@ -382,7 +389,7 @@ class XmlRpcServer:
     def _evict(self) -> bool:
         """Close a connection for a new one; return whether there is one that is not being answered.
 
-        It is the slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
+        It is the slowest of those below ``_HTTP_PACE_MIN``; else the one that is idle for longest, whose client
         reconnects by itself; else the slowest of all.
         """
         now = asyncio.get_running_loop().time()
@@ -537,7 +544,7 @@ async def _listen(name: str, host: str, port: int, use: Use) -> socket.socket:
             sock = on_error.enter_context(DESCRIPTORS.open_socket(use, what=name))
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind(address)
-            sock.listen(limits.HTTP_BACKLOG)
+            sock.listen(_HTTP_BACKLOG)
             on_error.pop_all()
     except OSError as error:
         owner = await asyncio.to_thread(program_at, port) if error.errno == errno.EADDRINUSE else ""

@@ -79,6 +79,9 @@ class MasterApi:
         pid: The process id, for ``getPid``.
         on_shutdown: Called with the reason when a client calls ``shutdown``.
         yielder: Iterates, and serves pending data in between, in large graphs and for large parameters.
+
+    Attributes:
+        service_lookup: Answers ``lookupService`` for each caller; see ``Core.on_lookup``.
     """
 
     def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, yielder: Yielder = iter) -> None:
@@ -89,7 +92,6 @@ class MasterApi:
         self.registrations = Registrations()
         self.parameters = params.Parameters()
         self.service_lookup: Callable[[str, str, str, str], str] | None = None
-        """Answers ``lookupService`` for each caller; see ``Core.on_lookup``."""
         self._methods = self._table()
 
     # --- calling ----------------------------------------------------------------------------------------------

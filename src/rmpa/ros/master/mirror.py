@@ -26,22 +26,22 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Yielder
 
+# The kinds of the three lists of ``getSystemState``, in order.
 _KINDS: Final = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)
-"""The kinds of the three lists of ``getSystemState``, in order."""
 _HEAD: Final = ("getSystemState", "getTopicTypes", "getPid")
+# The methods that ``Mirror.apply`` accepts, and what they register.
 REGISTRATIONS: Final = {
     **{f"register{kind.value.title()}": kind for kind in _KINDS},
     **{f"unregister{kind.value.title()}": kind for kind in _KINDS},
     "subscribeParam": RegistrationKind.PARAM,
     "unsubscribeParam": RegistrationKind.PARAM,
 }
-"""The methods that ``Mirror.apply`` accepts, and what they register."""
 
 _V = TypeVar("_V")
+# A method of the Master API and its parameters.
 Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
-"""A method of the Master API and its parameters."""
+# One registration: its kind, the topic, service or parameter, and the node.
 Entry: TypeAlias = tuple[RegistrationKind, str, str]
-"""One registration: its kind, the topic, service or parameter, and the node."""
 
 
 @dataclass(slots=True)
@@ -164,15 +164,17 @@ class Mirror:
 
     Args:
         yielder: Iterates, and serves pending data in between, in surveys of thousands of topics.
+
+    Attributes:
+        asked: Count of calls of ``apply``: a survey that begins now shows the effect of these.
+        dead: Nodes of which the master has registrations although nothing listens at their slave APIs any more.
     """
 
     def __init__(self, *, yielder: Yielder = iter) -> None:
         self._yielder = yielder
         self.registrations = Registrations()
         self.asked = 0
-        """Count of calls of ``apply``: a survey that begins now shows the effect of these."""
         self.dead: dict[str, str] = {}
-        """Nodes of which the master has registrations although nothing listens at their slave APIs any more."""
         # The agent's registrations: the slave API, and the type of a topic or the URI of a service.
         self._own: dict[Entry, tuple[str, str]] = {}
         # Registrations changed by ``apply`` since the last survey began, with the number of that call: the survey may

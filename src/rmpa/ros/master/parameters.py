@@ -168,11 +168,14 @@ def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:
 
 
 class Parameters:
-    """The tree of one parameter server."""
+    """The tree of one parameter server.
+
+    Attributes:
+        tree: The whole tree, not to be changed; it and each of its parts stay the same object until a value changes.
+    """
 
     def __init__(self) -> None:
         self.tree: Tree = {}
-        """The whole tree, not to be changed; it and each of its parts stay the same object until a value changes."""
 
     def get(self, key: str) -> XmlRpcValue:
         """The value or the namespace at ``key``; ``/`` is the whole tree. The caller must not change it.

@@ -9,8 +9,10 @@ from typing import Annotated, Final
 
 import msgspec
 
-from rmpa.ros import limits
 from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind, SlaveCall
+
+# Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200.
+_CORE_STATE_NAME_MAX: Final = 4096
 
 ANY_TYPE: Final = "*"
 _NONE: Final[dict[str, str]] = {}
@@ -18,8 +20,8 @@ _OTHER_SIDE: Final = {
     RegistrationKind.PUBLISHER: RegistrationKind.SUBSCRIBER,
     RegistrationKind.SUBSCRIBER: RegistrationKind.PUBLISHER,
 }
-Name = Annotated[str, msgspec.Meta(pattern="^/", max_length=limits.CORE_STATE_NAME_MAX)]
-"""A name in a core's state file."""
+# A name in a core's state file.
+Name = Annotated[str, msgspec.Meta(pattern="^/", max_length=_CORE_STATE_NAME_MAX)]
 
 
 class NodeRecord(msgspec.Struct):
@@ -38,6 +40,9 @@ class Registrations:
     """The tables, and what follows from each change.
 
     Each change appends to ``calls`` (of slaves, to be made in order) and to ``changes``; the owner takes both.
+
+    Attributes:
+        revision: Another number after each change of a node's record.
     """
 
     def __init__(self) -> None:
@@ -53,7 +58,6 @@ class Registrations:
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
         self.revision = 0
-        """Another number after each change of a node's record."""
         self.calls: list[SlaveCall] = []
         self.changes: list[GraphChange] = []
 

@@ -16,7 +16,6 @@ from rmpa.config import limits as config_limits
 from rmpa.core import limits as core_limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
-from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_client import ServiceConnection
@@ -37,6 +36,11 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
+
+# Time in which an ending node unregisters everything; a master that hangs must not delay it longer.
+NODE_UNREGISTER_TIMEOUT: Final = 3.0
+# Concurrent calls to unregister, each on a connection of its own.
+NODE_UNREGISTER_AT_ONCE: Final = 16
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
 
 Handler = Callable[[Any], "Awaitable[Any] | Any"]
@@ -52,13 +56,12 @@ class MasterClient:
 
     def __init__(self, slave: SlaveNode, master_uri: str) -> None:
         self.slave = slave
-        """The servers of the node, for their connections and counters."""
         self.name = slave.name
         self.master_uri = master_uri
+        # By ``Publisher``, ``Subscriber`` or ``Service``, and name.
         self._entries: dict[tuple[str, str], Publisher | Subscriber | Service] = {}
-        """By ``Publisher``, ``Subscriber`` or ``Service``, and name."""
+        # The parameters that are subscribed to.
         self._followed: set[str] = set()
-        """The parameters that are subscribed to."""
 
     @property
     def uri(self) -> str:
@@ -114,7 +117,7 @@ class MasterClient:
 
     async def _unregister_all(self) -> None:
         """Unregister everything, concurrently and with one deadline for a slow master."""
-        at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
+        at_once = asyncio.Semaphore(NODE_UNREGISTER_AT_ONCE)
 
         async def unregister(method: str, *params: XmlRpcValue) -> None:
             try:
@@ -124,7 +127,7 @@ class MasterClient:
                 _log.debug("! %s: %s %s: %s", self.name, method, params, error)
 
         try:
-            async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
+            async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
                 for (kind, key), entry in self._entries.items():
                     group.create_task(unregister(f"unregister{kind}", key, entry.uri), name=f"unregister {self.name}")
                 for key in self._followed:
@@ -321,7 +324,12 @@ class Received:
 
 
 class Publisher(PublicationEvents):
-    """Publishes one topic of a ``Node``; made by ``Node.advertise``."""
+    """Publishes one topic of a ``Node``; made by ``Node.advertise``.
+
+    Attributes:
+        refusals: Why subscribers (by caller id) were refused.
+        numbers: Numbers what ``publish`` sends; what ``publish_raw`` sends has its numbers already.
+    """
 
     kind_name: Final = "Publisher"
 
@@ -337,12 +345,10 @@ class Publisher(PublicationEvents):
         self.topic = self.key = topic
         self.uri = node.uri
         self.refusals: dict[str, str] = {}
-        """Why subscribers (by caller id) were refused."""
         self.refusal_log = RefusalLog(_log, Counters())
         self.description = description
         self.kind = kind
         self.numbers = HeaderNumbers(kind) if kind is not None else None
-        """Numbers what ``publish`` sends; what ``publish_raw`` sends has its numbers already."""
         self._change = asyncio.Event()
         self.publication = Publication(topic, node.name, description, events=self, queue_messages=queue_messages)
 
@@ -424,7 +430,12 @@ class Publisher(PublicationEvents):
 
 
 class Subscriber:
-    """Receives one topic of a ``Node``, by callback or ``async for``; made by ``Node.subscribe``."""
+    """Receives one topic of a ``Node``, by callback or ``async for``; made by ``Node.subscribe``.
+
+    Attributes:
+        refusals: Why publishers (by slave API URI) refused or do not match.
+        dropped: Messages dropped because the ``async for`` is slow.
+    """
 
     kind_name: Final = "Subscriber"
 
@@ -446,12 +457,10 @@ class Subscriber:
         self.topic = self.key = topic
         self.uri = node.uri
         self.refusals: dict[str, str] = {}
-        """Why publishers (by slave API URI) refused or do not match."""
         self.refusal_log = RefusalLog(_log, Counters())
         self.kind = kind
         self.type_name = kind.name if kind is not None else type_name
         self.dropped = 0
-        """Messages dropped because the ``async for`` is slow."""
         self._callback = callback
         self._on_bytes = on_bytes
         self._queue: deque[Received] = deque()

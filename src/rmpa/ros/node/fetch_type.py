@@ -25,8 +25,11 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
+
+# Time-out for the header of one such publisher; a peer's publisher answers when its route is open.
+FETCH_TYPE_TIMEOUT: Final = 3.0
+# Prefix of the names of proxies for a peer's nodes. They are asked last, because asking one opens a route.
 _PROXIES: Final = "/rmpa/"
-"""Prefix of the names of proxies for a peer's nodes. They are asked last, because asking one opens a route."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,7 @@ async def fetch_type(
         if node == caller_id:
             continue
         try:
-            async with asyncio.timeout(limits.FETCH_TYPE_TIMEOUT):
+            async with asyncio.timeout(FETCH_TYPE_TIMEOUT):
                 uri = str((await call_api(master_uri, "lookupNode", caller_id, node)).value)
                 header = await ask_publisher(uri, where, f"{caller_id}_learns") or {}
             if header.get("type") == name:

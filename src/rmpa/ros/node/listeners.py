@@ -31,8 +31,18 @@ if TYPE_CHECKING:
     from rmpa.ros.node.service_server import ServiceEndpoint
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+    # Takes ownership of an accepted, non-blocking socket; the second argument is the client's address.
     Adopt = Callable[[socket.socket, tuple[str, int]], None]
-    """Takes ownership of an accepted, non-blocking socket; the second argument is the client's address."""
+
+# Time-out of the test whether addresses of 127/8 other than 127.0.0.1 work here; if so, it takes a millisecond.
+SHARED_PROBE_TIMEOUT: Final = 1.0
+# Time before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one.
+LOOPBACK_REST: Final = 60.0
+
+# Length of the listen queue: all subscribers of a restarted node connect at once.
+_TCPROS_BACKLOG: Final = 128
+# Listen queue of all proxies' one socket: all subscribers of a restarted agent connect at once.
+_SHARED_BACKLOG: Final = 4096
 
 
 def local_addresses() -> list[str]:
@@ -51,11 +61,11 @@ def local_addresses() -> list[str]:
 # Assigns loopback addresses ``127.a.b.c`` to nodes that share one port: the dialled address identifies the node.
 
 
+# Values of ``a``, from 1 on: 127.0/16 has localhost, Debian's 127.0.1.1 and the resolvers; 127.255/16 broadcasts.
 _FIRST: Final = 254
-"""Values of ``a``, from 1 on: 127.0/16 has localhost, Debian's 127.0.1.1 and the resolvers; 127.255/16 broadcasts."""
 _SECOND: Final = 256
+# Values of ``c``, from 1 on: an address that ends in 0 or 255 looks like a network's own.
 _THIRD: Final = 254
-"""Values of ``c``, from 1 on: an address that ends in 0 or 255 looks like a network's own."""
 
 
 class LoopbackAddresses:
@@ -63,7 +73,7 @@ class LoopbackAddresses:
 
     An address is a hash of the node's name: it is the same after a restart, and hardly ever another node's, so a
     client with an old address is refused instead of reaching the wrong node. A freed address is not used again for
-    ``limits.LOOPBACK_REST``, even for the same node: rospy takes a URI that it has just lost for one that it still
+    ``LOOPBACK_REST``, even for the same node: rospy takes a URI that it has just lost for one that it still
     has, and does not reconnect.
 
     Args:
@@ -108,7 +118,7 @@ class LoopbackAddresses:
         """Release addresses that rested long enough, and the oldest of too many."""
         while self._resting:
             since = next(iter(self._resting.values()))
-            if now - since < limits.LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:
+            if now - since < LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:
                 return
             self._resting.popitem(last=False)
 
@@ -136,6 +146,9 @@ class TcprosServer:
         counters: Count ``tcpros.refused.*``.
         numbers: The numbers of connections, shared with the node's outgoing ones.
         services: By name; read again at each header.
+
+    Attributes:
+        address: Where the socket listens.
     """
 
     def __init__(
@@ -157,7 +170,6 @@ class TcprosServer:
         self._accepted: set[AcceptedConnection] = set()
         self._forget_at = 16
         self.address: tuple[str, int] = ("", 0)
-        """Where the socket listens."""
 
     def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
         """Listen; ``port`` 0 lets the system choose.
@@ -172,7 +184,7 @@ class TcprosServer:
                 sock = on_error.enter_context(DESCRIPTORS.open_socket(Use.DATA, family, what=name))
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 sock.bind((host, port))
-                sock.listen(limits.TCPROS_BACKLOG)
+                sock.listen(_TCPROS_BACKLOG)
                 on_error.pop_all()
         except OSError as error:
             problem = ("no file descriptors left", remedy()) if is_shortage(error) else (str(error),)
@@ -271,17 +283,19 @@ class SharedListener:
     Args:
         salt: Distinguishes nodes of one name in several graphs of this machine: the master's URI.
         counters: ``address.unknown.xmlrpc``, ``address.unknown.tcpros``: connections to addresses without a node.
+
+    Attributes:
+        ports: The port of XML-RPC and that of TCPROS; 0 before ``start()``.
     """
 
     def __init__(self, salt: str, *, counters: Counters | None = None) -> None:
         self._counters = counters if counters is not None else Counters()
         self._salt = salt
         self._addresses = LoopbackAddresses(salt)
+        # By address: what takes the connections to the XML-RPC port, and those to the TCPROS port.
         self._nodes: dict[str, tuple[Adopt, Adopt]] = {}
-        """By address: what takes the connections to the XML-RPC port, and those to the TCPROS port."""
         self._acceptors: list[Acceptor] = []
         self.ports = (0, 0)
-        """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
         self._strays = XmlRpcServer(_former_node, counters=self._counters, name="addresses of former nodes")
 
     async def start(self) -> None:
@@ -345,7 +359,7 @@ class SharedListener:
             # Before it is bound to all addresses, so that the network can never reach it.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
             sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
-            sock.listen(limits.SHARED_BACKLOG)
+            sock.listen(_SHARED_BACKLOG)
             on_error.pop_all()
         acceptor = Acceptor(sock, accepted, name=name)
         acceptor.start()
@@ -367,7 +381,7 @@ class SharedListener:
         """Connect to an address, and wait until the connection is accepted with it.
 
         Raises:
-            OSError: The connection fails, or is not accepted in ``limits.SHARED_PROBE_TIMEOUT``.
+            OSError: The connection fails, or is not accepted in ``SHARED_PROBE_TIMEOUT``.
         """
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[None] = loop.create_future()
@@ -380,7 +394,7 @@ class SharedListener:
         self._nodes[address] = arrive, arrive
         try:
             with DESCRIPTORS.open_socket(Use.DATA) as probe:
-                async with asyncio.timeout(limits.SHARED_PROBE_TIMEOUT):
+                async with asyncio.timeout(SHARED_PROBE_TIMEOUT):
                     await loop.sock_connect(probe, (address, self.ports[1]))
                     await arrived
         except TimeoutError as error:

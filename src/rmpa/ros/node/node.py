@@ -49,6 +49,12 @@ if TYPE_CHECKING:
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+# Time between a node's checks whether its master knows it: a restarted core has the node back within a second.
+NODE_MASTER_CHECK: Final = 0.5
+
+# Messages queued for an ``async for``; above it the oldest is dropped.
+_RECEIVED_QUEUE: Final = 1000
+
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
 _log = logging.getLogger(__name__)
@@ -58,7 +64,7 @@ _NO_DEFAULT: Final = object()
 class Node(MasterClient):
     """One node, registered at a master as long as the ``async with`` lasts.
 
-    A restart of the master is detected within ``limits.NODE_MASTER_CHECK``, and everything is registered again; open
+    A restart of the master is detected within ``NODE_MASTER_CHECK``, and everything is registered again; open
     connections go on meanwhile. When the master shuts the node down, it closes itself: ``async for`` loops end and
     ``stopped`` is set.
 
@@ -73,6 +79,9 @@ class Node(MasterClient):
     Raises:
         ConfigError: A ROS variable cannot be used.
         ValueError: The name is not a legal one.
+
+    Attributes:
+        stopped: Set when the node is closed.
     """
 
     def __init__(
@@ -91,7 +100,6 @@ class Node(MasterClient):
             name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
         self.environment = environment
         self.stopped = asyncio.Event()
-        """Set when the node is closed."""
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
         self._watch: asyncio.Task[None] | None = None
@@ -177,7 +185,7 @@ class Node(MasterClient):
         on_bytes: Callable[[memoryview, Mapping[str, str]], None] | None = None,
         own: bool = True,
         nodelay: bool = True,
-        queue_messages: int = limits.RECEIVED_QUEUE,
+        queue_messages: int = _RECEIVED_QUEUE,
     ) -> Subscriber:
         """Subscribe to a topic, of this node's own publisher too, as rospy and roscpp do.
 
@@ -386,7 +394,7 @@ class Node(MasterClient):
 
     async def _watch_master(self) -> None:
         while True:
-            await asyncio.sleep(limits.NODE_MASTER_CHECK)
+            await asyncio.sleep(NODE_MASTER_CHECK)
             if not (self._entries or self._followed):
                 continue
             try:

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
+# The outbox key of messages.
 _MESSAGES: Final = 0
-"""The outbox key of messages."""
 
 
 class AcceptedConnection(Stream):
@@ -60,6 +60,7 @@ class AcceptedConnection(Stream):
         on_data: Gets the bytes after the header, as ``on_bytes`` of a stream; with ``None``, as for subscribers, they
             are dropped.
         since: The count of its publication's messages when it was served.
+        request: The other side's header, once received.
     """
 
     def __init__(
@@ -72,7 +73,6 @@ class AcceptedConnection(Stream):
     ) -> None:
         self.number = number
         self.request: Header = {}
-        """The other side's header, once received."""
         self.info = tcpros_info(sock)
         self.peer: tuple[str, int] = sock.getpeername()[:2]
         self.since = 0
@@ -184,6 +184,11 @@ class Publication:
         events: What is called at changes.
         queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         queue_bytes: Bytes queued for one slow subscriber; one message always fits.
+
+    Attributes:
+        messages: Messages published.
+        bytes: Bytes published, lengths included; each message counts once, whatever the number of subscribers.
+        latched: The messages kept for later subscribers, oldest first, with their lengths in front.
     """
 
     # More than 12 fields: what is sent to new subscribers, the bounds of their queues, and the message in progress.
@@ -201,13 +206,9 @@ class Publication:
         self.caller_id = caller_id
         self.events = events
         self.messages = 0
-        """Messages published."""
         self.bytes = 0
-        """Bytes published, lengths included; each message counts once, whatever the number of subscribers."""
         self.description: TopicDescription | None = None
-        """The description, once it is known."""
         self.latched: tuple[bytes, ...] = ()
-        """The messages kept for later subscribers, oldest first, with their lengths in front."""
         self._keeps = 1
         self._reply = _NOTHING
         self._queue_messages = queue_messages

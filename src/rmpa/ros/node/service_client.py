@@ -8,7 +8,7 @@ import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from rmpa.core.errors import (
     LocalProtocolError,
@@ -22,27 +22,10 @@ from rmpa.core.outbox import Outbox
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api, connect, keep_alive
 from rmpa.ros.node.service_server import BODIES, INLINE, send_large
+from rmpa.ros.wire import tcpros
 from rmpa.ros.wire.slave_api import TCPROS
-from rmpa.ros.wire.tcpros import (
-    ANY,
-    LENGTH,
-    REPLY,
-    BodyBuffer,
-    ServiceDescription,
-    check_server,
-    client_header,
-    encode_header,
-    parse_header,
-    parse_reply_head,
-    parse_service_uri,
-    printable,
-    subscriber_header,
-)
 from rmpa.runtime.accept import OUT_OF_DESCRIPTORS, Use, is_shortage
 from rmpa.runtime.stream import Stream
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.tcpros import Buffer, Header
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
@@ -75,7 +58,7 @@ class ServiceConnection:
     """
 
     def __init__(
-        self, sock: socket.socket, service: str, fields: Header, on_closed: Callable[[], None] | None
+        self, sock: socket.socket, service: str, fields: tcpros.Header, on_closed: Callable[[], None] | None
     ) -> None:
         self.service = service
         self.fields = fields
@@ -84,7 +67,7 @@ class ServiceConnection:
         self._loop = asyncio.get_running_loop()
         self._done: Done | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._body: BodyBuffer | None = None
+        self._body: tcpros.BodyBuffer | None = None
         self._ok = False
         self._sending: asyncio.Task[None] | None = None
         outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX)
@@ -98,7 +81,7 @@ class ServiceConnection:
         service: str,
         caller_id: str,
         *,
-        md5sum: str = ANY,
+        md5sum: str = tcpros.ANY,
         persistent: bool = True,
         probe: bool = False,
         timeout: float = limits.SERVICE_OPEN_TIMEOUT,  # noqa: ASYNC109 - the message names it
@@ -122,8 +105,8 @@ class ServiceConnection:
             PeerRefused: The server answers with an error header, or has another md5 sum.
             RemoteProtocolError: The answer is not that of a service's server.
         """
-        host, port = parse_service_uri(uri)
-        header = client_header(service, caller_id, md5sum=md5sum, persistent=persistent, probe=probe)
+        host, port = tcpros.parse_service_uri(uri)
+        header = tcpros.client_header(service, caller_id, md5sum=md5sum, persistent=persistent, probe=probe)
         try:
             async with asyncio.timeout(timeout):
                 sock = await connect(host, port)
@@ -144,9 +127,9 @@ class ServiceConnection:
             raise UnreachableError(f"server of service {service}", f"{uri} ({error})") from error
 
     @property
-    def description(self) -> ServiceDescription:
+    def description(self) -> tcpros.ServiceDescription:
         """The server's description; fields that roscpp clients do not need may be empty."""
-        return ServiceDescription.from_header(self.fields)
+        return tcpros.ServiceDescription.from_header(self.fields)
 
     @property
     def caller_id(self) -> str:
@@ -165,7 +148,7 @@ class ServiceConnection:
 
     async def call(
         self,
-        body: Buffer,
+        body: tcpros.Buffer,
         timeout: float | None = None,  # noqa: ASYNC109 - the message names it
     ) -> tuple[bool, bytes | bytearray]:
         """Send a request and wait for its reply: the ``ok`` byte, and the response or the text of the error.
@@ -194,7 +177,7 @@ class ServiceConnection:
             self.close()
             raise
 
-    def request(self, body: Buffer, done: Done, timeout: float | None = None) -> None:
+    def request(self, body: tcpros.Buffer, done: Done, timeout: float | None = None) -> None:
         """Send a request without waiting: ``done`` is called once in the event loop, with the reply or the error.
 
         A ``body`` larger than ``service_stream.INLINE`` must not change until then. ``timeout`` is in seconds;
@@ -216,7 +199,7 @@ class ServiceConnection:
         self._done = done
         if timeout is not None:
             self._timer = self._loop.call_later(timeout, self._timed_out, timeout)
-        head = LENGTH.pack(len(body))
+        head = tcpros.LENGTH.pack(len(body))
         if len(body) > INLINE:
             self._sending = self._loop.create_task(self._send_large(head, body), name=f"request of {self.service}")
         else:
@@ -238,7 +221,7 @@ class ServiceConnection:
         except OSError:
             return True
 
-    async def _send_large(self, head: bytes, body: Buffer) -> None:
+    async def _send_large(self, head: bytes, body: tcpros.Buffer) -> None:
         try:
             await send_large(self._stream, head, body)
         finally:
@@ -249,15 +232,15 @@ class ServiceConnection:
             raise RemoteProtocolError(f"the server of {self.service} sent {len(data)} bytes that were not asked for")
         at, body = 0, self._body
         if body is None:
-            head = parse_reply_head(data)
+            head = tcpros.parse_reply_head(data)
             if head is None:
-                return 0, REPLY.size
+                return 0, tcpros.REPLY.size
             self._ok, size = head
-            end = REPLY.size + size
+            end = tcpros.REPLY.size + size
             if len(data) >= end:
-                self._answered((self._ok, bytes(data[REPLY.size : end])))
+                self._answered((self._ok, bytes(data[tcpros.REPLY.size : end])))
                 return end, 0
-            at, body = REPLY.size, BodyBuffer(size)
+            at, body = tcpros.REPLY.size, tcpros.BodyBuffer(size)
         at += body.take(data[at:])
         self._body = None if body.whole else body
         if body.whole:
@@ -295,12 +278,13 @@ class ServiceConnection:
                 on_closed()
 
 
-def _checked(fields: Header | None, service: str, md5sum: str) -> Header:
+def _checked(fields: tcpros.Header | None, service: str, md5sum: str) -> tcpros.Header:
     if fields is None:
         raise RemoteProtocolError(f"the server of {service} closed before its header")
-    problem = check_server(fields, service, md5sum)
+    problem = tcpros.check_server(fields, service, md5sum)
     if problem is not None:
-        raise PeerRefused(f"service {service}: {printable(fields.get('callerid', '')) or 'its server'}", problem)
+        server = tcpros.printable(fields.get("callerid", "")) or "its server"
+        raise PeerRefused(f"service {service}: {server}", problem)
     return fields
 
 
@@ -349,7 +333,7 @@ async def probe(
             sock = await connect(address, port)
             if not service:
                 return ""
-            header = client_header(service, _CALLER_ID, probe=True)
+            header = tcpros.client_header(service, _CALLER_ID, probe=True)
             return _judge(await exchange_headers(sock, header), node)
     except TimeoutError:
         return f"no answer within {timeout:g} s" if sock is None else f"connected, but no answer within {timeout:g} s"
@@ -367,7 +351,7 @@ async def probe(
             sock.close()
 
 
-async def exchange_headers(sock: socket.socket, header: Header) -> Header | None:
+async def exchange_headers(sock: socket.socket, header: tcpros.Header) -> tcpros.Header | None:
     """Send a connection header, and return the one that comes, or ``None`` if the other side closes before.
 
     Args:
@@ -379,10 +363,10 @@ async def exchange_headers(sock: socket.socket, header: Header) -> Header | None
         OSError: The connection broke.
     """
     loop = asyncio.get_running_loop()
-    await loop.sock_sendall(sock, encode_header(header))
+    await loop.sock_sendall(sock, tcpros.encode_header(header))
     data = b""
     while True:
-        fields, _, wanted = parse_header(data)
+        fields, _, wanted = tcpros.parse_header(data)
         if fields is not None:
             return fields
         chunk = await loop.sock_recv(sock, wanted - len(data))  # what follows the header is left to the caller
@@ -391,7 +375,7 @@ async def exchange_headers(sock: socket.socket, header: Header) -> Header | None
         data += chunk
 
 
-async def ask_publisher(uri: str, topic: str, caller_id: str, use: Use = Use.DATA) -> Header | None:
+async def ask_publisher(uri: str, topic: str, caller_id: str, use: Use = Use.DATA) -> tcpros.Header | None:
     """Connect to a publisher, and return the header that it answers; ``None`` where it sends none.
 
     Args:
@@ -408,16 +392,16 @@ async def ask_publisher(uri: str, topic: str, caller_id: str, use: Use = Use.DAT
     match await call_api(uri, "requestTopic", caller_id, topic, [[TCPROS]], use=use):
         case (1, _, [protocol, str(host), int(port)]) if protocol == TCPROS:
             with await connect(host, port, use) as sock:
-                return await exchange_headers(sock, subscriber_header(topic, caller_id))
+                return await exchange_headers(sock, tcpros.subscriber_header(topic, caller_id))
     return None
 
 
-def _judge(fields: Header | None, node: str) -> str:
+def _judge(fields: tcpros.Header | None, node: str) -> str:
     if fields is None:
         return "the program that listens there closed the connection without an answer"
     name, error = fields.get("callerid", ""), fields.get("error")
     if node and name and name != node:
-        return f"another node listens there: {printable(name)}"
+        return f"another node listens there: {tcpros.printable(name)}"
     if error is None or (node and (name == node or error.startswith(f"[{node}] "))):
         return ""
-    return f"a ROS node listens there, but not the expected one: {printable(error)}"
+    return f"a ROS node listens there, but not the expected one: {tcpros.printable(error)}"

@@ -12,18 +12,7 @@ from rmpa.core.counters import logged_failure
 from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.limits import KIB
 from rmpa.ros import limits
-from rmpa.ros.wire.tcpros import (
-    LENGTH,
-    BodyBuffer,
-    ServiceDescription,
-    check_client,
-    frame_reply,
-    is_persistent,
-    is_probe,
-    parse_request_length,
-    printable,
-    server_header,
-)
+from rmpa.ros.wire import tcpros
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.loop import yield_to_data
 
@@ -31,21 +20,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from rmpa.ros.node.publication import AcceptedConnection
-    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.stream import Stream
+
+# Time within which the next bytes of a service request (of a single call also the first) must arrive.
+SERVICE_STALL: Final = 30.0
 
 
 # Sends large requests and responses in parts; other pending data is served between two parts.
 
 
+# The outbox key of requests and responses.
 BODIES: Final = 0
-"""The outbox key of requests and responses."""
+# Larger bodies are sent in parts: to copy 64 MiB into a queue would hold up the event loop for 30 ms.
 INLINE: Final = 256 * KIB
-"""Larger bodies are sent in parts: to copy 64 MiB into a queue would hold up the event loop for 30 ms."""
 _PART: Final = 256 * KIB
 
 
-async def send_large(stream: Stream, head: bytes, body: Buffer) -> None:
+async def send_large(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
     """Send a body that is larger than ``INLINE``; ends early when the stream is closed."""
     message = stream.open(BODIES, len(head) + len(body))
     stream.extend(message, head)
@@ -62,7 +53,7 @@ async def send_large(stream: Stream, head: bytes, body: Buffer) -> None:
 
 _log = logging.getLogger(__name__)
 
-Describe = Callable[[], Awaitable[ServiceDescription | str]]
+Describe = Callable[[], Awaitable[tcpros.ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
 
 
@@ -95,7 +86,7 @@ class ServiceCall:
         """Whether the call was answered, or needs no answer any more."""
         return self._client is None
 
-    def reply(self, ok: bool, body: Buffer) -> None:
+    def reply(self, ok: bool, body: tcpros.Buffer) -> None:
         """Answer; ``body`` is the response, or for ``ok=False`` the text of the error. Later answers are ignored."""
         client, self._client = self._client, None
         if client is not None:
@@ -129,6 +120,10 @@ class ServiceEndpoint:
         description: The description, if it is known.
         timeout: Seconds for a call before the client gets an error.
         on_mismatch: ``(fields, text)``: a client with another md5 sum was refused.
+
+    Attributes:
+        calls: Requests received.
+        failed: Requests answered with an error.
     """
 
     def __init__(
@@ -138,7 +133,7 @@ class ServiceEndpoint:
         serve: Serve,
         describe: Describe | None = None,
         *,
-        description: ServiceDescription | None = None,
+        description: tcpros.ServiceDescription | None = None,
         timeout: float = config_limits.SERVICE_TIMEOUT,
         on_mismatch: Callable[[Mapping[str, str], str], None] = lambda _, text: _log.warning("! %s", text),
     ) -> None:
@@ -147,11 +142,8 @@ class ServiceEndpoint:
         self.serve = serve
         self.timeout = timeout
         self.description = description
-        """The description for clients; with ``None``, ``describe`` is called at the next header."""
         self.calls = 0
-        """Requests received."""
         self.failed = 0
-        """Requests answered with an error."""
         self._describe = describe
         self.on_mismatch = on_mismatch
         self._clients: set[_ClientConnection] = set()
@@ -192,7 +184,7 @@ class ServiceEndpoint:
 
     async def _fetch_description(self) -> None:
         name = f"service [{self.service}]"
-        answer: ServiceDescription | str
+        answer: tcpros.ServiceDescription | str
         try:
             async with asyncio.timeout(self.timeout):
                 answer = await self._describe() if self._describe is not None else f"{name} has no description yet"
@@ -219,7 +211,7 @@ class ServiceEndpoint:
             try:
                 answer(client)
             except Exception:  # noqa: BLE001 - one client must not cost the others their answers
-                _log.exception("! %s: %s could not be answered", self.service, printable(client.caller_id))
+                _log.exception("! %s: %s could not be answered", self.service, tcpros.printable(client.caller_id))
                 client.close()
 
 
@@ -237,30 +229,30 @@ class _ClientConnection:
         self._endpoint = endpoint
         self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = is_persistent(connection.request)
+        self._persistent = tcpros.is_persistent(connection.request)
         self.opened = self._ended = self._taking = False
-        self._body: BodyBuffer | None = None
+        self._body: tcpros.BodyBuffer | None = None
         self._call: ServiceCall | None = None
         self._sending: asyncio.Task[None] | None = None
         self._discard = 0
+        # Ends a call that takes too long, or a connection whose client sends nothing.
         self._timer: asyncio.TimerHandle | None = None
-        """Ends a call that takes too long, or a connection whose client sends nothing."""
         connection.on_data = self._take
         connection.on_end = self._left
 
-    def open(self, description: ServiceDescription) -> None:
+    def open(self, description: tcpros.ServiceDescription) -> None:
         """Answer the client's header, or refuse it if the md5 sums differ."""
         connection, endpoint = self._connection, self._endpoint
-        problem = check_client(connection.request, endpoint.service, endpoint.caller_id, description)
+        problem = tcpros.check_client(connection.request, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
             endpoint.on_mismatch(connection.request, problem)
             self.refuse(problem)
             return
         self.opened = True
         connection.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
-        header = server_header(endpoint.caller_id, description)
+        header = tcpros.server_header(endpoint.caller_id, description)
         connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or is_probe(connection.request):
+        if not self._persistent or tcpros.is_probe(connection.request):
             self._watch(connection.bytes_in)
 
     def refuse(self, text: str) -> None:
@@ -287,7 +279,7 @@ class _ClientConnection:
         self._connection.close()
         self._release()
 
-    def reply(self, ok: bool, body: Buffer) -> None:
+    def reply(self, ok: bool, body: tcpros.Buffer) -> None:
         """Answer the call that is under way."""
         self._call = None
         if not self._ended:
@@ -320,20 +312,20 @@ class _ClientConnection:
         if body is None:
             if not self.opened or self._call is not None or self._sending is not None:
                 # One request at a time; at most one more is buffered.
-                if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
+                if len(data) > limits.SERVICE_MESSAGE_MAX + tcpros.LENGTH.size:
                     raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
                 return 0, 0
-            size = parse_request_length(data)
+            size = tcpros.parse_request_length(data)
             if size is None:
-                return 0, LENGTH.size
-            at = LENGTH.size
+                return 0, tcpros.LENGTH.size
+            at = tcpros.LENGTH.size
             if size > limits.SERVICE_MESSAGE_MAX:
                 self._too_large(size)
                 return at, 0
             if len(data) >= at + size:
                 self._start_call(bytes(data[at : at + size]))
                 return at + size, 0
-            body = self._body = BodyBuffer(size)
+            body = self._body = tcpros.BodyBuffer(size)
         at += body.take(data[at:])
         if body.whole:
             self._body = None
@@ -353,7 +345,7 @@ class _ClientConnection:
         except RmpaError as error:
             call.fail(str(error))
         except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
-            _log.exception("! %s: a call of %s failed", endpoint.service, printable(call.caller_id))
+            _log.exception("! %s: a call of %s failed", endpoint.service, tcpros.printable(call.caller_id))
             call.fail(f"service [{endpoint.service}]: [{endpoint.caller_id}] failed at this call; its log says why")
         if not call.answered:
             self._timer = self._loop.call_at(deadline, self._timed_out, call)
@@ -370,21 +362,21 @@ class _ClientConnection:
             f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
             f"{limits.SERVICE_MESSAGE_MAX}"
         )
-        _log.warning("! %s: a %s", printable(self.caller_id), text)
+        _log.warning("! %s: a %s", tcpros.printable(self.caller_id), text)
         self._discard = size
         self._respond(False, text.encode())
         self._watch(self._connection.bytes_in)
 
     # --- replies ----------------------------------------------------------------------------------------------
 
-    def _respond(self, ok: bool, body: Buffer) -> None:
+    def _respond(self, ok: bool, body: tcpros.Buffer) -> None:
         self._stop_timer()
         if ok and len(body) > limits.SERVICE_MESSAGE_MAX:
             ok, size = False, len(body)
             text = f"response of {size} bytes of service [{self._endpoint.service}] exceeds the limit of "
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
-        head, body = frame_reply(ok, body)
+        head, body = tcpros.frame_reply(ok, body)
         if len(body) > INLINE:
             # A view may be valid during this call only.
             self._send(head, bytes(body) if isinstance(body, memoryview) else body)
@@ -395,10 +387,10 @@ class _ClientConnection:
         else:
             self._proceed()
 
-    def _send(self, head: bytes = b"", body: Buffer = b"") -> None:
+    def _send(self, head: bytes = b"", body: tcpros.Buffer = b"") -> None:
         self._sending = self._loop.create_task(self._finish(head, body), name="service response")
 
-    async def _finish(self, head: bytes, body: Buffer) -> None:
+    async def _finish(self, head: bytes, body: tcpros.Buffer) -> None:
         """Send a large reply, if there is one; once all is sent close, or go on with the next request."""
         try:
             if head:
@@ -430,9 +422,9 @@ class _ClientConnection:
     # --- the end ----------------------------------------------------------------------------------------------
 
     def _watch(self, seen: int) -> None:
-        """Close the connection if no bytes arrive within ``limits.SERVICE_STALL`` seconds."""
+        """Close the connection if no bytes arrive within ``SERVICE_STALL`` seconds."""
         self._stop_timer()
-        self._timer = self._loop.call_later(limits.SERVICE_STALL, self._stalled, seen)
+        self._timer = self._loop.call_later(SERVICE_STALL, self._stalled, seen)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
@@ -443,13 +435,13 @@ class _ClientConnection:
         if self._connection.bytes_in != seen:
             self._watch(self._connection.bytes_in)
             return
-        who = printable(self.caller_id)
-        _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
+        who = tcpros.printable(self.caller_id)
+        _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, SERVICE_STALL)
         self.close()
 
     def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
-            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self.caller_id), error)
+            _log.warning("! %s: %s: %s", self._endpoint.service, tcpros.printable(self.caller_id), error)
         self._release()
 
     def _release(self) -> None:

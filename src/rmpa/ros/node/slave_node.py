@@ -69,6 +69,9 @@ class SlaveNode:
         on_param_update: ``(key, value) -> whether the node subscribed to that key``.
         on_kill: ``(caller id, reason) -> reply``: awaited after ``on_shutdown`` for the answer to ``shutdown``.
         taps: The owner's own connections to publishers, for ``getBusInfo`` and ``getBusStats``.
+
+    Attributes:
+        uri: The slave API's URI, ``http://host:port/``; empty before ``start()``.
     """
 
     # More than 12 fields: the tables of topics and services, the two servers, and the callbacks of the Slave API.
@@ -90,7 +93,6 @@ class SlaveNode:
         self.name = name
         self.master_uri = master_uri
         self.uri = ""
-        """The slave API's URI, ``http://host:port/``; empty before ``start()``."""
         self.counters = counters if counters is not None else Counters()
         self._host = host
         self._listener = listener

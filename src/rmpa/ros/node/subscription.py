@@ -37,6 +37,11 @@ if TYPE_CHECKING:
     Attach = Callable[["InProcessConnection"], None]
 
 _log = logging.getLogger(__name__)
+
+# Pause before the second attempt to reach a publisher; roscpp's own value.
+TCPROS_RETRY_FIRST: Final = 0.1
+# The longest pause between attempts, while the graph lists the publisher.
+TCPROS_RETRY_MAX: Final = 2.0
 _PORT_MAX: Final = 65535
 
 
@@ -86,12 +91,17 @@ class TopicConnection:
         nodelay: Whether to ask for TCP_NODELAY on the publisher's side.
         number: The connection's number within the node, for ``getBusInfo``.
         find: Returns ``Publication.attach`` while there is one at that address, if it is one of this process.
+
+    Attributes:
+        info: The addresses, in the form of ``rosnode info``.
+        malformed: Whether the last connection ended because the publisher broke the protocol.
+        request: The subscriber's header.
+        fields: The publisher's reply header; empty while there is no connection.
+        refused: Why the publisher refused or does not match; ``None`` while it has not refused.
     """
 
     info = ""
-    """The addresses, in the form of ``rosnode info``."""
     malformed = False
-    """Whether the last connection ended because the publisher broke the protocol."""
 
     # More than 12 fields: the counts of ``getBusStats``, and a callback for each thing that happens to a connection.
     def __init__(
@@ -119,12 +129,9 @@ class TopicConnection:
         self.request = subscriber_header(
             topic, caller_id, type_name=type_name, md5sum=md5sum, definition=definition, nodelay=nodelay
         )
-        """The subscriber's header."""
         self.fields: Header = {}
-        """The publisher's reply header; empty while there is no connection."""
         self.messages = self.bytes = self.oversized = 0
         self.refused: str | None = None
-        """Why the publisher refused or does not match; ``None`` while it has not refused."""
         self._on_message = on_message
         self._parts = on_parts
         self._on_header = on_header
@@ -132,9 +139,9 @@ class TopicConnection:
         self._on_lost = on_lost
         self._on_oversized = on_oversized
         self._find = find
+        # Bytes to come of a message that is taken in parts.
         self._left = 0
-        """Bytes to come of a message that is taken in parts."""
-        self._backoff = Backoff(limits.TCPROS_RETRY_FIRST, limits.TCPROS_RETRY_MAX, random.random)
+        self._backoff = Backoff(TCPROS_RETRY_FIRST, TCPROS_RETRY_MAX, random.random)
         self._closed = False
 
     @property
@@ -164,8 +171,8 @@ class PublisherConnection(TopicConnection):
     _task: asyncio.Task[None] | None = None
     _ended: asyncio.Future[Exception | None]
     _handshake: asyncio.Timeout
+    # Whether the message in progress is too long, and dropped.
     _skips = False
-    """Whether the message in progress is too long, and dropped."""
 
     def start(self) -> None:
         """Connect, in a task of its own."""
@@ -189,7 +196,7 @@ class PublisherConnection(TopicConnection):
                 return
             _log.debug("< %s: lost publisher %s: %s", self.topic, self.uri, reason)
             self._on_lost(reason)
-            if loop.time() - began > limits.TCPROS_RETRY_MAX:
+            if loop.time() - began > TCPROS_RETRY_MAX:
                 self._backoff.reset()
             await asyncio.sleep(self._backoff.delay())
 
@@ -318,6 +325,9 @@ class InProcessConnection(TopicConnection):
     A relay or a gateway subscribes to its own proxies. Each message goes from the publication to the subscriber by a
     call, while it is received: nothing is copied, and no queue is between them. The publication uses it as it uses
     an ``AcceptedConnection``.
+
+    Attributes:
+        closed: Whether no publication has the connection.
     """
 
     peer: Final = ("in this process", 0)
@@ -325,10 +335,9 @@ class InProcessConnection(TopicConnection):
     dropped: Final = 0
     pending_bytes: Final = 0
     closed = True
-    """Whether no publication has the connection."""
     since = 0
+    # What has come of a message in parts, for a subscriber that takes it whole.
     _whole: bytearray | None = None
-    """What has come of a message in parts, for a subscriber that takes it whole."""
     _next: asyncio.Handle | None = None
 
     on_end: Callable[[InProcessConnection, Exception | None], None]

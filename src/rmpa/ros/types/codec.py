@@ -18,15 +18,33 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
-from rmpa.core.limits import UINT32_MAX
-from rmpa.ros import limits
+from rmpa.core.limits import MIB, UINT32_MAX
 from rmpa.ros.types.definitions import DefinitionError, parse_definition
-from rmpa.ros.types.messages import MessageError
+from rmpa.ros.types.messages import MessageError, shown
 
 if TYPE_CHECKING:
     from rmpa.ros.types.definitions import Field, Specification
     from rmpa.ros.types.messages import MessageType
 
+# Bytes of a message that is written from values.
+WRITTEN_MAX: Final = 64 * MIB
+
+# Compiled types in the cache of the process; a module has some 50 types. The least recently used is dropped.
+_CODECS_MAX: Final = 512
+# Values that a message without elements in its arrays of any length has; a covariance has 36, a type rarely 200.
+_TYPE_VALUES_MAX: Final = 100_000
+# Bytes of the smallest message of a type: it has fixed arrays of this size together.
+_TYPE_SIZE_MAX: Final = 16 * MIB
+# Values read for each byte of a message: messages within arrays that have no bytes could be any number.
+_VALUES_PER_BYTE: Final = 16
+# Values that any message may have besides those for its bytes.
+_VALUES_FREE: Final = 10_000
+# Numbers of an embedded message that are read in one step with those around it.
+_INLINE_MAX: Final = 64
+# Fields that were not given and are named to the client.
+_MISSING_NAMED: Final = 8
+
+# The ``struct`` code of each number.
 CODES: Final = {
     "bool": "?",
     "int8": "b",
@@ -42,22 +60,22 @@ CODES: Final = {
     "float32": "f",
     "float64": "d",
 }
-"""The ``struct`` code of each number."""
 SIZES: Final = {kind: struct.calcsize(f"<{code}") for kind, code in CODES.items()}
 TIMES: Final = {"time": "II", "duration": "ii"}
+# Bytes of the default of each primitive.
 _DEFAULTS: Final = {**SIZES, "string": 4, "time": 8, "duration": 8}
-"""Bytes of the default of each primitive."""
+# Little-endian typed arrays (RFC 8746), by ``struct`` code.
 _TAGS: Final = {"H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
-"""Little-endian typed arrays (RFC 8746), by ``struct`` code."""
 _TAG_CODES: Final = {tag: code for code, tag in _TAGS.items()} | {64: "B"}
 _HEADER: Final = "std_msgs/Header"
+_SHORT: Final = "they end too early"
 _LENGTH: Final = struct.Struct("<I")
 _TIME_KEYS: Final = {"secs": 0, "nsecs": 1, "sec": 0, "nanosec": 1}
 
 Values: TypeAlias = dict[str, Any]
+# Reads a message. It raises ``MessageError`` for bytes that are not one; strings that are not UTF-8 have U+FFFD in
+# place of the wrong bytes, since JSON and CBOR have text only.
 Read: TypeAlias = Callable[[memoryview], Values]
-"""Reads a message. It raises ``MessageError`` for bytes that are not one; strings that are not UTF-8 have U+FFFD in
-place of the wrong bytes, since JSON and CBOR have text only."""
 _Write: TypeAlias = Callable[[Any, "Written"], None]
 
 
@@ -66,6 +84,9 @@ class Written:
 
     Args:
         now_ns: The present time (UTC) in nanoseconds, for stamps that are not given and for ``"now"``.
+
+    Attributes:
+        missing: The first fields that were not given; a header and its fields do not count.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -73,7 +94,6 @@ class Written:
         self.now = {"secs": max(0, min(seconds, UINT32_MAX)), "nsecs": nanoseconds}
         self.out = bytearray()
         self.missing: list[str] = []
-        """The first fields that were not given; a header and its fields do not count."""
 
     @property
     def payload(self) -> bytes:
@@ -114,9 +134,9 @@ class MessageCodec:
         self._measures: dict[str, tuple[int, int, bool]] = {}
         self._writers: dict[str, _Write] = {}
         values, size, _ = self.measure(name)
-        if values > limits.TYPE_VALUES_MAX or size > limits.TYPE_SIZE_MAX:
+        if values > _TYPE_VALUES_MAX or size > _TYPE_SIZE_MAX:
             problem = f"has {values} values and {size} bytes at least"
-            remedy = f"up to {limits.TYPE_VALUES_MAX} values and {limits.TYPE_SIZE_MAX} bytes are converted"
+            remedy = f"up to {_TYPE_VALUES_MAX} values and {_TYPE_SIZE_MAX} bytes are converted"
             raise DefinitionError(name, problem, f"{remedy}; subscribe with cbor-raw")
 
     def measure(self, name: str) -> tuple[int, int, bool]:
@@ -133,7 +153,7 @@ class MessageCodec:
                 values += 1 if field.primitive else count * inner[0]
                 size += count * inner[1]
                 flat = flat and inner[2] and not field.array
-            self._measures[name] = values, size, flat and size > 0 and values <= limits.INLINE_MAX
+            self._measures[name] = values, size, flat and size > 0 and values <= _INLINE_MAX
         return self._measures[name]
 
     def item_size(self, kind: str) -> int:
@@ -168,17 +188,17 @@ class MessageCodec:
         return self._reader(_cast)
 
     def _reader(self, array: Callable[[memoryview, str], Any]) -> Read:
-        names: dict[str, Any] = {**_FUNCTIONS, "_array": array}
+        names: dict[str, Any] = {"_slice": _slice, "_strings": _strings, "_charge": _charge, "_array": array}
         text = _ReaderText(self, names).text()
         exec(compile(text, f"<reader of {self.name}>", "exec"), names)  # noqa: S102 - see the module's docstring
         read = names["read_0"]
-        spare = limits.VALUES_FREE + self.measure(self.name)[0]
+        spare = _VALUES_FREE + self.measure(self.name)[0]
 
         def convert(payload: memoryview) -> Values:
             size = len(payload)
             try:
                 values: Values
-                values, at = read(payload, 0, [spare + limits.VALUES_PER_BYTE * size])
+                values, at = read(payload, 0, [spare + _VALUES_PER_BYTE * size])
                 if at == size:
                     return values
                 problem = f"{size - at} are left over"
@@ -249,13 +269,13 @@ class MessageCodec:
                         write_field(filled, written)
                     else:
                         written.out += bytes(default)
-                        if name != _HEADER and len(written.missing) < limits.MISSING_NAMED:
+                        if name != _HEADER and len(written.missing) < _MISSING_NAMED:
                             written.missing.append(label)
             except _WrongValueError as error:
                 error.path.append(label)
                 raise
-            if len(written.out) > limits.WRITTEN_MAX:
-                raise _WrongValueError(f"the message is longer than {limits.WRITTEN_MAX} bytes")
+            if len(written.out) > WRITTEN_MAX:
+                raise _WrongValueError(f"the message is longer than {WRITTEN_MAX} bytes")
 
         return write
 
@@ -298,19 +318,16 @@ class MessageCodec:
 
 
 def codec_for(kind: MessageType) -> MessageCodec:
-    """The codec of a type; the last ``limits.CODECS_MAX`` are kept. Errors as for ``MessageCodec``."""
+    """The codec of a type; the last ``_CODECS_MAX`` are kept. Errors as for ``MessageCodec``."""
     return _codec(kind.name, kind.definition)
 
 
-@functools.lru_cache(maxsize=limits.CODECS_MAX)
+@functools.lru_cache(maxsize=_CODECS_MAX)
 def _codec(name: str, definition: str) -> MessageCodec:
     return MessageCodec(name, parse_definition(name, definition))
 
 
 # --- what generated readers call ----------------------------------------------------------------------------------
-
-
-_SHORT: Final = "they end too early"
 
 
 def _slice(buf: memoryview, at: int, size: int) -> memoryview:
@@ -342,9 +359,6 @@ def _charge(left: list[int], values: int) -> None:
     left[0] -= values
     if left[0] < 0:
         raise _MalformedError("they claim too many values")
-
-
-_FUNCTIONS: Final = {each.__name__: each for each in (_slice, _strings, _charge)}
 
 
 class _ReaderText:
@@ -446,22 +460,6 @@ class _ReaderText:
 
 
 # --- what writers are made of -------------------------------------------------------------------------------------
-
-
-def shown(value: object) -> str:
-    """A wrong value for an error, shortened; never the whole of a large one."""
-    if isinstance(value, Mapping):
-        return f"an object of {len(value)} fields"
-    if isinstance(value, list | tuple):
-        return f"a list of {len(value)}"
-    if isinstance(value, bytes | bytearray | memoryview):
-        return f"{len(value)} bytes"
-    if isinstance(value, int) and value.bit_length() > 256:  # str() of a huge one is slow or refused
-        return f"an integer of {value.bit_length()} bits"
-    if isinstance(value, str):
-        cut = value[: limits.SHOWN].encode("utf-8", "backslashreplace").decode()
-        return repr(cut) if len(value) <= limits.SHOWN else f"{cut!r}…"
-    return type(value).__name__ if hasattr(value, "tag") else repr(value)[: limits.SHOWN]
 
 
 def _list(field: Field, values: Any) -> Sequence[Any]:

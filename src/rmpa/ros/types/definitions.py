@@ -52,10 +52,14 @@ class DefinitionError(RmpaError):
 
 @dataclass
 class UnknownTypeError(DefinitionError):
-    """No definition of a type was found."""
+    """No definition of a type was found.
+
+    Attributes:
+        fetchable: Whether a publisher may supply the definition; ``False`` if rmpa brings the other types of its
+            package.
+    """
 
     fetchable: bool = True
-    """Whether a publisher may supply the definition; ``False`` if rmpa brings the other types of its package."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,16 +19,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.ros import limits
-from rmpa.ros.types.definitions import (
-    DefinitionError,
-    Specification,
-    UnknownTypeError,
-    complete,
-    full_text,
-    known_text,
-    known_types,
-    parse_definition,
-)
+from rmpa.ros.types import definitions
 from rmpa.ros.types.installed import (
     SearchPath,
     ServiceType,
@@ -45,9 +36,12 @@ if TYPE_CHECKING:
 
     from rmpa.ros.types.installed import Found
 
+# Time before an unknown type is searched for again: each message asks for it, and a search takes some 50 ms.
+TYPE_MISSING: Final = 10.0
+
 _Type = TypeVar("_Type", MessageType, ServiceType)
+# The md5 sum of a message without fields, for which publishers send an empty definition.
 EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"
-"""The md5 sum of a message without fields, for which publishers send an empty definition."""
 _REMEDIES: Final = {
     "msg": "source the workspace that has it, or let a node that publishes it run, here or at a peer",
     "srv": "source the workspace that has it; no server sends its definition",
@@ -97,8 +91,8 @@ def _search(
                 return made
             text = f"has the md5 sum {made.md5sum} here ({made.source or 'it comes with rmpa'}), and {md5} there"
             remedy = "source the workspace that the node over there was built in"
-            problem = problem or DefinitionError(name, text, remedy)
-        if problem is not None and (fresh or not isinstance(problem, UnknownTypeError)):
+            problem = problem or definitions.DefinitionError(name, text, remedy)
+        if problem is not None and (fresh or not isinstance(problem, definitions.UnknownTypeError)):
             raise problem
         if fresh:
             return _unknown(name, path, kind)
@@ -109,7 +103,7 @@ def _search(
 def _versions(kind: str, name: str, path: SearchPath) -> Iterator[Found | None]:
     """The versions of a type, best first; ``None`` is the one that rmpa brings."""
     yield from find_definitions(kind, name, path, sourced=True)
-    if name in (known_types() if kind == "msg" else known_services()):
+    if name in (definitions.known_types() if kind == "msg" else known_services()):
         yield None
     yield from find_definitions(kind, name, path, sourced=False)
 
@@ -118,10 +112,10 @@ def _message(name: str, found: Found | None, path: SearchPath) -> MessageType:
     if found is None:
         return MessageType(name)
     text, embedded, where = found
-    known = {name: Specification.parse(name, text)}
+    known = {name: definitions.Specification.parse(name, text)}
     _complete(name, known, embedded, path, "message type")
-    made = _built_message(name, full_text(name, known), str(where))
-    if known_text(name) is not None and (ours := MessageType(name)).md5sum == made.md5sum:
+    made = _built_message(name, definitions.full_text(name, known), str(where))
+    if definitions.known_text(name) is not None and (ours := MessageType(name)).md5sum == made.md5sum:
         return ours  # its serialization code may be generated already
     return made
 
@@ -139,7 +133,7 @@ def _service(name: str, found: Found | None, path: SearchPath) -> ServiceType:
 # Types are cached by their text, with their serialization code, which takes some 10 ms to generate.
 @functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
 def _built_message(name: str, definition: str, source: str) -> MessageType:
-    return MessageType(name, parse_definition(name, definition), source)
+    return MessageType(name, definitions.parse_definition(name, definition), source)
 
 
 @functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
@@ -150,7 +144,7 @@ def _built_service(
 
 
 def _complete(
-    name: str, known: dict[str, Specification], embedded: Mapping[str, str], path: SearchPath, what: str
+    name: str, known: dict[str, definitions.Specification], embedded: Mapping[str, str], path: SearchPath, what: str
 ) -> None:
     """Add all types that a found definition embeds: those of its file, else as found by their names."""
 
@@ -158,13 +152,15 @@ def _complete(
         if inner in embedded:
             return embedded[inner]
         for found in _versions("msg", inner, path):
-            return found[0] if found is not None else known_text(inner)
+            return found[0] if found is not None else definitions.known_text(inner)
         return _unknown(inner, path, "msg")
 
     try:
-        complete(known, find)
-    except UnknownTypeError as error:
-        raise UnknownTypeError(name, f"embeds {error.type}, which {error.problem}", error.remedy, what) from None
+        definitions.complete(known, find)
+    except definitions.UnknownTypeError as error:
+        raise definitions.UnknownTypeError(
+            name, f"embeds {error.type}, which {error.problem}", error.remedy, what
+        ) from None
 
 
 def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
@@ -181,9 +177,9 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
     """
     what = "message type" if kind == "msg" else "service type"
     if not is_type_name(name):
-        raise DefinitionError(name[:80], "is not a type's name", "write it like std_msgs/String", what)
+        raise definitions.DefinitionError(name[:80], "is not a type's name", "write it like std_msgs/String", what)
     package, _, base = name.partition("/")
-    ours = known_types() if kind == "msg" else known_services()
+    ours = definitions.known_types() if kind == "msg" else known_services()
     siblings = {each for each in ours if each.startswith(f"{package}/")}
     folders, names = definitions_of(package, path, kind)
     if folders:
@@ -196,14 +192,14 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
     near = did_you_mean(name, there or [each for each in ours if each.endswith(f"/{base}")])
     remedy = (f"did you mean {near}? Else " if near else "") + _REMEDIES[kind]
     problem += f"; looked in {path}, and at what comes with rmpa"
-    raise UnknownTypeError(name, problem, remedy, what, fetchable=not siblings)
+    raise definitions.UnknownTypeError(name, problem, remedy, what, fetchable=not siblings)
 
 
 # Finds the message type of a connection header; results are cached, so it can be called for each message.
 
 
+# Types that were not found: the time of the search (monotonic seconds) and the error; the oldest first.
 _missing: OrderedDict[tuple[str, str, SearchPath], tuple[float, RmpaError]] = OrderedDict()
-"""Types that were not found: the time of the search (monotonic seconds) and the error; the oldest first."""
 _missing_lock: Final = threading.Lock()
 
 
@@ -217,7 +213,7 @@ def type_of_header(fields: Mapping[str, str]) -> MessageType:
     """The message type of a publisher's connection header: from its definition, else as found on this machine.
 
     May be called for each message: results are cached, and a failed search is not repeated within
-    ``limits.TYPE_MISSING`` seconds.
+    ``TYPE_MISSING`` seconds.
 
     Raises:
         DefinitionError: As for ``MessageType.learn`` and ``find_message_type``.
@@ -229,7 +225,7 @@ def type_of_header(fields: Mapping[str, str]) -> MessageType:
     key = name, md5, SearchPath.read(os.environ)
     with _missing_lock:
         when, error = _missing.get(key, (0.0, None))
-    if error is not None and monotonic() - when < limits.TYPE_MISSING:
+    if error is not None and monotonic() - when < TYPE_MISSING:
         raise error.with_traceback(None)  # the traceback would grow with each message
     try:
         return _with_sum(*key)

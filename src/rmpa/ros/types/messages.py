@@ -32,17 +32,20 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
+# Message types from publishers' headers in the cache of a process; the least recently used is dropped.
+_RECEIVED_TYPES_MAX: Final = 256
+
+# A value of YAML or JSON.
 Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, list["Plain"], dict[str, "Plain"], None
 ]
-"""A value of YAML or JSON."""
 
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _NANO: Final = 1_000_000_000
 _SEQ: Final = struct.Struct("<I")
 _FLOATS: Final = frozenset(("float32", "float64"))
+# Characters of a wrong value in an error.
 _SHOWN: Final = 80
-"""Characters of a wrong value in an error."""
 _DTYPES: Final = {"bool": "bool_", "byte": "int8", "char": "uint8"}
 
 
@@ -70,13 +73,12 @@ class MessageType:
         self.source = source
         self._learnt = specifications is not None
         self.specifications = specifications if specifications is not None else known_specifications(name)
-        """The type and all that it embeds, by name."""
         self.md5sum = md5sum(name, self.specifications)
         self.definition = full_text(name, self.specifications)
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
-        """Make a type from its publisher's header; the last ``limits.RECEIVED_TYPES_MAX`` types are cached.
+        """Make a type from its publisher's header; the last ``_RECEIVED_TYPES_MAX`` types are cached.
 
         Args:
             name: ``package/Name``.
@@ -277,12 +279,12 @@ class HeaderNumbers:
         return b"".join((_SEQ.pack(number & UINT32_MAX), memoryview(payload)[_SEQ.size :]))
 
 
+# The integers of each type; of times the seconds, and the nanoseconds likewise.
 _RANGES: Final = {
     f"{sign}int{bits}": (0, (1 << bits) - 1) if sign else (-(1 << bits - 1), (1 << bits - 1) - 1)
     for sign in ("u", "")
     for bits in (8, 16, 32, 64)
 } | {"byte": (-128, 127), "char": (0, 255), "time": (0, (1 << 32) - 1), "duration": (-(1 << 31), (1 << 31) - 1)}
-"""The integers of each type; of times the seconds, and the nanoseconds likewise."""
 _FLOAT32: Final = struct.Struct("<f").pack
 
 
@@ -375,6 +377,22 @@ def _numbers(field: Field, values: list[object] | None, count: int) -> object:
     return np.zeros(count, dtype) if values is None else np.array(values, dtype)
 
 
+def shown(value: object) -> str:
+    """A wrong value for an error, shortened; never the whole of a large one."""
+    if isinstance(value, Mapping):
+        return f"an object of {len(value)} fields"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"{len(value)} bytes"
+    if isinstance(value, int) and value.bit_length() > 256:  # str() of a huge one is slow or refused
+        return f"an integer of {value.bit_length()} bits"
+    if isinstance(value, str):
+        cut = value[: limits.SHOWN].encode("utf-8", "backslashreplace").decode()
+        return repr(cut) if len(value) <= limits.SHOWN else f"{cut!r}…"
+    return type(value).__name__ if hasattr(value, "tag") else repr(value)[: limits.SHOWN]
+
+
 def _short(value: object) -> str:
     try:
         text = repr(value)
@@ -426,7 +444,7 @@ def _known_store() -> Typestore:
     return Ros1Store(Stores.ROS1_NOETIC)
 
 
-@functools.lru_cache(maxsize=limits.RECEIVED_TYPES_MAX)
+@functools.lru_cache(maxsize=_RECEIVED_TYPES_MAX)
 def _learn(name: str, definition: str) -> MessageType:
     return MessageType(name, parse_definition(name, definition))
 

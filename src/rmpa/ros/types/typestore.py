@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 _BYTE: Final = (Nodetype.BASE, ("byte", 0))
 _INT8: Final[FieldDesc] = (Nodetype.BASE, ("int8", 0))
+# What the two fields of a time are.
 _TIMES: Final[dict[str, FieldDesc]] = {
     "builtin_interfaces/msg/Time": (Nodetype.BASE, ("uint32", 0)),
     "builtin_interfaces/msg/Duration": (Nodetype.BASE, ("int32", 0)),
 }
-"""What the two fields of a time are."""
 
 
 class Ros1Store(Typestore):

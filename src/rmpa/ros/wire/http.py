@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
     from rmpa.ros.wire.tcpros import Buffer
 
+# All headers of one request.
+HTTP_HEADERS_MAX: Final = 64 * KIB
+
 _REASONS: Final = {
     200: b"OK",
     400: b"Bad Request",
@@ -33,8 +36,8 @@ CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
 
 _METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
 _TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
+# Bytes of a refused call that are kept, to name the call in the fault.
 _BEGIN: Final = 4 * KIB
-"""Bytes of a refused call that are kept, to name the call in the fault."""
 
 
 class CallBody:
@@ -170,8 +173,8 @@ class RequestParser:
         self._found: list[HttpRequest | HttpRefusal] = []
         self._refused = False
         self._headers: dict[bytes, bytes] = {}
+        # Bytes since the last body data or end of a request: of headers, trailers and the lines between chunks.
         self._without_body = 0
-        """Bytes since the last body data or end of a request: of headers, trailers and the lines between chunks."""
         self._progress = False
 
     def feed(self, data: Buffer) -> list[HttpRequest | HttpRefusal]:
@@ -189,8 +192,8 @@ class RequestParser:
         except HttpParserError as error:
             self._refuse(400, str(error), "http.malformed")
         self._without_body = 0 if self._progress else self._without_body + len(data)
-        if self._without_body > limits.HTTP_HEADERS_MAX:
-            self._refuse(431, f"headers of more than {limits.HTTP_HEADERS_MAX} bytes", "http.malformed")
+        if self._without_body > HTTP_HEADERS_MAX:
+            self._refuse(431, f"headers of more than {HTTP_HEADERS_MAX} bytes", "http.malformed")
         found, self._found = self._found, []
         return found
 
@@ -273,8 +276,8 @@ class ResponseParser:
         self._parser: HttpResponseParser | None = HttpResponseParser(self)
         self._body = bytearray()
         self._complete = self._has_length = False
+        # Whether the body ends with the connection: it has neither a length nor chunks.
         self._until_close = False
-        """Whether the body ends with the connection: it has neither a length nor chunks."""
 
     def feed(self, data: bytes) -> bytes | None:
         """Take the next bytes, or empty ones at the end of the connection; return the body once it is complete.

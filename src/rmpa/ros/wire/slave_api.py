@@ -51,6 +51,7 @@ class BusConnection:
     waiting: int = 0
 
 
+# By method: the number of parameters after the caller id, and the value in an error's reply.
 METHODS: Final[Mapping[str, tuple[int, XmlRpcValue]]] = {
     "getBusStats": (0, []),
     "getBusInfo": (0, []),
@@ -65,7 +66,6 @@ METHODS: Final[Mapping[str, tuple[int, XmlRpcValue]]] = {
     "getName": (0, ""),
     "getUri": (0, ""),
 }
-"""By method: the number of parameters after the caller id, and the value in an error's reply."""
 
 
 def check_call(method: str, params: Sequence[XmlRpcValue]) -> str | None:
@@ -128,10 +128,10 @@ def bus_info(connections: Iterable[BusConnection]) -> list[XmlRpcValue]:
 # out, and so is what is unknown in one that can: a node may be of any library.
 
 
+# ``TCPROS connection on port 46087 to [10.0.0.1:45225 on socket 12]``; the socket is not always named.
 _INFO: Final = re.compile(r"on port ([0-9]{1,5}) to \[([^\s\[\]]+):([0-9]{1,5})(?: on socket \w+)?\]")
-"""``TCPROS connection on port 46087 to [10.0.0.1:45225 on socket 12]``; the socket is not always named."""
+# How rospy's text begins for a connection that has ended; the row says that it is connected all the same.
 _CLOSED: Final = "Closed "
-"""How rospy's text begins for a connection that has ended; the row says that it is connected all the same."""
 _PORT_MAX: Final = 65535
 
 

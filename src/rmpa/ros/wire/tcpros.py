@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 # each length before it stores anything.
 
 
+# The fields of a connection header. Bytes that are not UTF-8 are kept as lone surrogates (PEP 383).
 Header = dict[str, str]
-"""The fields of a connection header. Bytes that are not UTF-8 are kept as lone surrogates (PEP 383)."""
 
 Buffer = bytes | bytearray | memoryview
 
+# The length in front of headers, fields and messages.
 LENGTH: Final = struct.Struct("<I")
-"""The length in front of headers, fields and messages."""
+# The type or md5 sum of a subscriber that accepts any type.
 ANY: Final = "*"
-"""The type or md5 sum of a subscriber that accepts any type."""
 _SHOWN: Final = 200
 
 
@@ -307,8 +307,8 @@ def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str
     return None
 
 
+# The head of a reply: the ``ok`` byte and the length of the body.
 REPLY: Final = struct.Struct("<BI")
-"""The head of a reply: the ``ok`` byte and the length of the body."""
 _SCHEME: Final = "rosrpc://"
 _TRUE: Final = ("1", "true")
 

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 # XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
 _ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+# Scalars in one piece: some 50 microseconds.
 _PIECE: Final = 128
-"""Scalars in one piece: some 50 microseconds."""
+# Characters of a long string, or bytes of binary data, in one piece; base64 has 57 bytes in a line.
 _SLICE: Final = 57 * 128
-"""Characters of a long string, or bytes of binary data, in one piece; base64 has 57 bytes in a line."""
 
 
 def legal_text(text: str) -> str:
@@ -145,6 +145,7 @@ def _datetime(value: datetime) -> Iterable[str]:
     return (f"<value><dateTime.iso8601>{value.year:04d}{value:%m%dT%H:%M:%S}</dateTime.iso8601></value>\n",)
 
 
+# Writers of the types other than list and dict.
 _SCALARS: Final[dict[type, Callable[..., Iterable[str]]]] = {
     bool: lambda value: (f"<value><boolean>{value:d}</boolean></value>\n",),
     int: _int,
@@ -154,13 +155,12 @@ _SCALARS: Final[dict[type, Callable[..., Iterable[str]]]] = {
     bytearray: _base64,
     datetime: _datetime,
 }
-"""Writers of the types other than list and dict."""
 
 
+# A value of XML-RPC. Parsed containers are lists and dicts; ``None`` is read, never written.
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None
 ]
-"""A value of XML-RPC. Parsed containers are lists and dicts; ``None`` is read, never written."""
 
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
 
@@ -349,6 +349,7 @@ class DocumentReader:
             raise
 
 
+# What the parsers raise for malformed documents, with the text of our error.
 _MALFORMED: Final[Sequence[tuple[type[Exception] | tuple[type[Exception], ...], str]]] = (
     (DefusedXmlException, "XML declares entities, which XML-RPC has no use for: {}"),
     (ExpatError, "malformed XML: {}"),
@@ -356,7 +357,6 @@ _MALFORMED: Final[Sequence[tuple[type[Exception] | tuple[type[Exception], ...], 
     # The standard unmarshaller has no error of its own for elements in the wrong order or bad content.
     ((ArithmeticError, AttributeError, LookupError, TypeError, ValueError), "malformed XML-RPC value: {}"),
 )
-"""What the parsers raise for malformed documents, with the text of our error."""
 
 
 def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:

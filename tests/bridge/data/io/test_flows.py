@@ -19,6 +19,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
+from rmpa.mesh.reliable import ACK_DELAY
 from rmpa.ros import limits as ros_limits
 from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, running
@@ -695,10 +696,10 @@ def test_acknowledged_are_many_at_once_or_a_few_soon(clock: Clock) -> None:
     assert inlet.acks == [mesh_limits.ACK_MESSAGES], "a full batch"
     assert clock.due == []
     inlet.message(mesh_limits.ACK_MESSAGES + 1)
-    clock.advance(mesh_limits.ACK_DELAY / 2)
+    clock.advance(ACK_DELAY / 2)
     inlet.message(mesh_limits.ACK_MESSAGES + 2)
     assert len(inlet.acks) == 1
-    clock.advance(mesh_limits.ACK_DELAY / 2)
+    clock.advance(ACK_DELAY / 2)
     assert inlet.acks[1:] == [mesh_limits.ACK_MESSAGES + 2]
     clock.advance(1.0)
     assert len(inlet.acks) == 2, "once"
@@ -729,7 +730,7 @@ def test_torn_reliable_message_is_delivered_whole(clock: Clock) -> None:
     inlet.message(3, b"three")
     assert inlet.got == [b"one", b"2" * BIG, b"three"]
     assert inlet.counts == (0, 1, 0, 0)
-    clock.advance(mesh_limits.ACK_DELAY)
+    clock.advance(ACK_DELAY)
     assert inlet.acks == [3]
 
 
@@ -762,7 +763,7 @@ def test_reliable_messages_survive_an_outage_within_their_lifespan(clock: Clock)
         inlet.parts(4, bytes(BIG), 50, stamp_ns=clock.wall_ns() - 7 * 10**9)
         assert len(inlet.got) == delivered
         assert inlet.counts == (0, 0, 0, 4 - delivered)
-        clock.advance(mesh_limits.ACK_DELAY)
+        clock.advance(ACK_DELAY)
         assert inlet.acks == [4], "what is too old has arrived all the same"
         inlet.flow.close()
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from rmpa.bridge.data.export import ExportFlow, ReliableRouteSender, RouteSender
+from rmpa.bridge.data.export import BULK_STALE_AGE, ExportFlow, ReliableRouteSender, RouteSender
 from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Reliability
 from rmpa.core.errors import RemoteProtocolError
@@ -148,7 +148,7 @@ def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     sender.fenced(number)
     sender.message(0, SMALL)
     assert link.numbers == list(range(1, ROW + 3))
-    assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.BULK_STALE_AGE, False), "they hold on"
+    assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, BULK_STALE_AGE, False), "they hold on"
 
 
 def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
@@ -164,13 +164,13 @@ def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
 @pytest.mark.parametrize(
     ("contract", "depth", "ages", "strict"),
     [
-        (Contract(), core_limits.ROUTE_QUEUE_MESSAGES, (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE), False),
-        (Contract(depth=3), 3, (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE), False),
+        (Contract(), core_limits.ROUTE_QUEUE_MESSAGES, (runtime_limits.STALE_AGE, BULK_STALE_AGE), False),
+        (Contract(depth=3), 3, (runtime_limits.STALE_AGE, BULK_STALE_AGE), False),
         (Contract(depth=3, lifespan=0.5), 3, (0.5, 0.5), True),
         (
             Contract(depth=3, history=History.KEEP_ALL),
             mesh_limits.KEEP_ALL_MESSAGES,
-            (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE),
+            (runtime_limits.STALE_AGE, BULK_STALE_AGE),
             False,
         ),
         (

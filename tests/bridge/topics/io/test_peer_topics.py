@@ -12,13 +12,12 @@ from rmpa.bridge import limits
 from rmpa.bridge.data.quality import QosEventKind
 from rmpa.bridge.messages import Description, RouteOpened, Source
 from rmpa.bridge.proxies import PeerProxies, ProxyNodes
-from rmpa.bridge.sessions import PeerSession
+from rmpa.bridge.sessions import AWAY_GRACE, PeerSession
 from rmpa.bridge.topics.imports import RemoteTopic
 from rmpa.bridge.topics.peer_topics import PeerTopic, PeerTopics
 from rmpa.core.contract import Contract, Durability, Reliability, Transport
 from rmpa.core.counters import Counters
 from rmpa.core.outbox import FIRST
-from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
 from tests.bridge.io.two_bridges import made_up
 from tests.bridge.io.virtual import VirtualLoop, run
@@ -349,7 +348,7 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once(silent: bool) -> Non
         proxied.topics.link_down()
         if silent:
             proxied.topics.detach(CMD, 1, keep=True)
-            await asyncio.sleep(mesh_limits.AWAY_GRACE)
+            await asyncio.sleep(AWAY_GRACE)
             assert proxied.occurred == []
         else:
             proxied.topics.detach(CMD, 1)
