@@ -288,19 +288,6 @@ async def test_what_tcp_kept_over_a_cut_is_dropped_where_commands_may_not_be_old
         await reading
 
 
-async def test_a_client_without_a_sign_of_life_is_disconnected(core: RosCore, monkeypatch: Any) -> None:
-    monkeypatch.setattr("rmpa.web.limits.PING_INTERVAL", 0.1)
-    async with running_server(core) as server, server.client() as alive:
-        reading = asyncio.ensure_future(alive.next("service_response"))  # answers pings while it reads
-        dead = await server.session.ws_connect(f"ws://127.0.0.1:{server.port}/", autoping=False)
-        await until(lambda: len(server.gateways.connections) == 2)
-        await until(lambda: len(server.gateways.connections) == 1)
-        await alive.send("call_service", service="/rosapi/get_time", id="1")
-        assert (await reading)["result"]
-        dead._response.close()
-        await dead.close()
-
-
 async def test_a_command_overtakes_the_images_that_wait(core: RosCore) -> None:
     payload = bytes(BYTES.serialize(BYTES.make({"data": [7] * 500_000})))
     priorities: list[str] = []

@@ -7,6 +7,7 @@ import functools
 import secrets
 import socket
 import threading
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
@@ -24,6 +25,7 @@ from tests.web.hub.client import local_core, node, running_hub
 from tests.web.snapshots import FULL
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from rmpa.observe.control import GraphRevision
@@ -186,6 +188,17 @@ def agent_of(place: Path, graph: Any) -> ControlServer:
     return ControlServer(place, "base", answers)
 
 
+@asynccontextmanager
+async def following(hub: Hub, place: Path, graph: Any) -> AsyncIterator[None]:
+    """An agent that answers questions about the graph so, and a server that follows it."""
+    server, changes = agent_of(place, graph), AgentFollower({"RMPA_RUNTIME_DIR": str(place)}, "base", fits)
+    await server.start()
+    changes.start(hub.graph)
+    yield
+    await changes.close()
+    await server.close()
+
+
 def _has_topic(hub: Hub, name: str) -> bool:
     return name in hub.graph.topics
 
@@ -213,11 +226,12 @@ async def test_a_new_topic_is_seen_by_the_agents_word_and_again_after_its_restar
 
 
 async def test_an_agent_that_tells_only_that_there_is_a_change_has_the_master_read(tmp_path: Path) -> None:
-    async with local_core() as core, running_hub(core) as hub, node(core, "talker") as talker:
-        server = agent_of(tmp_path, GraphRevisions(core, rows=False).after)
-        await server.start()
-        changes = AgentFollower({"RMPA_RUNTIME_DIR": str(tmp_path)}, "base", fits)
-        changes.start(hub.graph)
+    async with (
+        local_core() as core,
+        running_hub(core) as hub,
+        node(core, "talker") as talker,
+        following(hub, tmp_path, GraphRevisions(core, rows=False).after),
+    ):
         await until(lambda: hub.graph.told)
         reads = hub.graph.reads
         async with asyncio.timeout(DEADLINE):
@@ -225,8 +239,6 @@ async def test_an_agent_that_tells_only_that_there_is_a_change_has_the_master_re
             await until(functools.partial(_has_topic, hub, "/told"))
         assert hub.graph.reads > reads
         assert not hub.graph.taken
-        await changes.close()
-        await server.close()
 
 
 async def test_the_graph_of_another_core_is_not_taken(tmp_path: Path) -> None:
@@ -239,25 +251,20 @@ async def test_the_graph_of_another_core_is_not_taken(tmp_path: Path) -> None:
             asked.set()
             return await revisions.after(args)
 
-        server = agent_of(tmp_path, answer)
-        await server.start()
-        changes = AgentFollower({"RMPA_RUNTIME_DIR": str(tmp_path)}, "base", fits)
-        changes.start(hub.graph)
-        await asked.wait()
-        asked.clear()
-        await asked.wait()  # the first answer was refused, and the question is asked anew
-        assert not hub.graph.taken
-        assert "/strange" not in hub.graph.topics
-        await changes.close()
-        await server.close()
+        async with following(hub, tmp_path, answer):
+            await asked.wait()
+            asked.clear()
+            await asked.wait()  # the first answer was refused, and the question is asked anew
+            assert not hub.graph.taken
+            assert "/strange" not in hub.graph.topics
 
 
 async def test_a_master_that_goes_while_the_agent_tells_the_graph_is_noticed(tmp_path: Path) -> None:
-    async with local_core() as core, running_hub(core) as hub:
-        server = agent_of(tmp_path, GraphRevisions(core, rows=True).after)
-        await server.start()
-        changes = AgentFollower({"RMPA_RUNTIME_DIR": str(tmp_path)}, "base", fits)
-        changes.start(hub.graph)
+    async with (
+        local_core() as core,
+        running_hub(core) as hub,
+        following(hub, tmp_path, GraphRevisions(core, rows=True).after),
+    ):
         await until(lambda: hub.graph.taken)
         checked = asyncio.Event()
 
@@ -268,8 +275,6 @@ async def test_a_master_that_goes_while_the_agent_tells_the_graph_is_noticed(tmp
         await core.close()
         async with asyncio.timeout(DEADLINE):
             await checked.wait()
-        await changes.close()
-        await server.close()
 
 
 async def test_an_agent_that_does_not_know_the_question_is_no_error(tmp_path: Path) -> None:
@@ -279,18 +284,17 @@ async def test_an_agent_that_does_not_know_the_question_is_no_error(tmp_path: Pa
         asked.append(args)
         return "nothing"
 
-    async with local_core() as core, running_hub(core) as hub, node(core, "talker") as talker:
-        server = agent_of(tmp_path, refuse)
-        await server.start()
-        changes = AgentFollower({"RMPA_RUNTIME_DIR": str(tmp_path)}, "base", fits)
-        changes.start(hub.graph)
+    async with (
+        local_core() as core,
+        running_hub(core) as hub,
+        node(core, "talker") as talker,
+        following(hub, tmp_path, refuse),
+    ):
         await until(lambda: asked)
         await talker.advertise("/seen", LATCHED)
         hub.graph.active = True
         await until(lambda: "/seen" in hub.graph.topics)
         assert not hub.graph.told
-        await changes.close()
-        await server.close()
 
 
 async def test_a_server_is_made_anew_for_an_agent_that_is_secured_meanwhile(tmp_path: Path) -> None:

@@ -69,22 +69,6 @@ async def test_a_token_in_the_url_opens_a_websocket(path: str) -> None:
             await until(lambda: core.publishers("/cmd_vel"))
 
 
-async def test_pages_of_other_sites_connect_only_where_they_are_listed() -> None:
-    origin = "https://app.foxglove.dev"
-    async with running() as (server, _), aiohttp.ClientSession() as session:
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await connect(session, server, Origin=origin)
-        assert refused.value.status == 403
-        async with connect(session, server, Origin=f"http://127.0.0.1:{server.port}"):
-            pass
-    async with (
-        running(origins=frozenset({origin})) as (server, _),
-        aiohttp.ClientSession() as session,
-        connect(session, server, Origin=origin),
-    ):
-        pass
-
-
 async def test_a_client_whose_frames_are_not_masked_is_disconnected() -> None:
     """RFC 6455, section 5.1: the server closes the connection, with 1002."""
     async with running() as (server, _), aiohttp.ClientSession() as session:
