@@ -314,6 +314,12 @@ class Recorded:
 
         return call
 
+    def entry(self, peer: int, what: Any) -> Any:
+        """An entry that is there."""
+        found = self.book.get(peer, what)
+        assert found is not None
+        return found
+
     def advertised(self, peer: int, message: Any, now: float = 0.0) -> list[Any]:
         """Take a whole advertisement."""
         for wire, offer in self.book.changes(peer, message):

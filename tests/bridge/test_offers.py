@@ -218,8 +218,7 @@ def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
     assert {(one.kind, one.who) for one in warnings} == {("nodes.too_many", "far")}
     assert "limits.nodes = 2" in warnings[0].text
     assert {node: len(sources) for node, sources in made.refused_nodes(1).items()} == {"/n2": 3, "/n3": 3}
-    entry = made.get(1, Source("/n2/t0", "/n2"))
-    assert entry is not None
+    entry = made.entry(1, Source("/n2/t0", "/n2"))
     assert entry.cause == CROWDED
     assert "limits.nodes = 2 of this module" in entry.hidden
     more = TopicOffer("/late", "/n0", "a/B")

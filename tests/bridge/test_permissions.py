@@ -173,8 +173,7 @@ def test_only_topics_that_a_peer_may_publish_are_shown_here() -> None:
         offers = (TopicOffer("/cmd_vel", "/n", TYPE), TopicOffer("/odom", "/n", TYPE))
         here.imports.advertised(peer, Advertise(offers, ()))
     assert here.shown() == [(1, "/cmd_vel")]
-    entry = here.imports.get(2, Source("/cmd_vel", "/n"))
-    assert entry is not None
+    entry = here.imports.entry(2, Source("/cmd_vel", "/n"))
     assert (entry.cause, entry.hidden) == (DENIED, "no [[permission]] lets arm publish /cmd_vel")
     assert here.counters["permission.publish"] == 3
     here.reload(allow("arm", publish="/**"))

@@ -223,8 +223,7 @@ def test_of_two_topics_with_one_local_name_the_first_is_shown() -> None:
     imports = Side(PeerRule("p", "/p", (("/x", "/p/y"),))).imports()
     imports.link_up(1, "p")
     assert learn(imports, "/x", "/y") == [Publish(1, Source("/x", "/n"), TYPE, "/p/y")]
-    entry = imports.get(1, Source("/y", "/n"))
-    assert entry is not None
+    entry = imports.entry(1, Source("/y", "/n"))
     assert entry.hidden == "it would be /p/y here, as /x of this node is already; rename one"
     assert learn(imports, "/y", node="/other") == [Publish(1, Source("/y", "/other"), TYPE, "/p/y")]
     assert imports.advertised(1, Advertise(removed=(Source("/x", "/n"),))) == [
@@ -252,8 +251,7 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
         Retract(1, c),
     ]
     assert changed(imports, new) == []
-    entry = imports.get(1, Source("/a", "/n"))
-    assert entry is not None
+    entry = imports.entry(1, Source("/a", "/n"))
     assert (entry.state, entry.route) == ("open", 1)
     assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
 
@@ -459,6 +457,5 @@ def test_after_reloads_exactly_the_last_rules_hold(steps: list[tuple[str, int]])
     assert {world.exports.local(1, wire) for wire in flowing} == {source for source, _ in world.sending}
     assert world.connected == {source for source, _ in world.sending}
     for source in world.here:
-        entry = world.imports.get(1, source)
-        assert entry is not None
+        entry = world.imports.entry(1, source)
         assert entry.state == ("open" if source in flowing else "idle")

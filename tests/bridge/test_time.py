@@ -35,8 +35,7 @@ def advertise(machine: Imports, peer: int, *sources: Source) -> list[Any]:
 
 
 def hidden(machine: Imports, peer: int, source: Source) -> str:
-    entry = machine.get(peer, source)
-    assert entry is not None
+    entry = machine.entry(peer, source)
     return str(entry.hidden)
 
 

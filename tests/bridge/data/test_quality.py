@@ -365,15 +365,6 @@ def test_miss_hidden_by_rounding_is_reported_next() -> None:
     assert watch.next_timer() == 1e6 + 3 * 0.1
 
 
-def test_of_many_gaps_the_last_are_remembered() -> None:
-    watch = QosWatch(Contract(deadline=0.5), 0.0)
-    for second in range(100):
-        watch.last = float(second)
-        watch.handle_timer(second + 0.5)
-    assert watch.counts == {QosEventKind.DEADLINE_MISSED: 100}
-    assert [event.now for event in watch.recent] == [second + 0.5 for second in range(100 - limits.WATCH_RECENT, 100)]
-
-
 def test_a_sleep_of_years_costs_one_event() -> None:
     watch = QosWatch(Contract(deadline=0.001), 0.0)
     (event,) = watch.handle_timer(1e9)

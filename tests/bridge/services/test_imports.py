@@ -50,15 +50,13 @@ def opened(imports: ServiceImports) -> None:
 
 
 def about(imports: ServiceImports) -> ServiceDescription | None:
-    remote = imports.get(1, "/add")
-    assert remote is not None
+    remote = imports.entry(1, "/add")
     found: ServiceDescription | None = remote.about
     return found
 
 
 def hidden(imports: ServiceImports, peer: int, service: str = "/add") -> str:
-    remote = imports.get(peer, service)
-    assert remote is not None
+    remote = imports.entry(peer, service)
     return imports.hidden(remote)
 
 
@@ -118,8 +116,7 @@ def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
     imports.want(imports.get(1, "/add"), 0.0)
     assert imports.closed(1, ServiceClosed(ROUTE, "no")) == [EndedService(1, "/add", ROUTE, "no")]
     assert imports.closed(1, ServiceClosed(ROUTE, "no")) == []
-    remote = imports.get(1, "/add")
-    assert remote is not None
+    remote = imports.entry(1, "/add")
     assert (remote.state, remote.problem) == ("idle", "no")
 
 

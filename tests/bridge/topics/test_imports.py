@@ -35,8 +35,7 @@ def imports() -> Imports:
 
 
 def state(imports: Imports, peer: int = 1) -> str:
-    entry = imports.get(peer, CMD)
-    assert entry is not None
+    entry = imports.entry(peer, CMD)
     found: str = entry.state
     return found
 
@@ -72,8 +71,7 @@ def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports
         now = timer
         assert imports.handle_timer(now) == [Send(1, OpenRoute(attempt + 1, "/cmd", "/joy"))]
     assert delays == [0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
-    entry = imports.get(1, CMD)
-    assert entry is not None
+    entry = imports.entry(1, CMD)
     assert entry.problem == "it hung up"
     imports.opened(1, RouteOpened(8, ABOUT), now)
     assert entry.problem == ""
@@ -251,8 +249,7 @@ def test_our_contract_is_asked_for_and_what_holds_is_what_was_answered() -> None
     assert machine.opened(1, RouteOpened(1, ABOUT, holds, epoch=3, first=12), 0.0) == [
         Describe(1, CMD, 1, ABOUT, holds, 3, 12)
     ]
-    entry = machine.get(1, CMD)
-    assert entry is not None
+    entry = machine.entry(1, CMD)
     assert entry.contract == holds
 
 

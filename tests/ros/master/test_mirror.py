@@ -102,17 +102,6 @@ def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     assert pair.changes() == set()
 
 
-def test_what_is_gone_there_goes_here(pair: Pair) -> None:
-    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
-    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
-    pair.look()
-    pair.theirs("unregisterPublisher", "/p", "/t", THEIRS)
-    pair.theirs("unregisterService", "/p", "/srv", "rosrpc://h:9")
-    pair.changes()
-    pair.look()
-    assert pair.changes() == {("-", "/t", "/p"), ("-", "/srv", "/p")}
-
-
 def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)

@@ -248,15 +248,6 @@ def test_what_a_sender_says_that_it_has_given_up_is_lost(
     play(scene)
 
 
-def test_another_run_of_the_agent_is_told_what_it_cannot_know() -> None:
-    async def scene(proxied: Proxied) -> None:
-        await proxied.publish()
-        proxied.describe(SURE, epoch=5, unknown=True)
-        assert proxied.kinds() == [QosEventKind.LOSS_UNKNOWN]
-
-    play(scene)
-
-
 @pytest.mark.parametrize("last", [1, 3])
 def test_what_had_not_come_of_a_publisher_that_has_gone_is_lost(last: int) -> None:
     async def scene(proxied: Proxied) -> None:
