@@ -20,8 +20,9 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.direct.conditions import NO_LINK, Condition, DirectAsk, Grant, Unmet, Want, read_ask, read_reply
 from rmpa.bridge.peer_offers import EntryT
+from rmpa.bridge.rpc import UNKNOWN_QUESTION
 from rmpa.core.contract import Contract, Transport
-from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -331,6 +332,9 @@ class Paths(Generic[EntryT]):
                 )
                 found = read_reply(value, want.node)
                 path.held = isinstance(found, Grant)
+            except PeerRefused as error:
+                older = UNKNOWN_QUESTION in error.reason
+                found = Unmet(Condition.RELEASE if older else Condition.AGENT, str(error))
             except RemoteProtocolError as error:
                 found = Unmet(Condition.RELEASE, f"{session.link.name}: {error}")
             except RmpaError as error:

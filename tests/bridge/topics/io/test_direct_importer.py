@@ -237,6 +237,7 @@ async def test_only_so_many_requests_wait_for_a_peer(module: Module) -> None:
 @pytest.mark.parametrize(
     ("value", "condition"),
     [
+        (PeerRefused("a", "this agent does not know the question 'direct.topic'"), Condition.RELEASE),
         (PeerRefused("a", "too many questions at once"), Condition.AGENT),
         (UnreachableError("agent", "a"), Condition.AGENT),
         ({"port": 0}, Condition.RELEASE),
