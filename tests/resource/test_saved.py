@@ -128,13 +128,12 @@ def refused(one: Clients) -> list[str]:
 
 def test_refusal_lasts_until_a_valid_request() -> None:
     one = clients()
-    one.received("/a", "m" * 9999, "")
-    assert len(one["/a"].mark) == limits.REQUIREMENT_TEXT_MAX
     with pytest.raises(ConfigError):
-        one.read("/a", [("rat", ">= 20 Hz")], 1.0)
+        one.read("/a", "m" * 9999, "", [("rat", ">= 20 Hz")], 1.0)
+    assert len(one["/a"].mark) == limits.REQUIREMENT_TEXT_MAX
     one.refuse("/a", "no such attribute")
     assert (one["/a"].refusal, refused(one)) == ("no such attribute", ["/a"])
-    requirement = one.read("/a", ASKS, 1.0)
+    requirement = one.read("/a", "m", "", ASKS, 1.0)
     assert requirement is not None
     assert (requirement.client, requirement.expires) == ("/a", 31.0)
     assert (one["/a"].refusal, refused(one)) == ("", [])
@@ -144,28 +143,24 @@ def test_refusal_lasts_until_a_valid_request() -> None:
 def test_repeated_latched_request_keeps_its_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
     one = clients()
     for now, expires in ((1.0, 31.0), (20.0, 31.0), (31.0, None)):
-        one.received("/a", "m", "5.000000000")
-        found = one.read("/a", ASKS, now)
+        found = one.read("/a", "m", "5.000000000", ASKS, now)
         assert (found and found.expires) == expires
-    one.received("/a", "m", "6.000000000")
-    again = one.read("/a", ASKS, 40.0)
+    again = one.read("/a", "m", "6.000000000", ASKS, 40.0)
     assert again is not None
     assert again.expires == 70.0
-    one.received("/a", "m", "")  # without a stamp each one is new
-    unstamped = one.read("/a", ASKS, 50.0)
+    unstamped = one.read("/a", "m", "", ASKS, 50.0)  # without a stamp each one is new
     assert unstamped is not None
     assert unstamped.expires == 80.0
     monkeypatch.setattr(limits, "RESOURCE_STAMPS_MAX", 2)
     for number in range(5):
-        one.received("/a", "m", f"{number}.5")
-        one.read("/a", ASKS, 60.0)
+        one.read("/a", "m", f"{number}.5", ASKS, 60.0)
     assert list(one.expiries) == [("/a", "3.5"), ("/a", "4.5")]
 
 
 def test_absent_client_is_removed() -> None:
     one = clients()
-    one.received("/a", "m", "")
-    one.received("/b", "n", "")
+    one.read("/a", "m", "", [], 0.0)
+    one.read("/b", "n", "", [], 0.0)
     assert one.remove_absent({"/a"}, 1.0) == []
     assert one.remove_absent({"/a", "/b"}, 2.0) == []  # it was only connecting anew
     assert one.remove_absent({"/a"}, 3.0) == []
@@ -177,11 +172,9 @@ def test_absent_client_is_removed() -> None:
 
 def test_requirements_wait_for_their_clients_after_a_restart() -> None:
     before = clients()
-    before.received("/a", "m", "5.0")
-    before.received("/b", "n", "")
     requirements = {}
-    for name, values in (("/a", ASKS), ("/b", [("latency", "<= 1 s")])):
-        requirement = before.read(name, values, 10.0)
+    for name, mark, stamp, values in (("/a", "m", "5.0", ASKS), ("/b", "n", "", [("latency", "<= 1 s")])):
+        requirement = before.read(name, mark, stamp, values, 10.0)
         assert requirement is not None
         requirements[name] = requirement
     asked = before.save(requirements | {"context lab": requirements["/a"]}, 12.0, NOW)
@@ -193,11 +186,10 @@ def test_requirements_wait_for_their_clients_after_a_restart() -> None:
     found = after.restore(asked, 100.0, NOW + 8 * 10**9)
     assert [(r.client, r.expires) for r in found] == [("/a", 120.0), ("/b", None)]
     grace = 100.0 + limits.RESOURCE_CLIENT_GRACE
-    after.received("/b", "n", "")  # it is back
+    after.read("/b", "n", "", [], 100.0)  # it is back
     for now in (101.0, 102.0):
         assert after.remove_absent({"/b"}, now) == []
-    after.received("/a", "m", "5.0")
-    again = after.read("/a", ASKS, 110.0)
+    again = after.read("/a", "m", "5.0", ASKS, 110.0)
     assert again is not None
     assert again.expires == 120.0
     silent = clients()

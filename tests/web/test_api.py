@@ -21,7 +21,7 @@ from rmpa.observe.peer_info import PeerInfo
 from rmpa.observe.snapshot import RouteInfo, ServiceInfo, Snapshot, TopicInfo
 from rmpa.web import api as rest
 from rmpa.web import limits
-from rmpa.web.api import EVENT_KINDS, Figures, content_type, exposition, metrics, web_metrics
+from rmpa.web.api import EVENT_KINDS, content_type, exposition, metrics, web_metrics
 from tests.web.snapshots import AGENT, FULL, SERVICE, peer, route
 
 API = "/api/v1"
@@ -105,8 +105,7 @@ def test_no_path_breaks_it(path: str) -> None:
         msgspec.json.decode(response.body)
 
 
-FIGURES = Figures(1, 2, {"200": 3}, {"host": 4}, 5, 0.6)
-EVERYTHING = (*metrics(FULL), *web_metrics(FIGURES))
+EVERYTHING = (*metrics(FULL), *web_metrics((1, 2), {"200": 3}, {"host": 4}, (5, 0.6), {}))
 DOCS = Path(__file__).parents[2] / "docs"
 DASHBOARD = DOCS / "grafana" / "rmpa.json"
 PAGE = DOCS / "metrics.md"

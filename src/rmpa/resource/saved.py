@@ -204,22 +204,15 @@ class Clients:
         """The client of this name; an empty record if it has sent nothing."""
         return self.known.get(name, ClientRecord())
 
-    def received(self, name: str, mark: str, stamp: str) -> None:
-        """Record that a client has sent a message; called before ``read``, which uses the stamp.
+    def read(
+        self, name: str, mark: str, stamp: str, values: Sequence[tuple[str, str]], now: float
+    ) -> Requirement | None:
+        """Record a client's message, and read its requirement.
 
         Args:
             name: Name of the client's node.
             mark: The mark on the message; it is cut to a maximum length, because each response repeats it.
             stamp: The message's stamp as ``seconds.nanoseconds``, or empty.
-        """
-        client = self.known.setdefault(name, ClientRecord())
-        client.mark, client.stamp, client.grace = mark[: limits.REQUIREMENT_TEXT_MAX], stamp, -math.inf
-
-    def read(self, name: str, values: Sequence[tuple[str, str]], now: float) -> Requirement | None:
-        """Read a client's requirement from the values of its message.
-
-        Args:
-            name: Name of the client's node.
             values: Attributes with the texts of the requests.
             now: Monotonic seconds.
 
@@ -229,8 +222,9 @@ class Clients:
         Raises:
             ConfigError: The request is invalid.
         """
-        requirement = parse_requirement(name, values, self._attributes, self._resource, now)
         client = self.known.setdefault(name, ClientRecord())
+        client.mark, client.stamp, client.grace = mark[: limits.REQUIREMENT_TEXT_MAX], stamp, -math.inf
+        requirement = parse_requirement(name, values, self._attributes, self._resource, now)
         if requirement.expires is not None and client.stamp:
             due = self.expiries.setdefault((name, client.stamp), requirement.expires)
             while len(self.expiries) > limits.RESOURCE_STAMPS_MAX:

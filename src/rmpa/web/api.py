@@ -179,28 +179,6 @@ class Metric(NamedTuple):
     samples: Samples
 
 
-class Figures(NamedTuple):
-    """What the web server counts.
-
-    Attributes:
-        connections: Open at present.
-        accepted: Connections so far.
-        responses: Responses so far, by HTTP status.
-        refused: Refusals so far, by the words of ``REFUSALS``.
-        reads: Questions to the agent so far.
-        read_seconds: Seconds that they took.
-        gateways: What each gateway counts, by its protocol.
-    """
-
-    connections: int
-    accepted: int
-    responses: Mapping[str, int]
-    refused: Mapping[str, int]
-    reads: int
-    read_seconds: float
-    gateways: Mapping[str, GatewayFigures] = {}
-
-
 def content_type(accept: str) -> str:
     """The content type of ``/metrics`` for a request's ``Accept`` header: one of two, whatever it is."""
     return _OPENMETRICS if "application/openmetrics-text" in accept else _TEXT
@@ -405,20 +383,33 @@ def _at(taken: float, ago: float | None) -> float | None:
     return None if ago is None else round(taken - ago, 3)
 
 
-def web_metrics(figures: Figures) -> Iterator[Metric]:
-    """All metrics of the web server itself."""
-    yield Metric("rmpa_web_connections", "Open connections of clients.", "gauge", [("", figures.connections)])
-    yield Metric(
-        "rmpa_web_accepted_connections", "Connections of clients so far.", "counter", [("", figures.accepted)]
-    )
-    responses = [(labels(status=status), count) for status, count in sorted(figures.responses.items())]
-    yield Metric("rmpa_web_responses", "Responses by HTTP status.", "counter", responses)
+def web_metrics(
+    connections: tuple[int, int],
+    responses: Mapping[str, int],
+    refused: Mapping[str, int],
+    reads: tuple[int, float],
+    gateways: Mapping[str, GatewayFigures],
+) -> Iterator[Metric]:
+    """All metrics of the web server itself.
+
+    Args:
+        connections: How many are open at present, and how many there were so far.
+        responses: Responses so far, by HTTP status.
+        refused: Refusals so far, by the words of ``REFUSALS``.
+        reads: Questions to the agent so far, and the seconds that they took.
+        gateways: What each gateway counts, by its protocol.
+    """
+    is_open, accepted = connections
+    yield Metric("rmpa_web_connections", "Open connections of clients.", "gauge", [("", is_open)])
+    yield Metric("rmpa_web_accepted_connections", "Connections of clients so far.", "counter", [("", accepted)])
+    statuses = [(labels(status=status), count) for status, count in sorted(responses.items())]
+    yield Metric("rmpa_web_responses", "Responses by HTTP status.", "counter", statuses)
     help_ = "Requests, connections and WebSocket clients refused, by reason."
-    refused = [(labels(reason=reason), figures.refused.get(reason, 0)) for reason in REFUSALS]
-    yield Metric("rmpa_web_refused", help_, "counter", refused)
-    read = [("_count", figures.reads), ("_sum", figures.read_seconds)]
+    reasons = [(labels(reason=reason), refused.get(reason, 0)) for reason in REFUSALS]
+    yield Metric("rmpa_web_refused", help_, "counter", reasons)
+    read = [*zip(("_count", "_sum"), reads, strict=True)]
     yield Metric("rmpa_web_agent_read_seconds", "Time to read the agent's snapshot.", "summary", read)
-    gateways = [(labels(protocol=name), figures.gateways.get(name, GatewayFigures())) for name in PROTOCOLS]
+    clients = [(labels(protocol=name), gateways.get(name, GatewayFigures())) for name in PROTOCOLS]
     counts: tuple[_Row[GatewayFigures], ...] = (
         ("clients", "WebSocket clients of the gateways.", "gauge", lambda x: x.clients),
         ("client_queue_bytes", "Bytes that wait for these.", "gauge", lambda x: x.queued),
@@ -430,4 +421,4 @@ def web_metrics(figures: Figures) -> Iterator[Metric]:
             lambda x: x.dropped,
         ),
     )
-    yield from _table("rmpa_web_", counts, gateways)
+    yield from _table("rmpa_web_", counts, clients)

@@ -12,7 +12,6 @@ import binascii
 import json
 import math
 import struct
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
@@ -183,26 +182,12 @@ def parse_text(data: bytes | str, decoder: msgspec.json.Decoder[msgspec.Struct])
 # --- from a client: binary ---
 
 
-@dataclass(frozen=True, slots=True)
-class ClientMessageData:
-    """A message that a client publishes; ``payload`` is a part of the received frame."""
-
-    channel_id: int
-    payload: memoryview
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceCallRequest:
-    """A service call; ``payload`` is a part of the received frame."""
-
-    service_id: int
-    call_id: int
-    encoding: str
-    payload: memoryview
-
-
-def parse_binary(data: Payload) -> ClientMessageData | ServiceCallRequest:
+def parse_binary(data: Payload) -> tuple[int, memoryview] | tuple[int, int, str, memoryview]:
     """Parse a binary frame of a client; its payload is not copied.
+
+    Returns:
+        Of a message that the client publishes the channel's number and the payload; of a service call the numbers of
+        the service and the call, the encoding and the payload.
 
     Raises:
         LimitExceeded: It is longer than ``limits.FOXGLOVE_BINARY_MAX``.
@@ -215,7 +200,7 @@ def parse_binary(data: Payload) -> ClientMessageData | ServiceCallRequest:
     if opcode == 1:
         if len(view) < 5:
             raise RemoteProtocolError(f"a published message of {len(view)} bytes is too short for its header of 5")
-        return ClientMessageData(int.from_bytes(view[1:5], "little"), view[5:])
+        return int.from_bytes(view[1:5], "little"), view[5:]
     if opcode == 2:
         return _parse_call(view)
     known = "1 (message data) and 2 (service call)"
@@ -224,7 +209,7 @@ def parse_binary(data: Payload) -> ClientMessageData | ServiceCallRequest:
     )
 
 
-def _parse_call(view: memoryview) -> ServiceCallRequest:
+def _parse_call(view: memoryview) -> tuple[int, int, str, memoryview]:
     if len(view) < _SERVICE.size:
         raise RemoteProtocolError(f"a service call of {len(view)} bytes is too short for its header of 13")
     _, service, call, length = _SERVICE.unpack_from(view)
@@ -235,7 +220,7 @@ def _parse_call(view: memoryview) -> ServiceCallRequest:
         encoding = str(view[_SERVICE.size : end], "utf-8")
     except UnicodeDecodeError:
         raise RemoteProtocolError("the encoding of a service call is not UTF-8") from None
-    return ServiceCallRequest(service, call, encoding, view[end:])
+    return service, call, encoding, view[end:]
 
 
 # --- parameters: ROS tells integers from floating-point numbers and has byte strings, which JSON does not ---

@@ -156,11 +156,11 @@ class FoxgloveSession(Session):
                 received = protocol.parse_text(data, DECODER)
                 getattr(self, type(received).__name__)(**msgspec.structs.asdict(received))
             else:
-                binary = protocol.parse_binary(data)
-                if isinstance(binary, protocol.ServiceCallRequest):
-                    self._call(binary)
-                else:
-                    self._publish(binary)
+                match protocol.parse_binary(data):
+                    case channel, payload:
+                        self._publish(channel, payload)
+                    case service, call, encoding, payload:
+                        self._call(service, call, encoding, payload)
         except RmpaError as error:
             self._refuse(error)
 
@@ -287,38 +287,37 @@ class FoxgloveSession(Session):
         if (publication := self._published.pop(number)) is not None:
             publication.close()
 
-    def _publish(self, data: protocol.ClientMessageData) -> None:
+    def _publish(self, channel: int, payload: Payload) -> None:
         self.check_control("publish")
-        if data.channel_id not in self._published:
-            raise RmpaError(f"channel {data.channel_id} is not advertised; advertise it before its messages")
-        if (publication := self._published[data.channel_id]) is not None:
-            publication.publish(data.payload)
+        if channel not in self._published:
+            raise RmpaError(f"channel {channel} is not advertised; advertise it before its messages")
+        if (publication := self._published[channel]) is not None:
+            publication.publish(payload)
 
     # --- services and assets ----------------------------------------------------------------------------------
 
-    def _call(self, call: protocol.ServiceCallRequest) -> None:
+    def _call(self, service: int, call: int, encoding: str, payload: Payload) -> None:
         def done(response: Payload) -> None:
-            self.connection.push(protocol.service_response(call.service_id, call.call_id, response))
+            self.connection.push(protocol.service_response(service, call, response))
 
         def failed(error: RmpaError) -> None:
-            about = {"serviceId": call.service_id, "callId": call.call_id, "message": str(error)}
-            self.connection.push(message("serviceCallFailure", **about))
+            self.connection.push(message("serviceCallFailure", serviceId=service, callId=call, message=str(error)))
 
         try:
-            work = self._service_call(call)
+            work = self._service_call(service, encoding, payload)
         except RmpaError as error:
             failed(error)
         else:
             self._await("calls", limits.FOXGLOVE_CALLS_MAX, work, done, failed)
 
-    def _service_call(self, call: protocol.ServiceCallRequest) -> Coroutine[Any, Any, Payload]:
+    def _service_call(self, number: int, encoding: str, payload: Payload) -> Coroutine[Any, Any, Payload]:
         self.check_control("call services")
-        service = self.table.services.get(call.service_id)
+        service = self.table.services.get(number)
         if service is None:
-            raise RmpaError(f"there is no service {call.service_id}; it may be gone")
-        if call.encoding != ENCODING:
-            raise RmpaError(f"the encoding {call.encoding[:80]!r} is not {ENCODING!r}")
-        return self.call(service.name, service.kind.name, call.payload)
+            raise RmpaError(f"there is no service {number}; it may be gone")
+        if encoding != ENCODING:
+            raise RmpaError(f"the encoding {encoding[:80]!r} is not {ENCODING!r}")
+        return self.call(service.name, service.kind.name, payload)
 
     def op_fetch_asset(self, *, uri: protocol.Text, request_id: protocol.Id) -> None:
         """Send a file of a ROS package."""

@@ -134,7 +134,7 @@ class Gateways:
                 text = f"pages speak {SUBPROTOCOL} here; see /rosbridge"
                 self.refuse(address, "handshake", text)
                 return web.Response(status=400, text=f"{text}\n")
-            await self._monitor.ready()
+            await self._monitor.mesh.first()
             return await self._serve(request, MonitorSession(*client, self._monitor), limits.REQUEST_MAX + 1)
         await self._hub.settled(limits.SETTLE)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.

@@ -75,7 +75,7 @@ class MeshFeed:
         self._task = asyncio.get_running_loop().create_task(self._run(), name="monitor's state")
 
     async def first(self) -> None:
-        """Ask the agent once, so that its name is known."""
+        """Ask the agent once, so that a page is told its name."""
         self._take(await self._watch.reading())
 
     def follow(self, page: object, show: Callable[[Tree], None]) -> None:
@@ -264,10 +264,6 @@ class Monitor:
         self.resources.start()
         self.log.start()
         self.mesh.start()
-
-    async def ready(self) -> None:
-        """Wait until the agent was asked once, so that a page is told its name."""
-        await self.mesh.first()
 
     async def close(self) -> None:
         """End, before the hub ends."""
