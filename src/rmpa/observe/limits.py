@@ -10,55 +10,55 @@ from typing import Final
 from rmpa.core.limits import MIB
 
 # --- control socket, snapshot, /diagnostics ------------------------------------------------------------------------
+# Bytes of one request; the longest request names the topics that a client wants.
 CONTROL_REQUEST_MAX: Final = 1 * MIB
-"""Bytes of one request; the longest request names the topics that a client wants."""
+# Bytes of a text that follows a request: a parameter.
 CONTROL_TEXT_BYTES_MAX: Final = 17 * MIB
-"""Bytes of a text that follows a request: a parameter."""
+# Bytes of one reply: the snapshot of a very large graph.
 CONTROL_REPLY_MAX: Final = 64 * MIB
-"""Bytes of one reply: the snapshot of a very large graph."""
+# Simultaneous clients of the control socket.
 CONTROL_CLIENTS_MAX: Final = 32
-"""Simultaneous clients of the control socket."""
+# A connection without a request for this long is closed.
 CONTROL_IDLE_TIMEOUT: Final = 60.0
-"""A connection without a request for this long is closed."""
+# Time-out of one call of a client: a stopped agent must not block the command line.
 CONTROL_CALL_TIMEOUT: Final = 10.0
-"""Time-out of one call of a client: a stopped agent must not block the command line."""
+# Time-out of a connection that only tests whether an agent runs; the kernel accepts it even for a stopped agent.
 CONTROL_LOOK_TIMEOUT: Final = 1.0
-"""Time-out of a connection that only tests whether an agent runs; the kernel accepts it even for a stopped agent."""
+# Pings of one call, which must end within its time-out. The command line asks for one at a time.
 CONTROL_PINGS_MAX: Final = 100
-"""Pings of one call, which must end within its time-out. The command line asks for one at a time."""
+# Time-out of an operation in the agent; ``rmpa why`` waits for peers.
 CONTROL_HANDLER_TIMEOUT: Final = 30.0
-"""Time-out of an operation in the agent; ``rmpa why`` waits for peers."""
+# The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``.
 CONTROL_WAIT_MAX: Final = 25.0
-"""The longest wait for a change of the graph in one request: it must end within ``CONTROL_HANDLER_TIMEOUT``."""
+# Changes of the graph that are kept for clients of ``graph``: the start of a large graph makes fewer while a slow
+# client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB.
 GRAPH_HISTORY: Final = 4096
-"""Changes of the graph that are kept for clients of ``graph``: the start of a large graph makes fewer while a slow
-client does not ask. A client that is further behind gets the whole graph. Some 0.5 MB."""
+# Bytes in a UNIX socket's path: Linux's sun_path less its final zero.
 CONTROL_PATH_MAX: Final = 107
-"""Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
+# How long a peer that is gone, with its topics, is shown as stale on /diagnostics.
 DIAGNOSTICS_STALE: Final = 60.0
-"""How long a peer that is gone, with its topics, is shown as stale on /diagnostics."""
+# Topics and services beyond which /diagnostics leaves out those that nothing here uses: each second it would take
+# 0.03 ms for each of them, two thirds of a core with 20,000.
 DIAGNOSTICS_TOPICS: Final = 2000
-"""Topics and services beyond which /diagnostics leaves out those that nothing here uses: each second it would take
-0.03 ms for each of them, two thirds of a core with 20,000."""
 
 # --- doctor -----------------------------------------------------------------------------------------------------
+# Time-out for a multicast packet to return to its sender; where that works, it takes less than a millisecond.
 DOCTOR_HEAR: Final = 1.0
-"""Time-out for a multicast packet to return to its sender; where that works, it takes less than a millisecond."""
+# Time-out of a program of the system (nft, iptables).
 DOCTOR_PROGRAM: Final = 5.0
-"""Time-out of a program of the system (nft, iptables)."""
+# Time-out of a name look-up: the resolver itself waits 5 s for a dead name server.
 DOCTOR_NAME: Final = 5.0
-"""Time-out of a name look-up: the resolver itself waits 5 s for a dead name server."""
+# Peers of an agent that are listed one by one; of more, those with a problem are, and the others are counted.
 DOCTOR_PEERS_LISTED: Final = 16
-"""Peers of an agent that are listed one by one; of more, those with a problem are, and the others are counted."""
+# How long both clocks are watched, to notice that the wall clock is set.
 DOCTOR_CLOCK_LOOK: Final = 0.3
-"""How long both clocks are watched, to notice that the wall clock is set."""
 
 # --- why --------------------------------------------------------------------------------------------------------
+# Time between the two counts that ``rmpa why`` compares: a topic of some messages a second has moved by then.
 WHY_WINDOW: Final = 1.0
-"""Time between the two counts that ``rmpa why`` compares: a topic of some messages a second has moved by then."""
+# Publishers of one topic in one module that ``rmpa why`` reports.
 WHY_SOURCES_MAX: Final = 64
-"""Publishers of one topic in one module that ``rmpa why`` reports."""
+# Seconds in which a core tells the addresses of its nodes; each takes a millisecond.
 DOCTOR_NODES_TIMEOUT: Final = 2.0
-"""Seconds in which a core tells the addresses of its nodes; each takes a millisecond."""
+# Nodes of one core whose ports are looked at, so that the check ends in time.
 DOCTOR_NODES_MAX: Final = 500
-"""Nodes of one core whose ports are looked at, so that the check ends in time."""
