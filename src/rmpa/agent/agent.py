@@ -304,10 +304,8 @@ def _asking_for_direct(settings: Settings) -> list[str]:
     return asked
 
 
-# Chooses the ROS core of an agent: an embedded one, or a roscore that runs already.
+# --- the ROS core of an agent: an embedded one, or a roscore that runs already ---
 
-
-_log = logging.getLogger(__name__)
 # Seconds in which a program that has the core's port says whether it is a ROS master.
 _ASKED: Final = 1.0
 
