@@ -152,7 +152,7 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: ResourceNode, remote: list[dict[
     assert as_json(rmpa, "profile", "set", "sonar", "fast") == {"resource": "/sonar", "peer": None, "chosen": "fast"}
     assert rmpa("profile", "set", "sonar", "fast") == (0, "", "")
     assert ["fast", "runs,", "by"] in rows(rmpa, "profile", "explain", "sonar")
-    assert running.adapter.loop.profile == "fast"
+    assert running.adapter.adaptation.profile == "fast"
     assert rows(rmpa, "profile", "list", "sonar")[2] == ["fast", "runs,", "by"]
     code, out, err = rmpa("profile", "set", "sonar", "broken")
     assert (code, out) == (1, "")
@@ -215,7 +215,7 @@ def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
     assert rmpa("context", "get") == (0, "\n", "")
     assert as_json(rmpa, "context", "set", "sonar", "away")["chosen"] == "away"
     assert rmpa("context", "set", "sonar", "away") == (0, "", "")
-    assert running.adapter.loop.profile == "fast"
+    assert running.adapter.adaptation.profile == "fast"
     assert rmpa("context", "get", "sonar") == (0, "away\n", "")
     code, _, err = rmpa("context", "set", "sonar", "awya")
     assert (code, err) == (2, "rmpa: CONTEXT: there is no context 'awya'; did you mean away?\n")

@@ -11,7 +11,7 @@ from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 

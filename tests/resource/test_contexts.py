@@ -128,7 +128,7 @@ async def test_parameters_are_set_and_published_together(lamp: Lamp, node: Node)
 
 
 async def test_profile_is_chosen_by_hand_and_released(lamp: Lamp, node: Node) -> None:
-    loop = lamp.member.adapter.loop
+    loop = lamp.member.adapter.adaptation
     await until(lambda: loop.profile == "slow", "the cheapest does not run")
     assert (await ask(node, profile="fast"))["profile"] == "fast"
     assert loop.profile == lamp.profile == "fast"
@@ -175,11 +175,11 @@ async def test_rules_select_a_context(lamp: Lamp, node: Node) -> None:
     await ask(node, level=2.0)
     await until(lambda: contexts[-1].data == "docked", "a topic's rule does nothing")
     assert lamp.profile == "fast"
-    assert "context docked" in lamp.member.adapter.loop.requirements
+    assert "context docked" in lamp.member.adapter.adaptation.requirements
     await until(lambda: len(other) > heard, "the other output does not flow again")
     battery.publish(battery.make({"power_supply_status": 2}))
     await until(lambda: contexts[-1].data == "" and lamp.profile == "slow", "it stays for ever")
-    assert not lamp.member.adapter.loop.requirements
+    assert not lamp.member.adapter.adaptation.requirements
     charging = await node.advertise("/charging", "std_msgs/Bool", latch=True)
     charging.publish(charging.make(True))
     await until(lambda: contexts[-1].data == "docked", "the other topic does nothing")

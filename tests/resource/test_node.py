@@ -181,7 +181,7 @@ async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogC
         await node.subscribe("/loud/words", "std_msgs/String", lambda m: words.append(m.message.data))
         await node.subscribe("/loud/mode", "std_msgs/String", lambda m: modes.append(m.message.data))
         await member.runtime.start(member.parts, member._configure)
-        while not (member.runtime._publishers["words"].subscribers and member.adapter.loop.profile == "plain"):
+        while not (member.runtime._publishers["words"].subscribers and member.adapter.adaptation.profile == "plain"):
             await asyncio.sleep(0.01)
         while not member.runtime._publishers["mode"].subscribers:
             await asyncio.sleep(0.01)
@@ -278,7 +278,7 @@ async def test_profiles_change_the_requests_to_others(core: RosCore) -> None:
     assert member.demands.problems() == ([], [])
     member.adapter.pin("fine")
     await until(lambda: needs.answer is not None and needs.answer.message == "profile sharp", "more is asked")
-    assert other.adapter.loop.requirements["/hand"].bounds["blur"].hard
+    assert other.adapter.adaptation.requirements["/hand"].bounds["blur"].hard
     needs.ask(blur=at_most("0.1 px", hard=True))
     await until(lambda: member.demands.problems()[1], "it cannot be had")
     assert needs.answer is not None
@@ -287,15 +287,15 @@ async def test_profiles_change_the_requests_to_others(core: RosCore) -> None:
     needs.ask(blurr=at_most("2 px"))
     await until(lambda: "did you mean blur?" in "".join(member.demands.problems()[1]), "what cannot be asked is said")
     needs.ask()
-    await until(lambda: not other.adapter.loop.requirements, "nothing is asked")
+    await until(lambda: not other.adapter.adaptation.requirements, "nothing is asked")
     assert member.demands.problems() == ([], [])
     needs.ask(blur=at_most("2 px"))
-    await until(lambda: other.adapter.loop.requirements, "something is asked again")
+    await until(lambda: other.adapter.adaptation.requirements, "something is asked again")
     # Its descriptor says what it asks at present, to everybody.
     said: list[str] = []
     async with Node("reader", master_uri=core.uri) as node:
         await node.subscribe("/hand/descriptor", "std_msgs/String", lambda m: said.append(m.message.data))
         await until(lambda: said and Descriptor.parse(said[-1]).asks[0].wishes == {"blur": "<= 2 px"}, "it says so")
     await member.close()
-    await until(lambda: not other.adapter.loop.requirements, "it is forgotten")
+    await until(lambda: not other.adapter.adaptation.requirements, "it is forgotten")
     await other.close()

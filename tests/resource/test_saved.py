@@ -221,7 +221,7 @@ async def started(core: RosCore, path: Path, one: Resource | None = None) -> Res
 
 
 def cooling(member: ResourceNode) -> list[CoolDown]:
-    return list(member.adapter.loop.cooling(asyncio.get_running_loop().time()).values())
+    return list(member.adapter.adaptation.cooling(asyncio.get_running_loop().time()).values())
 
 
 async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
@@ -240,11 +240,11 @@ async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> No
     tried: list[str] = []
     path = tmp_path / "sonar.json"
     first = await started(core, path, broken())
-    await until(lambda: first.adapter.loop.profile == "coarse")
+    await until(lambda: first.adapter.adaptation.profile == "coarse")
     (before,) = cooling(first)
     await first.close()
     again = await started(core, path, broken())
-    await until(lambda: again.adapter.loop.profile == "coarse")
+    await until(lambda: again.adapter.adaptation.profile == "coarse")
     (after,) = cooling(again)
     assert after.until == pytest.approx(before.until, abs=2)
     assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
@@ -252,7 +252,7 @@ async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> No
     # Somebody who has mended it need not wait.
     again.adapter.pin("fine")
     await until(lambda: len(tried) == 2)
-    await until(lambda: again.adapter.loop.profile == "coarse")
+    await until(lambda: again.adapter.adaptation.profile == "coarse")
     await again.close()
 
 

@@ -271,7 +271,7 @@ def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: t
     return ours.is_loopback or ours not in kept
 
 
-# What the user is told at the start about settings of permissions that do not do what they seem to.
+# --- What the user is told at the start about settings of permissions that do not do what they seem to --------------
 
 
 def permission_notes(settings: Settings, *, secured: bool) -> Iterator[str]:

@@ -172,7 +172,7 @@ def _shown(value: object) -> str:
     return text if len(text) <= _VALUE_SHOWN else text[: _VALUE_SHOWN - 3] + "..."
 
 
-# Runs ``rmpa web`` as a child process of the agent, which does not depend on it.
+# --- Runs ``rmpa web`` as a child process of the agent, which does not depend on it ---------------------------------
 #
 # The child's standard input is a pipe from the agent: its end tells the child that the agent has ended, however it
 # did.
@@ -297,7 +297,9 @@ async def _ended(pid: int) -> None:
         os.close(descriptor)
 
 
-# The process of an agent: its signals, its readiness, and the limits that it sets for itself.
+# --- The process of an agent ----------------------------------------------------------------------------------------
+#
+# Its signals, its readiness, and the limits that it sets for itself.
 
 
 async def serve(

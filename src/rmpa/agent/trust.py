@@ -346,7 +346,7 @@ class AgentTrust(Part):
         return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
 
 
-# Answers ``rmpa trust …`` on the control socket of a secured agent.
+# --- Answers ``rmpa trust …`` on the control socket of a secured agent ----------------------------------------------
 
 
 Args = dict[str, object]

@@ -179,12 +179,12 @@ class Bridge(Shared):
                 part.reconcile()
 
 
-# Decides whether a peer is a *twin*: a module of the same kind, each of which drives the other by equal names.
-# Pure.
+# --- Decides whether a peer is a *twin* -----------------------------------------------------------------------------
+#
+# A module of the same kind, each of which drives the other by equal names. Pure.
 #
 # Two identical robots offer the same topics (``/odom``, ``/scan``) and take the same commands (``/cmd_vel``). By
-# default one name is one topic in the whole mesh, so the command of one reaches both. In one robot that is split
-# over
+# default one name is one topic in the whole mesh, so the command of one reaches both. In one robot that is split over
 # several modules a name is offered by one module, and taken by others.
 
 
@@ -241,7 +241,7 @@ def twin_text(peer: str, names: tuple[str, ...]) -> str:
     )
 
 
-# Finds twins among the peers, and tells each that may be one what this module's nodes take.
+# --- Finds twins among the peers, and tells each that may be one what this module's nodes take ----------------------
 
 
 # The notification ``{"names": [...]}`` to a peer that offers what we do: the topics that nodes here subscribe to.

@@ -264,7 +264,9 @@ class PermissionGate:
 OPEN_GATE: Final = PermissionGate()
 
 
-# Relaying between two networks by a module that is in both, as the paper's proxies do. Pure.
+# --- Relaying between two networks by a module that is in both, as the paper's proxies do ---------------------------
+#
+# Pure.
 #
 # ::
 #
@@ -272,10 +274,8 @@ OPEN_GATE: Final = PermissionGate()
 #     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
 #
 # The relay offers the proxies in its own graph, each with its *origin*. The origin lists every relay on the path,
-# which
-# prevents loops: a source is not offered to its own module nor to a relay on its path, and a relay on its path
-# does not
-# show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
+# which prevents loops: a source is not offered to its own module nor to a relay on its path, and a relay on its path
+# does not show it. A module that is linked to the origin, or reaches it by a better relay, hides the source.
 
 
 # A topic and the proxy that publishes it, by their local names.

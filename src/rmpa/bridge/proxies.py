@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from rmpa.ros.node.publication import Publication
 
 
-# Names the proxies: one namespace for each module that has nodes in the local graph.
+# --- Names the proxies ----------------------------------------------------------------------------------------------
+#
+# One namespace for each module that has nodes in the local graph.
 
 
 class ProxyNamespaces:
@@ -85,7 +87,7 @@ class ProxyNamespaces:
         return linked | {prefix for other, prefix in self._relayed.items() if other != instance}
 
 
-# Makes the proxy nodes; where possible, all of them share one pair of listening sockets.
+# --- Makes the proxy nodes; where possible, all of them share one pair of listening sockets -------------------------
 
 
 _log = logging.getLogger(__name__)
@@ -176,7 +178,7 @@ class ProxyNodes:
         return node.publication(topic) if node is not None and node.uri == uri else None
 
 
-# The nodes in the local graph that stand for the nodes of one peer.
+# --- The nodes in the local graph that stand for the nodes of one peer ----------------------------------------------
 
 
 # What a topic or service does at its proxy: ``ready(proxy)`` registers it there, ``left(proxy)`` removes it.

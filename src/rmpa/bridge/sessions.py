@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 AWAY_GRACE: Final = 0.5
 
 
-# The state that the bridge keeps for one run of a peer, across its links.
+# --- The state that the bridge keeps for one run of a peer, across its links ----------------------------------------
 
 
 class PeerState(Enum):
@@ -101,7 +101,9 @@ class PeerSession:
         return None if self.wait is None else self.away_since + self.wait
 
 
-# The base class of the bridge's parts: topics, services, parameters and others.
+# --- The base class of the bridge's parts ---------------------------------------------------------------------------
+#
+# Topics, services, parameters and others.
 
 
 _log = logging.getLogger(__name__)

@@ -76,7 +76,7 @@ class Master:
 
 
 def choose_master(master: str | None, agent: str | None, environ: Mapping[str, str]) -> Master:
-    """Choose the master, in the order that this module's docstring gives.
+    """Choose the master: ``--master``; ``ROS_MASTER_URI``, unless an agent is named; the core of the agent that runs.
 
     Raises:
         UnreachableError: The named agent does not answer.

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from rmpa.config.schema import Key, Setting
 
 
-# Where in a TOML text a key or an element stands: ``tomllib`` does not say.
+# --- Where in a TOML text a key or an element stands ----------------------------------------------------------------
+#
+# ``tomllib`` does not say.
 
 
 def value_at(table: object, place: Place) -> object:
@@ -204,7 +206,7 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
             yield (*table, name)
 
 
-# Where settings come from, each source stronger than the one before it.
+# --- Where settings come from, each source stronger than the one before it ------------------------------------------
 #
 # ::
 #

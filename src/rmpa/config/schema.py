@@ -177,7 +177,9 @@ def settings_of(
             yield replace(it, path=where, key=key, env=variable, live=live or it.live, command=command)
 
 
-# Lists of tables such as [[contract]]: rules.
+# --- Lists of tables such as [[contract]] ---------------------------------------------------------------------------
+#
+# Rules.
 
 
 def keys_of(kind: type) -> dict[str, Setting]:

@@ -103,7 +103,9 @@ class RefusalLog:
         self._logger.warning("! %s%s", text, more)
 
 
-# The formats of log records: one line of text, or one JSON object a line; and failures that are only logged.
+# --- The formats of log records -------------------------------------------------------------------------------------
+#
+# One line of text, or one JSON object a line; and failures that are only logged.
 
 
 # Looked up at import: without a free file descriptor the codec's file could not be opened to log the shortage.
@@ -185,7 +187,9 @@ def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) 
     logging.raiseExceptions = False
 
 
-# Statistics of periods and latencies. Plain Python: numpy would cost the agent 15 MB.
+# --- Statistics of periods and latencies ----------------------------------------------------------------------------
+#
+# Plain Python: numpy would cost the agent 15 MB.
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +226,7 @@ def percentile(ordered: list[float], percent: float) -> float:
     return ordered[low] + (ordered[high] - ordered[low]) * (position - low)
 
 
-# Many timers of one protocol machine in a heap.
+# --- Many timers of one protocol machine in a heap ------------------------------------------------------------------
 
 
 # The heap, which also holds moved and cancelled entries, is rebuilt above this plus twice the live entries.
@@ -282,7 +286,9 @@ class TimerQueue(Generic[_K]):
         return due
 
 
-# Exponential back-off with a cap and jitter: retries go on forever, and not in step with those of other agents.
+# --- Exponential back-off with a cap and jitter ---------------------------------------------------------------------
+#
+# Retries go on forever, and not in step with those of other agents.
 
 
 class Backoff:
@@ -318,7 +324,9 @@ def earliest(*timers: float | None) -> float | None:
     return min((timer for timer in timers if timer is not None), default=None)
 
 
-# A token bucket: limits the rate of an action.
+# --- A token bucket -------------------------------------------------------------------------------------------------
+#
+# Limits the rate of an action.
 
 
 _ROUNDING: Final = 1e-9
@@ -372,7 +380,7 @@ class TokenBucket:
             self._at = now
 
 
-# Lets long computations yield to pending data without importing the event loop.
+# --- Lets long computations yield to pending data without importing the event loop ----------------------------------
 
 
 _T = TypeVar("_T")
@@ -390,7 +398,7 @@ class Yielder(Protocol):
         ...
 
 
-# The advice for a user whose limit of open files (file descriptors) is too low.
+# --- The advice for a user whose limit of open files (file descriptors) is too low ----------------------------------
 
 
 def remedy(pid: int | None = None) -> str:

@@ -17,7 +17,10 @@ from rmpa.core.limits import UINT32_MAX
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-# GUIDs: they identify a peer, and decide which of two peers dials (paper, section 4.2).
+
+# --- GUIDs ----------------------------------------------------------------------------------------------------------
+#
+# They identify a peer, and decide which of two peers dials (paper, section 4.2).
 
 
 _TEXT: Final = re.compile(r"(?P<ip>[0-9.]+):(?P<port>[0-9]+)(?:#(?P<incarnation>[0-9]+))?")
@@ -123,7 +126,7 @@ def _is_unicast(first: int) -> bool:
     return 0 < first < _MULTICAST
 
 
-# ROS graph names (wiki.ros.org/Names, REP 144) and the globs that rules are written in.
+# --- ROS graph names (wiki.ros.org/Names, REP 144) and the globs that rules are written in --------------------------
 
 
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
@@ -206,7 +209,7 @@ def matches(pattern: str, name: str) -> bool:
     return _compile_glob(pattern).fullmatch(name) is not None
 
 
-# Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982.
+# --- Serial numbers of 32 bits, which wrap around and are compared as in RFC 1982 -----------------------------------
 #
 # Of two numbers the later one is less than 2³¹ ahead of the other. Code that runs once for each message writes the
 # expressions out with ``SERIAL_MASK`` and ``SERIAL_HALF``, because a call takes longer than the arithmetic.
@@ -323,7 +326,7 @@ class Identity:
         return f"{self.name} ({self.guid})"
 
 
-# Names of the agent and of its proxies in the local graph.
+# --- Names of the agent and of its proxies in the local graph -------------------------------------------------------
 
 # The agent's own node; proxies have names below it: ``/rmpa/<peer>/<node>``.
 OWN_NODE: Final = "/rmpa"

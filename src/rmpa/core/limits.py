@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-# Units of size, and the bounds of 32-bit integers.
+# --- Units of size, and the bounds of 32-bit integers ---------------------------------------------------------------
 
 
 KIB: Final = 1024

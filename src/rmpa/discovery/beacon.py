@@ -28,8 +28,8 @@ Address = tuple[str, int]
 MAGIC: Final = b"RMPA"
 VERSION: Final = 2
 
-# Where the instance id stands in a beacon of any version 1: begin and end.
-RUN_AT: Final = (16, 32)
+# Where the instance id stands in a beacon: begin and end.
+INSTANCE_AT: Final = (16, 32)
 MALFORMED: Final = "beacon.malformed"
 OTHER_DOMAIN: Final = "beacon.other_domain"
 OTHER_VERSION: Final = "beacon.version"

@@ -16,9 +16,9 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.discovery import limits, network
 from rmpa.discovery.announcing import AddressLimit
 from rmpa.discovery.beacon import (
+    INSTANCE_AT,
     MALFORMED,
     OTHER_DOMAIN,
-    RUN_AT,
     Beacon,
     BeaconKind,
     BeaconRefused,
@@ -153,7 +153,7 @@ class PacketFilter:
             if len(data) > limits.BEACON_MAX_BYTES:
                 self._counters.add(MALFORMED)
                 return None
-            proof = self._trust.verify(data, RUN_AT, now)
+            proof = self._trust.verify(data, INSTANCE_AT, now)
             if proof.verdict is not Verdict.ACCEPTED:
                 return self._parse_unproved(proof, data, host, now)
         if not self._sources.take(host, now):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.gateway.rules import MeshSource, SourceKey
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import TopicConnection

@@ -129,7 +129,7 @@ ROS2_ACCEPT_TIMEOUT: Final = 10.0
 ROS2_ACTIONS_MAX: Final = 500
 
 
-# Every bound of the gateway's Zenoh session, with unit and reason.
+# --- Every bound of the gateway's Zenoh session, with unit and reason -----------------------------------------------
 
 
 # Seconds without a sign of life after which a Zenoh transport counts as dead: with the other side's grace a

@@ -132,5 +132,3 @@ RESUME_BYTES_MAX: Final = 256 * MIB
 LOSSES_REMEMBERED: Final = 8192
 # Modules whose closed reliable routes are remembered. The one that was linked longest ago is forgotten first.
 ABSENT_PEERS_MAX: Final = 1024
-
-# --- bridge -----------------------------------------------------------------------------------------------------

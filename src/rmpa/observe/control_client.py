@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import AgentInfo
 
 
-# The directory of the control sockets, and the lock that keeps agents' names apart.
+# --- The directory of the control sockets, and the lock that keeps agents' names apart ------------------------------
 
 
 _SYSTEM: Final = Path("/run/rmpa")

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _yielder: Final = functools.partial(yielding_to_data, every=1)
+# ``struct ucred``: pid, uid, gid (unix(7), SO_PEERCRED).
 _UCRED: Final = struct.Struct("3i")
-"""``struct ucred``: pid, uid, gid (unix(7), SO_PEERCRED)."""
+# Not in Python's ``socket``; Linux has it since 4.13.
 _SO_PEERGROUPS: Final = 59
-"""Not in Python's ``socket``; Linux has it since 4.13."""
+# Groups of one user that are read, besides the main one: Python reads no more bytes. Of a user in more of them the
+# main one alone counts.
 _GROUPS_MAX: Final = 256
-"""Groups of one user that are read, besides the main one: Python reads no more bytes. Of a user in more of them the
-main one alone counts."""
 
 Handler = Callable[[dict[str, Any]], Awaitable[object] | object]
 

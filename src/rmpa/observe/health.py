@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 # --- the evidence of each status: figures as text, their units in the keys, so that rqt can plot them ---------------
 
+# Figures by their name; what is empty or ``None`` is left out.
 Values = dict[str, str | float | None]
-"""Figures by their name; what is empty or ``None`` is left out."""
 
 
 def _texts(*values: Values) -> dict[str, str]:
@@ -156,8 +156,8 @@ def route_values(route: RouteInfo) -> dict[str, str]:
 
 # --- the judgement --------------------------------------------------------------------------------------------------
 
+# The name of the agent's own status.
 HERE: Final = "rmpa: this module"
-"""The name of the agent's own status."""
 _LINKED: Final = "linked"
 _LOST, _RESTORED = "liveliness_lost", "liveliness_restored"
 _COUNTS: Final = ("lost", "late", "expired", "dropped", "oversized")
@@ -188,12 +188,12 @@ class Health:
     """Judges snapshots in turn, and compares each with the one before it to find what is new."""
 
     def __init__(self) -> None:
+        # The counts of the last snapshot, by the check's name.
         self._counts: dict[str, dict[str, int]] | None = None
-        """The counts of the last snapshot, by the check's name."""
+        # When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``.
         self._linked: dict[str, float] = {}
-        """When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``."""
+        # The names of the checks of each peer's topics.
         self._topics: dict[str, set[str]] = {}
-        """The names of the checks of each peer's topics."""
 
     def judge(self, snapshot: Snapshot, now: float) -> Iterator[Check]:
         """One check for the agent, each peer, each topic that comes from a peer or that a peer cannot take.
@@ -388,7 +388,7 @@ def _relayed(route: RouteInfo) -> str:
     return f"{route.rate:.1f} Hz{latency}"
 
 
-# Publishes the agent's health on ``/diagnostics`` once a second (REP 107).
+# --- Publishes the agent's health on ``/diagnostics`` once a second (REP 107) ---------------------------------------
 #
 # The agent's own node publishes it, so it does not cross to other modules. Without a subscriber nothing is built.
 
@@ -396,8 +396,8 @@ def _relayed(route: RouteInfo) -> str:
 _log = logging.getLogger(__name__)
 
 TOPIC: Final = "/diagnostics"
+# The topic of REP 107.
 _ARRAY: Final = known_description(ARRAY_TYPE)
-"""The topic of REP 107."""
 
 
 class Diagnostics(PublicationEvents):

@@ -54,14 +54,14 @@ Args = dict[str, Any]
 
 # --- other sites ----------------------------------------------------------------------------------------------------
 
+# The request for a ``SitesReport`` without sources.
 REPORT: Final = "site.report"
-"""The request for a ``SitesReport`` without sources."""
+# The request for a ``SitesReport`` of one site with its sources: ``{site}``.
 INFO: Final = "site.info"
-"""The request for a ``SitesReport`` of one site with its sources: ``{site}``."""
+# A request about parameters (``bridge.params.rules``) to a module: ``{site, module, what, key, text}``.
 PARAM: Final = "site.param"
-"""A request about parameters (``bridge.params.rules``) to a module: ``{site, module, what, key, text}``."""
+# The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``.
 WHY: Final = "site.why"
-"""The request for the ways of a topic or a service through gateways: ``{name, site, module, service}``."""
 _SOURCES: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL),
     "each topic and service; of this site the asking module's own alone. Sites and modules are named to all",
@@ -73,8 +73,8 @@ _PARAM: Final = Needs(
 _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
+# The questions about other sites.
 QUESTIONS: Final = (REPORT, INFO, PARAM, WHY)
-"""The questions about other sites."""
 
 
 class SiteAnswerer(Protocol):
@@ -100,10 +100,10 @@ class SiteRequests:
 
     def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
+        # What answers as a gateway; ``None``: this agent is none.
         self.answerer: SiteAnswerer | None = None
-        """What answers as a gateway; ``None``: this agent is none."""
+        # The gateway that answered for a site, by its GUID.
         self._liked: dict[str, str] = {}
-        """The gateway that answered for a site, by its GUID."""
 
     def serve(self, gateway: SiteAnswerer) -> None:
         """Answer as a gateway from now on."""
@@ -174,8 +174,8 @@ class SiteRequests:
 
 # --- changes of the local graph -------------------------------------------------------------------------------------
 
+# Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other.
 _REVISION_BITS = 52
-"""Each revision is an integer that all programs read exactly from JSON, and no two agents begin near each other."""
 
 
 class GraphHistory:
@@ -189,8 +189,8 @@ class GraphHistory:
     """
 
     def __init__(self, revision: int) -> None:
+        # The present one: stands for the present local graph.
         self.revision = revision
-        """The present one: stands for the present local graph."""
         self._changes: deque[tuple[RegistrationKind, str]] | None = None
         self._asked = 0
 
@@ -427,6 +427,7 @@ def _request(args: Args, known: Collection[str]) -> str:
     return what
 
 
+# All operations of the control socket, with the type of the value; ``object``: it depends on the arguments.
 REPLIES: Final[dict[str, object]] = {
     "snapshot": Snapshot,
     "ping": PingReply,
@@ -441,7 +442,6 @@ REPLIES: Final[dict[str, object]] = {
     "site": object,  # as ``QUESTIONS`` say
     "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
 }
-"""All operations of the control socket, with the type of the value; ``object``: it depends on the arguments."""
 
 
 # --- the client's side of ``param`` -------------------------------------------------------------------------------

@@ -18,8 +18,8 @@ from rmpa.core.identity import peer_name_problem
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+# The state of a module that is heard, or refuses this one, because it is not of this mesh.
 FOREIGN: Final = "foreign"
-"""The state of a module that is heard, or refuses this one, because it is not of this mesh."""
 
 
 class LaneInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -146,11 +146,13 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     direct_out: int = 0
 
 
-# What an agent tells its peers of itself: the answer to their question ``agent.info``.
+# --- What an agent tells its peers of itself ------------------------------------------------------------------------
+#
+# The answer to their question ``agent.info``.
 
 
+# The request for what an agent tells of itself.
 INFO: Final = "agent.info"
-"""The request for what an agent tells of itself."""
 
 
 class PeerAgent(msgspec.Struct, kw_only=True, frozen=True):
@@ -177,7 +179,9 @@ class PeerAgent(msgspec.Struct, kw_only=True, frozen=True):
     proxies: int | None = None
 
 
-# Other sites as a gateway sees them: what ``rmpa site`` shows.
+# --- Other sites as a gateway sees them -----------------------------------------------------------------------------
+#
+# What ``rmpa site`` shows.
 
 
 class SiteModuleInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -295,23 +299,25 @@ class ContractTerm(msgspec.Struct, kw_only=True, frozen=True):
     rule: str
 
 
-# The result of a check: one model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``.
+# --- The result of a check ------------------------------------------------------------------------------------------
+#
+# One model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``.
 
 
 class CheckLevel(StrEnum):
     """How bad a result is."""
 
     OK = "ok"
+    # It works, or may work: the first thing to check when something fails.
     WARN = "warn"
-    """It works, or may work: the first thing to check when something fails."""
+    # Something cannot work like this. ERROR on ``/diagnostics``.
     FAIL = "fail"
-    """Something cannot work like this. ERROR on ``/diagnostics``."""
+    # It could not be checked.
     SKIPPED = "skipped"
-    """It could not be checked."""
+    # The agent that knows the answer did not reply; the walk along a path goes on.
     UNKNOWN = "unknown"
-    """The agent that knows the answer did not reply; the walk along a path goes on."""
+    # It existed before, and is gone (REP 107).
     STALE = "stale"
-    """It existed before, and is gone (REP 107)."""
 
 
 OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL

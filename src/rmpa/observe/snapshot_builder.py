@@ -478,7 +478,7 @@ def _raise_limit(kind: str) -> str:
     return f"raise it in rmpa.toml and `rmpa reload`, or deny some by {setting}"
 
 
-# Finds peers that share an IP address with another machine.
+# --- Finds peers that share an IP address with another machine ------------------------------------------------------
 #
 # Each agent has a mesh port of its own, so the GUIDs of two machines with one address differ, and the roster takes
 # them for two agents of one machine. TCP shows the difference: the beacons of both arrive, because multicast needs no

@@ -60,8 +60,8 @@ class TopicFacts:
         self._core = core
         self._bridge = bridge
         self._clock = SystemClock()
+        # Over the last minute, by the session's number; those of peers that are away for a moment are kept.
         self._peer_clocks: dict[int, PeerClockHistory] = {}
-        """Over the last minute, by the session's number; those of peers that are away for a moment are kept."""
 
     def follow_clocks(self) -> None:
         """Record each link's estimate of its peer's clock, once a second; forget peers that are gone."""

@@ -37,8 +37,8 @@ __all__ = [
     "between",
     "exactly",
 ]
+# Names that are imported at their first use, because their modules import asyncio and sockets.
 _LAZY: Final = {"ResourceClient": "rmpa.resource.client", "Node": "rmpa.ros.node.node"}
-"""Names that are imported at their first use, because their modules import asyncio and sockets."""
 
 
 def __getattr__(name: str) -> object:

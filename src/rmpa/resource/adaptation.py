@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import AdaptationSettings
     from rmpa.resource.quality import Attribute, Bound, Requirement, Value
 
+# Factor by which each cool-down of a profile is longer than the one before, up to ``cool_down_max``.
 COOL_DOWN_GROWTH: Final = 2.0
-"""Factor by which each cool-down of a profile is longer than the one before, up to ``cool_down_max``."""
 
 
 class CoolDown(NamedTuple):
@@ -82,35 +82,35 @@ class Adaptation:
         self._decider = decider
         self._settings = settings
         self._out = out
+        # The requirement of each client, by client; ``require`` and ``release`` change it.
         self.requirements: dict[str, Requirement] = {}
-        """The requirement of each client, by client; ``require`` and ``release`` change it."""
+        # The requirements of all clients, merged, by attribute.
         self.bounds: dict[str, Bound] = {}
-        """The requirements of all clients, merged, by attribute."""
+        # Clients whose bounds are left out, with texts about it; see ``merge``.
         self.conflicts: list[tuple[str, str]] = []
-        """Clients whose bounds are left out, with texts about it; see ``merge``."""
+        # The profile that runs, or that ran before the one that is being applied; empty: none.
         self.profile = ""
-        """The profile that runs, or that ran before the one that is being applied; empty: none."""
+        # The profile that is being applied; empty: none.
         self.applying = ""
-        """The profile that is being applied; empty: none."""
+        # The profile that was chosen by hand; empty: the loop decides.
         self.pinned = ""
-        """The profile that was chosen by hand; empty: the loop decides."""
+        # The alarm that is raised at present.
         self.alarm: Alarm | None = None
-        """The alarm that is raised at present."""
+        # Why a profile is blocked by its precondition or by the context, by profile.
         self._blocked: dict[str, str] = {}
-        """Why a profile is blocked by its precondition or by the context, by profile."""
         self._cooling: dict[str, CoolDown] = {}
+        # The length of the last cool-down by profile, from which that of the next one is computed.
         self._cool_down_lengths: dict[str, float] = {}
-        """The length of the last cool-down by profile, from which that of the next one is computed."""
+        # The last windows under the profile and requirements: when each began, and its shortfalls.
         self._windows: deque[tuple[float, tuple[Shortfall, ...]]] = deque(maxlen=settings.windows)
-        """The last windows under the profile and requirements: when each began, and its shortfalls."""
+        # The profile that ran before the restart; empty after the first decision.
         self._restored_profile = ""
-        """The profile that ran before the restart; empty after the first decision."""
         self._active_since = -math.inf
         self._window_end: float | None = None
+        # When the cause of the present reconfiguration began; infinite: no reconfiguration is under way.
         self._cause = math.inf
-        """When the cause of the present reconfiguration began; infinite: no reconfiguration is under way."""
+        # Whether a change that skips the dwell time has occurred while a profile was being applied.
         self._replan_at_once = False
-        """Whether a change that skips the dwell time has occurred while a profile was being applied."""
 
     def explain(self, now: float) -> tuple[ProfileScore, ...]:
         """The present score of each profile, with the reason if the profile is excluded."""

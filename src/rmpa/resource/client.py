@@ -52,8 +52,8 @@ class ResourceClient:
     def __init__(self, node: Node, resource: str) -> None:
         self._node = node
         self.resource = resource if resource.startswith("/") else f"/{resource}"
+        # The last answer to the present request; ``None`` until it arrives.
         self.answer: RequirementAnswer | None = None
-        """The last answer to the present request; ``None`` until it arrives."""
         self._requirements: Publisher | None = None
         self._observed: Publisher | None = None
         self._responses: Subscriber | None = None
@@ -198,8 +198,8 @@ class Demands(RuntimePart):
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._clients: dict[str, ResourceClient] = {}
+        # Name of the first output of each resource whose descriptor has been received, by resource.
         self._first: dict[str, str] = {}
-        """Name of the first output of each resource whose descriptor has been received, by resource."""
         self._undo = contextlib.AsyncExitStack()
 
     async def start(self) -> None:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
+from rmpa.resource.adapter import HungError, call_function
 from rmpa.resource.declare import Context, parse_rule, split_reference
 from rmpa.resource.descriptor import topic_of
-from rmpa.resource.loop import HungError, call_function
 from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
@@ -27,18 +27,18 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
+    from rmpa.resource.adapter import Adapter
     from rmpa.resource.declare import Input, Output, Parameter, Scalar
-    from rmpa.resource.loop import Adapter
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 _HOLDER: Final = "context"
+# Seconds from a change of a value until the rules are evaluated; changes within that time share one evaluation.
 _DEBOUNCE: Final = 0.02
-"""Seconds from a change of a value until the rules are evaluated; changes within that time share one evaluation."""
+# Seconds between evaluations without a change: a dwell time may have ended, or a publisher may be gone.
 _INTERVAL: Final = 0.25
-"""Seconds between evaluations without a change: a dwell time may have ended, or a publisher may be gone."""
 
 
 class Contexts(RuntimePart):
@@ -56,12 +56,12 @@ class Contexts(RuntimePart):
         self._tasks = tasks
         self._adapter = adapter
         self._known = resource.contexts
+        # Name of the present context; empty: none.
         self.current = ""
-        """Name of the present context; empty: none."""
+        # Name of the context chosen by hand; empty: the rules decide. May be set before ``start``.
         self.chosen = ""
-        """Name of the context chosen by hand; empty: the rules decide. May be set before ``start``."""
+        # When the present context began, monotonic seconds.
         self._since = -math.inf
-        """When the present context began, monotonic seconds."""
         self._rules = {
             name: parse_rule(context.when, resource.parameters, f"context {name} of {resource.name}")
             for name, context in self._known.items()
@@ -71,17 +71,17 @@ class Contexts(RuntimePart):
         self._parameters = {reference for reference in references if reference.startswith("~")}
         self._fields = {reference: _TopicField(reference) for reference in references - self._parameters}
         self._subscribers: dict[str, Subscriber] = {}
+        # The topic of each input or output of the resource that a rule refers to, by the declared name.
         self._taps: dict[str, str] = {}
-        """The topic of each input or output of the resource that a rule refers to, by the declared name."""
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
         self._retry = 0.0
+        # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
-        """Held during a switch, and from a choice to its outcome: one that fails must not undo the next."""
         self._work: set[asyncio.Task[None]] = set()
         self._next_evaluation: float | None = None
         self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
+        # True before ``start`` and after ``close``.
         self._closed = True
-        """True before ``start`` and after ``close``."""
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Why fields that rules refer to cannot be read."""
@@ -283,10 +283,10 @@ class _TopicField:
     def __init__(self, reference: str) -> None:
         self._reference = reference
         self._fields: tuple[str, ...] = ()
+        # Global name of the topic; empty until it is found.
         self.topic = ""
-        """Global name of the topic; empty until it is found."""
+        # Why the field cannot be read from the topic's messages; empty if it can.
         self.problem = ""
-        """Why the field cannot be read from the topic's messages; empty if it can."""
 
     def find(self, published: set[str]) -> bool:
         """Find the topic among the published ones; false if none of the candidates is published."""

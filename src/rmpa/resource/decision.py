@@ -1,9 +1,9 @@
 """Which profile fits: the most similar one, with its reasons; shortfalls and alarms (paper, section 3.1). Pure.
 
-For each requested attribute, a profile's *shortfall* is the distance by which its value lies outside of the bound,
-divided by ``s``: the attribute's tolerance, or else its range over all profiles. Where that is 0, the shortfall is 0
-or 1. A value within the bound has no shortfall. A profile's *distance* ``D`` is the weighted root mean square of its
-shortfalls, plus a part of its cost::
+For each requested attribute, a profile's *shortfall* is how far its value lies outside of the bound; a value within
+the bound has none. ``delta`` is the shortfall divided by ``s``: the attribute's tolerance, or else its range over all
+profiles; where that is 0, ``delta`` is 0 or 1. A profile's *distance* ``D`` is the weighted root mean square of its
+deltas, plus a part of its cost::
 
     delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import Profile
     from rmpa.resource.quality import Attribute, Bound, Value
 
+# What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall.
 EPSILON: Final = 1e-3
-"""What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall."""
+# Shortfall of a profile that does not offer the attribute, or that offers another word: the whole range.
 _MISSING: Final = 1.0
-"""Shortfall of a profile that does not offer the attribute, or that offers another word: the whole range."""
+# Factor by which a soft bound may be missed further than the profile declares, before it counts as violated.
 EXPECTED: Final = 1.25
-"""Factor by which a soft bound may be missed further than the profile declares, before it counts as violated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +95,8 @@ class Decider:
         self._resource = resource
         self._attributes = attributes
         self.profiles = {profile.name: profile for profile in profiles}
+        # What a shortfall of 1 is on the scale of each attribute that a profile offers.
         self._spans: dict[str, float] = {}
-        """What a shortfall of 1 is on the scale of each attribute that a profile offers."""
         for name in {name for profile in profiles for name in profile.offers}:
             attribute = attributes[name]
             places = [attribute.position(profile.offers[name]) for profile in profiles if name in profile.offers]
@@ -167,7 +167,7 @@ class Decider:
         return beyond / span if span > 0 else _MISSING
 
 
-# Shortfalls of measured quality, and alarms about them.
+# --- Shortfalls of measured quality, and alarms about them ----------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,10 +222,10 @@ def find_shortfalls(
 class AlarmKind(Enum):
     """The kind of an alarm, which determines its diagnostic level (REP 107)."""
 
+    # A quality is violated, and another profile takes over: WARN.
     ADAPTATION = "adaptation"
-    """A quality is violated, and another profile takes over: WARN."""
+    # No profile meets the requirements; the most similar one runs: ERROR.
     NON_ADAPTABLE = "non_adaptable"
-    """No profile meets the requirements; the most similar one runs: ERROR."""
 
 
 @dataclass(frozen=True, slots=True)

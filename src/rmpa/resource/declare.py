@@ -89,8 +89,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         self._value: Any = self.default
+        # Whether the value was given for this run (``rmpa run --set``); it then overrides stored values.
         self.given = False
-        """Whether the value was given for this run (``rmpa run --set``); it then overrides stored values."""
 
     @property
     def value(self) -> Any:
@@ -160,7 +160,7 @@ class Parameter:
         return value
 
 
-# Interfaces of a resource: outputs, inputs, attributes that the user's code observes, requirements on others.
+# --- Interfaces of a resource ---------------------------------------------------------------------------------------
 
 
 class DeclaredTopic:
@@ -179,10 +179,10 @@ class DeclaredTopic:
         self.name = name
         self.type_name = type_name
         self.contract = contract
+        # The type; ``None`` until it is known.
         self.known: MessageType | None = None
-        """The type; ``None`` until it is known."""
+        # Why the type is not known on this machine; ``None`` if it is.
         self.problem: UnknownTypeError | None = None
-        """Why the type is not known on this machine; ``None`` if it is."""
         try:
             self.known = find_message_type(type_name)
         except UnknownTypeError as error:
@@ -206,10 +206,10 @@ class DeclaredTopic:
 class Output(DeclaredTopic):
     """A topic that the resource publishes."""
 
+    # Whether a late subscriber gets the last message.
     latch = False
-    """Whether a late subscriber gets the last message."""
+    # Called in any thread with ``(message fields, whole message)``; ``None`` while the resource does not run.
     on_publish: Callable[[Mapping[str, Any], object | None], None] | None = None
-    """Called in any thread with ``(message fields, whole message)``; ``None`` while the resource does not run."""
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
         """Publish a message: an object, plain values (see ``MessageType.make``), or fields by name.
@@ -229,8 +229,8 @@ class Output(DeclaredTopic):
 class Input(DeclaredTopic):
     """A topic that the resource needs."""
 
+    # Whether the resource is stale while the topic has no publisher.
     required = True
-    """Whether the resource is stale while the topic has no publisher."""
 
 
 @dataclass(eq=False)
@@ -282,7 +282,7 @@ class Demand:
             self.on_change(self)
 
 
-# Behaviour of a resource: profiles with their functions, contexts, tasks.
+# --- Behaviour of a resource ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,12 +334,12 @@ class Context:
 class OnFailure(StrEnum):
     """What happens to a task that has raised or is stuck."""
 
+    # The task runs again after a back-off, which grows with each consecutive failure.
     RESTART = "restart"
-    """The task runs again after a back-off, which grows with each consecutive failure."""
+    # The task ends; the resource reports that and continues without the task.
     STOP = "stop"
-    """The task ends; the resource reports that and continues without the task."""
+    # The whole resource becomes inactive.
     DEACTIVATE = "deactivate"
-    """The whole resource becomes inactive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,7 +366,7 @@ class Task:
     rate_parameter: Parameter | None = None
 
 
-# Checks of the arguments of a declaration: functions, keys of a contract, values of an ``Enum``.
+# --- Checks of the arguments of a declaration -----------------------------------------------------------------------
 
 
 def check_arity(function: Callable[..., object], count: int, where: str) -> None:
@@ -422,9 +422,7 @@ def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], l
     raise ConfigError(where, problem, suggestion(text, names, f"{listed}{', '.join(names)}"))
 
 
-# Rules that select a context by fields of topics and by the resource's parameters.
-#
-# ::
+# --- Rules that select a context by fields of topics and by the resource's parameters -------------------------------
 #
 #     rule       = conjunction { "or" conjunction }
 #     conjunction= negation { "and" negation }
@@ -439,8 +437,8 @@ def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], l
 # Pure: a rule is parsed once, into a function of the values; nothing is evaluated as Python.
 
 
+# A value that rules can compare.
 Scalar = bool | int | float | str
-"""A value that rules can compare."""
 _Holds = Callable[[Mapping[str, Scalar]], bool | None]
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"

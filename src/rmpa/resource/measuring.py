@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
+# Number of publishers of one topic whose sequence numbers are tracked; one more, and the tracking starts afresh.
 _SOURCES: Final = 64
-"""Number of publishers of one topic whose sequence numbers are tracked; one more, and the tracking starts afresh."""
 
 
 class TopicQuality:
@@ -136,22 +136,21 @@ class QualityMeasurement:
         self._labels = resource.labels
         self._declared = resource.declared_attributes
         self._topics: dict[str, TopicQuality] = {}
+        # Inputs whose type is not known yet, by name; it is learnt from their first publisher.
         self._unknown: dict[str, DeclaredTopic] = {}
-        """Inputs whose type is not known yet, by name; it is learnt from their first publisher."""
         for name, topic in (resource.outputs | resource.inputs).items():
             self._add(topic, now, numbered=name in resource.inputs)
             if topic.known is None:
                 self._unknown[name] = topic
+        # The first output; its attributes are also available without the output's label.
         self._primary = next(iter(resource.outputs), "")
-        """The first output; its attributes are also available without the output's label."""
+        # Sum and number of the window's observations, by declared attribute.
         self._sums: dict[str, tuple[float, int]] = {}
-        """Sum and number of the window's observations, by declared attribute."""
+        # The mean of the last window with observations, or the last observed word, by declared attribute.
+        #
+        # It stays valid without a new observation: a battery's charge remains known between two readings. After a
+        # change of profile the attribute is unknown until it is observed again.
         self._observed: dict[str, Value] = {}
-        """The mean of the last window with observations, or the last observed word, by declared attribute.
-
-        It stays valid without a new observation: a battery's charge remains known between two readings. After a
-        change of profile the attribute is unknown until it is observed again.
-        """
 
     def message(self, topic: str, raw: bytes, now: float, now_ns: int, caller: str = "") -> None:
         """Measure a message that an output has sent or an input has received.
@@ -220,8 +219,8 @@ class QualityMeasurement:
 # measure the loss.
 
 
+# Consecutive windows for which something must be missing before it is reported, since connecting takes a while.
 MISSING_WINDOWS: Final = 2
-"""Consecutive windows for which something must be missing before it is reported, since connecting takes a while."""
 _WORSE: Final = {Direction.MAX: -1, Direction.MIN: 1}
 
 

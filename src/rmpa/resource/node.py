@@ -8,9 +8,9 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
+from rmpa.resource.adapter import Adapter
 from rmpa.resource.client import Demands
 from rmpa.resource.contexts import Contexts
-from rmpa.resource.loop import Adapter
 from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
@@ -34,13 +34,13 @@ _log = logging.getLogger(__name__)
 # Time between two checks of a resource whether a publisher of a type that it needs has appeared.
 TYPE_LOOK: Final = 1.0
 _UNCONFIGURED, _INACTIVE, _ACTIVE, _FINALIZED = LifecycleState
+# The states from which each transition of the life cycle is valid, and the one to which it leads.
 TRANSITIONS: Final = {
     "configure": ((_UNCONFIGURED,), _INACTIVE),
     "activate": ((_INACTIVE,), _ACTIVE),
     "deactivate": ((_ACTIVE,), _INACTIVE),
     "finalize": ((_UNCONFIGURED, _INACTIVE, _ACTIVE), _FINALIZED),
 }
-"""The states from which each transition of the life cycle is valid, and the one to which it leads."""
 
 
 class ResourceNode:
@@ -63,8 +63,8 @@ class ResourceNode:
             remedy = "declare one: @NAME.profile(offers={…})"
             raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy)
         self.resource = resource
+        # Set when the resource is finalized, or when its node is shut down from outside.
         self.ended = asyncio.Event()
-        """Set when the resource is finalized, or when its node is shut down from outside."""
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.runtime.close_outputs()
@@ -73,16 +73,16 @@ class ResourceNode:
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
+        # In the order of their start.
         self.parts: list[RuntimePart] = [self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
-        """In the order of their start."""
         self._persistence: Persistence | None = None
         if state is not None:
             self._persistence = Persistence(self.runtime, self._state, state)
             self.parts.append(self._persistence)
+        # The profile that ran last; empty: none yet.
         self._last = ""
-        """The profile that ran last; empty: none yet."""
+        # The transition whose callback runs; empty: none.
         self._under_way = ""
-        """The transition whose callback runs; empty: none."""
         self._deactivating: asyncio.Task[None] | None = None
 
     async def learn(self) -> None:
@@ -245,7 +245,7 @@ class ResourceNode:
 
     def _state(self, now: float, now_ns: int) -> SavedState:
         """The state to keep over a restart; see ``Persistence``."""
-        loop = self.adapter.loop
+        loop = self.adapter.adaptation
         self._last = loop.profile or self._last
         cooling = loop.cooling(asyncio.get_running_loop().time())
         return SavedState(

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from rmpa.ros.types.definitions import DiagnosticLevel
 
 
-# Units of quality attributes and their conversion: ``20 Hz``, ``50 ms``, ``2 MB/s``.
+# --- Units of quality attributes and their conversion ---------------------------------------------------------------
+#
+# ``20 Hz``, ``50 ms``, ``2 MB/s``.
 
 
 _DIMENSIONS: Final[dict[str, dict[str, float]]] = {
@@ -85,32 +87,34 @@ def quantity(text: str | float, to: str, where: str) -> float:
     return value * _DIMENSIONS[dimension][unit] / _DIMENSIONS[dimension][to]
 
 
-# Quality attributes: the unit and the scale of a quality, and which direction is better.
+# --- Quality attributes ---------------------------------------------------------------------------------------------
+#
+# The unit and the scale of a quality, and which direction is better.
 
 
 class Direction(StrEnum):
     """Which values of an attribute are better."""
 
+    # More is better: a request is a lower bound (rate, resolution).
     MAX = "max"
-    """More is better: a request is a lower bound (rate, resolution)."""
+    # Less is better: a request is an upper bound (latency, energy).
     MIN = "min"
-    """Less is better: a request is an upper bound (latency, energy)."""
+    # Nearer to a requested value or interval is better (zoom, speed).
     TARGET = "target"
-    """Nearer to a requested value or interval is better (zoom, speed)."""
+    # Only a requested value will do (frame id, encoding).
     EXACT = "exact"
-    """Only a requested value will do (frame id, encoding)."""
 
 
 class Scale(StrEnum):
     """How the distance between two values is measured."""
 
     LINEAR = "linear"
+    # By the ratio: 10 Hz is as far from 20 Hz as 20 Hz from 40 Hz. For rates, latencies and bandwidths.
     LOG = "log"
-    """By the ratio: 10 Hz is as far from 20 Hz as 20 Hz from 40 Hz. For rates, latencies and bandwidths."""
+    # Ordered words; the distance is the difference of their positions.
     ORDINAL = "ordinal"
-    """Ordered words; the distance is the difference of their positions."""
+    # Words without an order: equal or not.
     NOMINAL = "nominal"
-    """Words without an order: equal or not."""
 
 
 class Category(StrEnum):
@@ -118,15 +122,15 @@ class Category(StrEnum):
 
     TEMPORAL = "temporal"
     SPATIAL = "spatial"
+    # Reliability of information: accuracy, confidence, loss.
     RELIABILITY = "reliability"
-    """Reliability of information: accuracy, confidence, loss."""
+    # Performance of the operation: energy, CPU, cost.
     PERFORMANCE = "performance"
-    """Performance of the operation: energy, CPU, cost."""
 
 
 _LOG_FLOOR: Final = 1e-12
+# The value of a quality: a number in the attribute's unit, or one of its words.
 Value = float | str
-"""The value of a quality: a number in the attribute's unit, or one of its words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,6 +225,8 @@ class Attribute:
 
 
 _MAX, _MIN, _LOG = Direction.MAX, Direction.MIN, Scale.LOG
+# The attributes that are measured of every output and input without being declared, by name. ``loss`` and
+# ``deadline_misses`` are shares of 1.
 MEASURED: Final = {
     a.name: a
     for a in (
@@ -233,8 +239,6 @@ MEASURED: Final = {
         Attribute("bandwidth", _MIN, "B/s", _LOG),
     )
 }
-"""The attributes that are measured of every output and input without being declared, by name. ``loss`` and
-``deadline_misses`` are shares of 1."""
 
 
 def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str) -> Attribute:
@@ -250,7 +254,9 @@ def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str
     return found
 
 
-# Requests for one attribute: as a user writes them (``at_least("20 Hz", hard=True)``), and as bounds.
+# --- Requests for one attribute -------------------------------------------------------------------------------------
+#
+# As a user writes them (``at_least("20 Hz", hard=True)``), and as bounds.
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,7 +392,9 @@ def between(low: float | str, high: float | str, *, hard: bool = False, weight: 
     return QoSRequest(at_least=low, at_most=high, hard=hard, weight=weight)
 
 
-# Requests as texts, which any ROS tool can publish: ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
+# --- Requests as texts, which any ROS tool can publish --------------------------------------------------------------
+#
+# ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
 #
 # ::
 #
@@ -458,7 +466,9 @@ def parse_bound(text: str, name: str, attributes: Mapping[str, Attribute], resou
     return request.bound(attribute)
 
 
-# Requirements of clients: the requests of each, and their merge.
+# --- Requirements of clients ----------------------------------------------------------------------------------------
+#
+# The requests of each, and their merge.
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,9 +27,9 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from rmpa.resource.adapter import Adapter
     from rmpa.resource.contexts import Contexts
     from rmpa.resource.declare import ParameterValue
-    from rmpa.resource.loop import Adapter
     from rmpa.resource.resource import Resource
     from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
@@ -41,19 +41,19 @@ DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"
 SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
 PROFILE: Final = "profile"
 CONTEXT: Final = "context"
+# Name that enumerations show for an empty ``profile`` or ``context``.
 AUTOMATIC: Final = "automatic"
-"""Name that enumerations show for an empty ``profile`` or ``context``."""
+# dynamic_reconfigure's type of the values in each list of a ``Config``.
 _LISTS: Final = {"bools": "bool", "ints": "int", "strs": "str", "doubles": "double"}
-"""dynamic_reconfigure's type of the values in each list of a ``Config``."""
+# The group of all parameters: the one that every server has.
 _GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
-"""The group of all parameters: the one that every server has."""
 _HOLDER: Final = "configuration"
+# Seconds that an ending resource waits for the parameter server.
 _MIRROR_TIMEOUT: Final = 1.0
-"""Seconds that an ending resource waits for the parameter server."""
 _log = logging.getLogger(__name__)
 
 
-# Pure functions between parameters and the plain values of dynamic_reconfigure's messages.
+# --- Pure functions between parameters and the plain values of dynamic_reconfigure's messages -----------------------
 
 
 @dataclass(eq=False)
@@ -269,7 +269,7 @@ class Reconfigure(RuntimePart):
     @property
     def values(self) -> dict[str, ParameterValue]:
         """The present value of each parameter, with ``profile`` and ``context`` as chosen by hand."""
-        chosen = {PROFILE: self._adapter.loop.pinned, CONTEXT: self._contexts.chosen}
+        chosen = {PROFILE: self._adapter.adaptation.pinned, CONTEXT: self._contexts.chosen}
         return {name: chosen.get(name, parameter.value) for name, parameter in self._known.items()}
 
     async def set(self, values: Mapping[str, ParameterValue]) -> None:
@@ -290,7 +290,7 @@ class Reconfigure(RuntimePart):
                 if (context := wanted.pop(CONTEXT, before)) != before:
                     await self._contexts.choose(str(context))
                 try:
-                    await self._choose_profile(str(wanted.pop(PROFILE, self._adapter.loop.pinned)))
+                    await self._choose_profile(str(wanted.pop(PROFILE, self._adapter.adaptation.pinned)))
                 except RmpaError:
                     await self._contexts.choose(before)
                     raise
@@ -330,7 +330,7 @@ class Reconfigure(RuntimePart):
             self._tasks.resume(_HOLDER)
 
     async def _choose_profile(self, profile: str) -> None:
-        loop, before = self._adapter.loop, self._adapter.loop.pinned
+        loop, before = self._adapter.adaptation, self._adapter.adaptation.pinned
         if profile == before and (not profile or profile == loop.profile):
             return
         self._adapter.pin(profile)

@@ -50,20 +50,20 @@ from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scal
 if TYPE_CHECKING:
     from rmpa.resource.quality import QoSRequest
 
+# The highest rate of a periodic task, in Hz.
 _RATE_MAX: Final = 10_000
-"""The highest rate of a periodic task, in Hz."""
 _Function = TypeVar("_Function", bound=Callable[..., object])
+# Names below a resource's node that are reserved for topics, services and parameters of every resource.
 RESERVED: Final = frozenset(
     {
         "alarms", "context", "decision", "descriptor", "observed", "parameter_descriptions", "parameter_updates",
         "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
     }
 )  # fmt: skip
-"""Names below a resource's node that are reserved for topics, services and parameters of every resource."""
+# Keys of requirements and quality reports that cannot be names of attributes.
 NOT_ATTRIBUTES: Final = frozenset({"expires", "level_for", "priority", "profile", "reaction"})
-"""Keys of requirements and quality reports that cannot be names of attributes."""
+# The least value in seconds of each time of the control loop.
 _LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, "apply_timeout": 0.01}
-"""The least value in seconds of each time of the control loop."""
 _DAY: Final = 86400
 
 
@@ -107,8 +107,8 @@ class Resource:
         self.tasks: dict[str, Task] = {}
         self.demands: dict[str, Demand] = {}
         self.hooks: dict[str, Hook] = {}
+        # Parameters of the control loop.
         self.settings = AdaptationSettings()
-        """Parameters of the control loop."""
 
     # --- interfaces -------------------------------------------------------------------------------
 

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
+# ``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
+# begins; else empty.
 CALLER: ContextVar[str] = ContextVar("caller", default="")
-"""``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
-begins; else empty."""
 
 
 class LifecycleState(StrEnum):
@@ -46,14 +46,14 @@ class LifecycleState(StrEnum):
         any of them ──finalize──► finalized
     """
 
+    # The node is registered; the device is not open yet.
     UNCONFIGURED = "unconfigured"
-    """The node is registered; the device is not open yet."""
+    # Parameters can be set; no task runs and nothing is published.
     INACTIVE = "inactive"
-    """Parameters can be set; no task runs and nothing is published."""
+    # The tasks run, and outputs are published.
     ACTIVE = "active"
-    """The tasks run, and outputs are published."""
+    # The resource has ended; no transition leads out of this state.
     FINALIZED = "finalized"
-    """The resource has ended; no transition leads out of this state."""
 
 
 class RuntimePart:
@@ -98,10 +98,10 @@ class Runtime:
         self.node = node
         self.parts: list[RuntimePart] = []
         self.state = LifecycleState.UNCONFIGURED
+        # Called in the event loop with each value that the user's code has observed.
         self.on_observation: Callable[[str, Value], None] = lambda _attribute, _value: None
-        """Called in the event loop with each value that the user's code has observed."""
+        # The only outputs that are published in the present context; ``None``: all.
         self.context_outputs: tuple[str, ...] | None = None
-        """The only outputs that are published in the present context; ``None``: all."""
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
@@ -109,10 +109,10 @@ class Runtime:
         self._held_bytes = 0
         self._holders: set[str] = set()
         self._open = True
+        # Number of messages refused since the outputs were closed, by output.
         self._refused: Counter[str] = Counter()
-        """Number of messages refused since the outputs were closed, by output."""
+        # Pairs of an input and a publisher whose message definition cannot be used; each is logged once.
         self._unusable: set[tuple[str, str]] = set()
-        """Pairs of an input and a publisher whose message definition cannot be used; each is logged once."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
         self._undo = contextlib.AsyncExitStack()

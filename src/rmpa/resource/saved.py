@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _SECOND: Final = 1_000_000_000
+# Number of consecutive checks without a connection after which a client is gone. One check is not enough: after a
+# short interruption of its link, the connections of a proxy are made again.
 _ABSENT: Final = 2
-"""Number of consecutive checks without a connection after which a client is gone. One check is not enough: after a
-short interruption of its link, the connections of a proxy are made again."""
 
 
 class SavedRequirement(msgspec.Struct, frozen=True, kw_only=True):
@@ -161,7 +161,9 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         return found, lost
 
 
-# The clients of a resource: their last messages, refusals and presence. ``quality.merge`` merges their requirements.
+# --- The clients of a resource --------------------------------------------------------------------------------------
+#
+# Their last messages, refusals and presence. ``quality.merge`` merges their requirements.
 
 
 @dataclass(slots=True)
@@ -197,8 +199,8 @@ class Clients:
         self._resource = resource
         self._attributes = attributes
         self.known: dict[str, ClientRecord] = {}
+        # Expiry in monotonic seconds, by client and stamp: a latched request that arrives again keeps its expiry.
         self.expiries: dict[tuple[str, str], float] = {}
-        """Expiry in monotonic seconds, by client and stamp: a latched request that arrives again keeps its expiry."""
 
     def __getitem__(self, name: str) -> ClientRecord:
         """The client of this name; an empty record if it has sent nothing."""
@@ -314,11 +316,11 @@ class Persistence(RuntimePart):
         self._path = path
         self._lock: int | None = None
         self._started = False
+        # The state that was written last, with times of the monotonic clock.
         self._written: SavedState | None = None
-        """The state that was written last, with times of the monotonic clock."""
         self._writing: asyncio.Task[None] | None = None
+        # Why nothing can be stored at present; empty if storing works.
         self._problem = ""
-        """Why nothing can be stored at present; empty if storing works."""
 
     async def restore(self) -> SavedState:
         """Read the file, restore the parameters and return the saved state; called before the parts start."""

@@ -31,20 +31,20 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Received
 
 _log = logging.getLogger(__name__)
+# Seconds of the back-off after a task's first failure.
 RESTART_FIRST: Final = 0.1
-"""Seconds of the back-off after a task's first failure."""
+# Seconds of the longest back-off.
 RESTART_MAX: Final = 5.0
-"""Seconds of the longest back-off."""
+# Number of periods after which a run is stuck, unless declared otherwise.
 STUCK_PERIODS: Final = 10
-"""Number of periods after which a run is stuck, unless declared otherwise."""
+# Lower bound in seconds of the time after which a run is stuck, unless declared otherwise.
 STUCK_LEAST: Final = 5.0
-"""Lower bound in seconds of the time after which a run is stuck, unless declared otherwise."""
+# The longest time in seconds that a waiting thread takes to notice that it has to end.
 ENTER_SLICE: Final = 0.1
-"""The longest time in seconds that a waiting thread takes to notice that it has to end."""
+# Seconds between a waiting coroutine's checks of the gate; polling will do, because changes are rare and short.
 _POLL: Final = 0.002
-"""Seconds between a waiting coroutine's checks of the gate; polling will do, because changes are rare and short."""
+# Seconds between checks for stuck runs.
 _STUCK_CHECK: Final = 0.25
-"""Seconds between checks for stuck runs."""
 _EARLY: Final = 1e-9
 
 
@@ -190,15 +190,15 @@ class TaskRunner:
         self.problem = problem
         self.stopped = False
         self.report = TaskReport()
+        # When the present run began, in monotonic seconds; ``None`` between two runs.
         self.running_since: float | None = None
-        """When the present run began, in monotonic seconds; ``None`` between two runs."""
+        # The period in seconds; ``None`` if the task runs on messages.
         self.period: float | None = None
-        """The period in seconds; ``None`` if the task runs on messages."""
+        # Wakes the run loop: a message has arrived, or the period has changed.
         self.wake: Callable[[], None] = lambda: None
-        """Wakes the run loop: a message has arrived, or the period has changed."""
         self._tasks = tasks
+        # Number of failures since the last run that succeeded.
         self._in_a_row = 0
-        """Number of failures since the last run that succeeded."""
         self._messages: deque[Received] = deque()
         if rate := task.rate_parameter.value if task.rate_parameter is not None else task.rate:
             self.period = 1 / rate
@@ -417,11 +417,10 @@ class Tasks(RuntimePart):
         self._on_deactivate = on_deactivate
         self.gate = RunGate()
         self._runners: dict[str, AsyncTaskRunner | ThreadTaskRunner] = {}
+        # The problem of each task that was too slow in the last window in which it ran, by name.
+        #
+        # It is empty after the first such window, because that alone may be due to load of the machine.
         self._slow: dict[str, str] = {}
-        """The problem of each task that was too slow in the last window in which it ran, by name.
-
-        It is empty after the first such window, because that alone may be due to load of the machine.
-        """
         self._next_check: float | None = None
         self._timer = MachineTimer(lambda: self._next_check, self._check_stuck, now=time.monotonic)
 

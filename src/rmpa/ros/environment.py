@@ -184,7 +184,7 @@ def _split(
     return special, remappings, parameters, tuple(rest)
 
 
-# Records about nodes, as ``rmpa node`` shows them and agents send them to each other.
+# --- Records about nodes, as ``rmpa node`` shows them and agents send them to each other ----------------------------
 
 
 class NodeLine(msgspec.Struct, frozen=True):

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-# The mesh port: TCP for links and UDP for unicast beacons under one number.
+# --- The mesh port --------------------------------------------------------------------------------------------------
+#
+# TCP for links and UDP for unicast beacons under one number.
 
 
 def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
@@ -78,7 +80,9 @@ def _refused(port: int, error: OSError) -> StartError:
     return StartError(f"mesh port {port}", problem, remedy)
 
 
-# The file descriptors of this process: which uses may take the last ones, and what is said when they run out.
+# --- The file descriptors of this process ---------------------------------------------------------------------------
+#
+# Which uses may take the last ones, and what is said when they run out.
 #
 # A process without a free descriptor can neither accept nor dial. Connections for data are refused early, so that
 # the ROS core, the control socket and the links to peers still work: a user must be able to ask what is wrong.

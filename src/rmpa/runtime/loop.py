@@ -62,7 +62,7 @@ async def sleep_to_tick(period: float) -> None:
     await asyncio.sleep(next_tick(period, now) - now)
 
 
-# The machine's own clocks.
+# --- The machine's own clocks ---------------------------------------------------------------------------------------
 
 
 class SystemClock:
@@ -77,7 +77,7 @@ class SystemClock:
         return time.time_ns()
 
 
-# Runs the timer of a protocol machine in the event loop.
+# --- Runs the timer of a protocol machine in the event loop ---------------------------------------------------------
 #
 # A machine has no clock: its ``next_timer()`` returns when it must be called next, and the call passes the time.
 
@@ -140,7 +140,9 @@ class MachineTimer:
         self.arm()
 
 
-# A timer as a file descriptor (timerfd_create(2)): due at an absolute time, to the microsecond.
+# --- A timer as a file descriptor (timerfd_create(2)) ---------------------------------------------------------------
+#
+# Due at an absolute time, to the microsecond.
 #
 # The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of
 # 50 µs. A timerfd has neither fault. Python supports it since 3.13 only, so the C library is called.
@@ -217,7 +219,9 @@ def _check(result: int) -> int:
     return result
 
 
-# The event loop of an agent: asyncio's, with direct callbacks for the sockets of the data path.
+# --- The event loop of an agent -------------------------------------------------------------------------------------
+#
+# Asyncio's, with direct callbacks for the sockets of the data path.
 #
 # asyncio takes an event from the selector, finds its handle, queues it, checks its timers, and runs the handle in
 # its context. For a message that is forwarded at once this is a fifth of the interpreter's work. Here the selector

@@ -42,7 +42,7 @@ def give_back() -> None:
     gc.unfreeze()
 
 
-# Writes an agent's log lines in a thread, so that a log that is not read does not block the agent.
+# --- Writes an agent's log lines in a thread, so that a log that is not read does not block the agent ---------------
 
 
 _log = logging.getLogger(__name__)
@@ -110,8 +110,9 @@ class LogWriter:
                 return  # the pipe is closed
 
 
-# ``--realtime``: SCHED_FIFO and locked memory. All else is the systemd unit's, or the shell's that starts the
-# agent.
+# --- ``--realtime`` -------------------------------------------------------------------------------------------------
+#
+# SCHED_FIFO and locked memory. All else is the systemd unit's, or the shell's that starts the agent.
 #
 # The loop's thread gets SCHED_FIFO, and worker threads get it with one priority less. With default scheduling a
 # busy process could keep a worker thread that holds the interpreter's lock from the CPU, and the loop would wait
@@ -181,7 +182,9 @@ def _lock_memory() -> str:
     return ""
 
 
-# Status notifications to systemd (sd_notify(3)): one datagram to NOTIFY_SOCKET, if it is set.
+# --- Status notifications to systemd (sd_notify(3)) -----------------------------------------------------------------
+#
+# One datagram to NOTIFY_SOCKET, if it is set.
 
 
 def notify_service_manager(state: str) -> bool:

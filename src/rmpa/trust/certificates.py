@@ -34,12 +34,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-# Signed, numbered documents of the authority: the deny list and the list of group keys (docs/design/trust.md).
+# --- Signed, numbered documents of the authority --------------------------------------------------------------------
+#
+# The deny list and the list of group keys (docs/design/trust.md).
 #
 # A document is the JSON object ``{"signed": TEXT, "signature": BASE64}``: TEXT is a JSON object too, and the
-# signature
-# (ECDSA P-256, SHA-256, DER) is over the kind's label, a zero byte and TEXT. So it can be checked before TEXT is
-# parsed, and no document can stand for one of the other kind. Of two documents the one with the higher number
+# signature (ECDSA P-256, SHA-256, DER) is over the kind's label, a zero byte and TEXT. So it can be checked before
+# TEXT is parsed, and no document can stand for one of the other kind. Of two documents the one with the higher number
 # holds.
 
 

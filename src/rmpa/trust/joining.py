@@ -169,7 +169,9 @@ class JoinServer:
         changed.set()
 
 
-# A join, and a renewal with a certificate that has ended: the side of the module that asks.
+# --- A join, and a renewal with a certificate that has ended --------------------------------------------------------
+#
+# The side of the module that asks.
 
 
 _REMEDIES: Final = {
@@ -299,7 +301,7 @@ async def renew_at_authority(membership: Membership, address: str, port: int) ->
     membership.take_grant(grant)
 
 
-# Builds the state that ``rmpa trust status``, the snapshot and ``/diagnostics`` show.
+# --- Builds the state that ``rmpa trust status``, the snapshot and ``/diagnostics`` show ----------------------------
 
 
 def status_of(

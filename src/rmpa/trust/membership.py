@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from rmpa.trust.certificates import CertificateRequest
     from rmpa.trust.store import TrustStore
 
-# Private keys of modules and of the CA, as PEM.
+
+# --- Private keys of modules and of the CA, as PEM ------------------------------------------------------------------
 
 
 def new_key() -> bytes:

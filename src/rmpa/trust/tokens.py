@@ -258,7 +258,9 @@ class TokenBook:
         return True
 
 
-# The messages of joins and renewals: one question and one answer, inside TLS with the ALPN ``rmpa-join/1``.
+# --- The messages of joins and renewals -----------------------------------------------------------------------------
+#
+# One question and one answer, inside TLS with the ALPN ``rmpa-join/1``.
 #
 # ::
 #
@@ -267,9 +269,8 @@ class TokenBook:
 #     renew {request} ────────────────────────────────► the certificate of the connection may be renewed
 #                 ◄── grant {certificate, ca, keys, deny}, or refuse {reason, text}
 #
-# The proof is made with the token's key over the request and the server's certificate (``proof_of``): only a
-# holder of
-# the token's secret can have made it, and only for this TLS connection. The joining module has no certificate, and
+# The proof is made with the token's key over the request and the server's certificate (``proof_of``): only a holder
+# of the token's secret can have made it, and only for this TLS connection. The joining module has no certificate, and
 # takes no answer whose CA does not have the token's fingerprint, or has not issued the server's certificate.
 #
 # A message is a JSON object with its length in front (4 bytes, big-endian); bytes in it are base64.

@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 # --- the REST API -------------------------------------------------------------------------------------------------
 
+# Begins each path; a later version that breaks clients has another number.
 PREFIX: Final = "/api/v1"
-"""Begins each path; a later version that breaks clients has another number."""
+# What there is below ``PREFIX``: the snapshot, and members of it.
 _PATHS: Final = (
     "/snapshot",
     "/agent",
@@ -45,9 +46,8 @@ _PATHS: Final = (
     "/notes",
     "/unreachable",
 )
-"""What there is below ``PREFIX``: the snapshot, and members of it."""
+# Names that a wrong one is compared with for a hint, which takes some microseconds each.
 _NAMES_COMPARED: Final = 1000
-"""Names that a wrong one is compared with for a hint, which takes some microseconds each."""
 _TITLES: Final = {
     400: "Bad request",
     401: "A token is needed",
@@ -131,8 +131,9 @@ def _short(text: str) -> str:
 
 # --- the metrics --------------------------------------------------------------------------------------------------
 
+# The values of ``PeerInfo.state``.
 PEER_STATES: Final = ("linked", "linking", "refused", "conflict", "relayed")
-"""The values of ``PeerInfo.state``."""
+# The values of ``EventInfo.kind``; a route with a contract shows all of them from 0 on, so that the first counts.
 EVENT_KINDS: Final = (
     "deadline_missed",
     "lifespan_expired",
@@ -141,7 +142,8 @@ EVENT_KINDS: Final = (
     "messages_lost",
     "loss_unknown",
 )
-"""The values of ``EventInfo.kind``; a route with a contract shows all of them from 0 on, so that the first counts."""
+# Why the web server refuses requests, connections and clients; all are shown from 0 on, so that an alarm sees the
+# first.
 REFUSALS: Final = (
     "host",
     "origin",
@@ -155,19 +157,17 @@ REFUSALS: Final = (
     "oversized",
     *GATEWAY_REASONS,
 )
-"""Why the web server refuses requests, connections and clients; all are shown from 0 on, so that an alarm sees the
-first."""
+# Each node has these; they are shown only where they were called across the mesh.
 _LOGGER_SERVICES: Final = ("/get_loggers", "/set_logger_level")
-"""Each node has these; they are shown only where they were called across the mesh."""
 _SUFFIXES: Final = {"counter": "_total", "info": "_info"}
 _TEXT: Final = "text/plain; version=0.0.4; charset=utf-8"
 _OPENMETRICS: Final = "application/openmetrics-text; version=1.0.0; charset=utf-8"
 _ESCAPES: Final = str.maketrans({"\\": "\\\\", "\n": "\\n", '"': '\\"'})
 _T = TypeVar("_T")
+# Each with its labels as ``labels`` writes them; ``None``: not known, and left out.
 Samples: TypeAlias = "Iterable[tuple[str, float | None]]"
-"""Each with its labels as ``labels`` writes them; ``None``: not known, and left out."""
+# A metric of each of several things: the end of its name, what it means, its kind, and its value of one thing.
 _Row: TypeAlias = "tuple[str, str, str, Callable[[_T], float | None]]"
-"""A metric of each of several things: the end of its name, what it means, its kind, and its value of one thing."""
 
 
 class Metric(NamedTuple):

@@ -165,7 +165,7 @@ WEB_TOKEN_FILE_MAX: Final = 4096
 CERTIFICATE_LOOK_PERIOD: Final = 5.0
 
 
-# Limits of the monitor's clients.
+# --- Limits of the monitor's clients --------------------------------------------------------------------------------
 #
 # Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
 
@@ -245,7 +245,7 @@ ANSWERS_AT_ONCE: Final = 4
 STATE_PAUSE_MAX: Final = 0.5
 
 
-# Bounds and time-outs of one rosbridge client, in seconds and bytes.
+# --- Bounds and time-outs of one rosbridge client, in seconds and bytes ---------------------------------------------
 
 
 # One frame of a client, and so a message that it publishes, in JSON; rosbridge_suite's default.

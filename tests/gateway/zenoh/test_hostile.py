@@ -15,7 +15,7 @@ from tests.gateway.zenoh_bed import ZenohBed, bed, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
 
 zenoh = pytest.importorskip("zenoh")

@@ -16,7 +16,7 @@ from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
 from tests.gateway.zenoh_bed import bed, free_port, until
 
 if TYPE_CHECKING:
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.threads import ZenohSample
 
 pytest.importorskip("zenoh")

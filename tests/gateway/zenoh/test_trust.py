@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
 
 zenoh = pytest.importorskip("zenoh")
 

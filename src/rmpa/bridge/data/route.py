@@ -98,7 +98,7 @@ class LaneSwitch:
         self.lane = EXPRESS
 
 
-# Down-sampling to a contract's ``max_rate``, at a steady period.
+# --- Down-sampling to a contract's ``max_rate``, at a steady period -------------------------------------------------
 
 
 class Downsampler:

@@ -98,7 +98,7 @@ def follow_rules(settings: Settings) -> tuple[FollowRule, ...]:
     return settings.params.follow + ((FollowRule(SIM_TIME, owner, SIM_TIME),) if owner else ())
 
 
-# The names of the requests between two agents about parameters.
+# --- The names of the requests between two agents about parameters --------------------------------------------------
 #
 # Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has
 # neither binary data nor dates. ``bridge.rpc`` carries large ones aside of commands. ::

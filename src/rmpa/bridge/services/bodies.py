@@ -255,7 +255,9 @@ class LocalService(Local):
     type = None
 
 
-# Connections to one local server for the calls of all peers: a few are kept open, each with one call at a time.
+# --- Connections to one local server for the calls of all peers -----------------------------------------------------
+#
+# A few are kept open, each with one call at a time.
 
 
 _log = logging.getLogger(__name__)

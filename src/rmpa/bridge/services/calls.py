@@ -288,7 +288,9 @@ class Server(BodyReceiver):
         self._sender.send(sequence, text.encode(), _FAILED)
 
 
-# Serves services of this module to peers: a pool of connections to each server, and checks that servers live.
+# --- Serves services of this module to peers ------------------------------------------------------------------------
+#
+# A pool of connections to each server, and checks that servers live.
 
 
 _MD5_LENGTH: Final = 32

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration
     from rmpa.gateway.zenoh.threads import QueuedPublisher
     from rmpa.ros.wire.tcpros import TopicDescription
@@ -151,7 +151,7 @@ async def find_types(*names: str) -> list[MessageType]:
     return [await asyncio.to_thread(find_message_type, name) for name in names]
 
 
-# A server of ROS 1 for clients of ROS 2.
+# --- A server of ROS 1 for clients of ROS 2 -------------------------------------------------------------------------
 
 
 class OfferedAction(JoinedAction, GoalsToRos1):

@@ -19,7 +19,7 @@ from rosbags.serde import SerdeError
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import UINT32_MAX
 from rmpa.gateway.ros2.transcoder import HEAD, LayoutPart, Transcoder
-from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, Ros2Field, check_size, ros2_name, snake_case
+from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, Ros2Field, check_size, snake_case
 from rmpa.ros.types.codec import CODES, SIZES, MessageCodec
 from rmpa.ros.types.definitions import Specification
 from rmpa.ros.types.messages import MessageType
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     # The fields of a type of one side by its name.
     FieldsOf = Callable[[str], Iterable[Field]]
 
-HEADER: Final = "std_msgs/msg/Header"
 # Numbers of one byte keep their bits under each of these names; other numbers are equal if they have one name.
 _ONE_BYTE: Final = ("byte", "char", "int8", "uint8")
 _LITTLE_ENDIAN: Final = HEAD[:2]
@@ -192,8 +191,6 @@ class Conversion:
             NoConversion: Each has fields that the other lacks, or a field is of another kind.
         """
         fields2 = self._fields2(name2)
-        if ros2_name(name1) == name2 == HEADER and list(fields2) == ["stamp", "frame_id"]:
-            return (LayoutPart(4, in2=False), LayoutPart(4, 2), LayoutPart())  # seq, stamp, frame_id
         ones = {name2_of(field.name, fields2): field for field in self._fields1(name1)}
         only1, only2 = sorted(ones.keys() - fields2), sorted(fields2.keys() - ones.keys() - {EMPTY_MEMBER})
         if only1 and only2:
@@ -358,7 +355,9 @@ def action_name(type_name: str, part: str) -> str:
     return type_name.removesuffix(part) if type_name.endswith(part) and not type_name.endswith(f"/{part}") else ""
 
 
-# An action type of ROS 1 and its counterpart in ROS 2: the types that rosidl makes of it, and their conversions.
+# --- An action type of ROS 1 and its counterpart in ROS 2 -----------------------------------------------------------
+#
+# The types that rosidl makes of it, and their conversions.
 
 
 # Stands between an action's name and those of its services and topics in ROS 2.

@@ -96,7 +96,7 @@ def _without_labels(raw: memoryview) -> memoryview:
     return memoryview(made + bytes(raw))
 
 
-# The QoS of a ROS 2 endpoint, and its text in a liveliness token.
+# --- The QoS of a ROS 2 endpoint, and its text in a liveliness token ------------------------------------------------
 #
 # The text is ``reliability:durability:history,depth:deadline:lifespan:liveliness,lease``, where a duration is
 # ``seconds,nanoseconds``. A value that is rmw's default is left out, but for the depth of *keep last*: a publisher
@@ -219,7 +219,9 @@ def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
         return default  # 0 is the system's default, and rmw has more kinds than these
 
 
-# The QoS of a topic that goes out to ROS 2: its contract in ROS 2's words, and in Zenoh's.
+# --- The QoS of a topic that goes out to ROS 2 ----------------------------------------------------------------------
+#
+# Its contract in ROS 2's words, and in Zenoh's.
 
 
 def ros2_qos(contracts: Contracts, topic: str, type_name: str, *, latching: bool) -> Ros2Qos:
@@ -275,18 +277,18 @@ def _nanoseconds(seconds: float | None) -> int:
     return INFINITE if seconds is None else round(seconds * 1e9)
 
 
-# Liveliness tokens of ROS 2 over Zenoh: the graph of nodes and endpoints.
+# --- Liveliness tokens of ROS 2 over Zenoh --------------------------------------------------------------------------
+#
+# The graph of nodes and endpoints.
 #
 # Each node and each endpoint of ROS 2 declares a token; what declares none is not seen by ``ros2 topic list``::
 #
 #     @ros2_lv/<domain>/<zid>/<node id>/<node id>/NN/<enclave>/<namespace>/<node>
 #     @ros2_lv/<domain>/<zid>/<node id>/<id>/MP|MS|SS|SC/<enclave>/<namespace>/<node>/<name>/<type>/<hash>/<QoS>
 #
-# ``zid`` is the Zenoh session. Within a part ``/`` is written as ``%``, and an empty part is ``%``. Data, and
-# calls of
-# services, go by the key ``<domain>/<name>/<type>/<hash>``. A subscriber whose type has another hash listens at
-# another
-# key: it hears nothing, and is told nothing.
+# ``zid`` is the Zenoh session. Within a part ``/`` is written as ``%``, and an empty part is ``%``. Data, and calls
+# of services, go by the key ``<domain>/<name>/<type>/<hash>``. A subscriber whose type has another hash listens at
+# another key: it hears nothing, and is told nothing.
 
 
 # The first chunk of each token; ``**`` does not match it, as it begins with ``@``.

@@ -24,7 +24,7 @@ from rmpa.gateway.ros2.transcoder import HEAD
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.loop import SystemClock
 

@@ -179,7 +179,9 @@ def _is_paths(fields: Any) -> bool:
     return isinstance(fields, dict) and all(isinstance(each, str) for pair in fields.items() for each in pair)
 
 
-# The ROS 1 definition of a type that only ROS 2 defines: a node of ROS 1 can ask for it by name.
+# --- The ROS 1 definition of a type that only ROS 2 defines ---------------------------------------------------------
+#
+# A node of ROS 1 can ask for it by name.
 
 
 _TIMES: Final = {ros2: ros1 for ros1, ros2 in TIMES.items()}

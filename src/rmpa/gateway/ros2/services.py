@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.wire.tcpros import ServiceDescription
@@ -48,13 +48,13 @@ SERVICE_NEEDS: Final = Needs(
 )
 
 
-# A service type of ROS 1 and its counterpart in ROS 2: names, hash, conversion of requests and responses.
+# --- A service type of ROS 1 and its counterpart in ROS 2 -----------------------------------------------------------
 #
-# ROS 2 has no reply that says "the call failed". rmw_zenoh's client prints the text of a Zenoh error reply and
-# goes on
-# waiting (rmw_data_types.cpp, ``client_data_handler``), so a failed call of ROS 1 is answered with one, never with
-# an
-# empty response.
+# Names, hash, conversion of requests and responses.
+#
+# ROS 2 has no reply that says "the call failed". rmw_zenoh's client prints the text of a Zenoh error reply and goes
+# on waiting (rmw_data_types.cpp, ``client_data_handler``), so a failed call of ROS 1 is answered with one, never with
+# an empty response.
 
 
 _LOGGERS: Final = "loggers of ROS 1 nodes have no counterpart in ROS 2"

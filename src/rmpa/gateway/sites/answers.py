@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import ImportedTopic
     from rmpa.gateway.topics import Export
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import OpenSession
     from rmpa.ros.wire.tcpros import Buffer
 
@@ -126,7 +126,7 @@ def _printable(stage: Check) -> Check:
     return Check(printable(stage.name), stage.level, printable(stage.text), printable(stage.remedy))
 
 
-# The stages, from what a part of the neighbour reports of a topic or service.
+# --- The stages, from what a part of the neighbour reports of a topic or service ------------------------------------
 
 
 def sent_stages(site: str, export: Export, *, asked: bool) -> list[Check]:

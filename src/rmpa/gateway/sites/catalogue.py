@@ -257,7 +257,9 @@ class SiteCatalogue:
             del self._sites[name]
 
 
-# Which gateway of a site leads, where there are several: the others stand by, so that no message crosses twice.
+# --- Which gateway of a site leads, where there are several ---------------------------------------------------------
+#
+# The others stand by, so that no message crosses twice.
 
 
 class Leader:
@@ -313,7 +315,9 @@ class Leader:
             self._best_since = now
 
 
-# Which sites were there and are not, and what they had: for "unreachable since".
+# --- Which sites were there and are not, and what they had ----------------------------------------------------------
+#
+# For "unreachable since".
 
 
 class SiteHistory:

@@ -146,7 +146,7 @@ def _read(raw: bytes, at: int) -> tuple[str, int]:
         raise RemoteProtocolError(f"an attachment of a site has a name that is not UTF-8: {error}") from error
 
 
-# What gateways tell of a publisher, and what follows from the numbers of its messages.
+# --- What gateways tell of a publisher, and what follows from the numbers of its messages ---------------------------
 
 
 _T = TypeVar("_T")
@@ -270,7 +270,7 @@ class SequenceCounter:
         self._run, self._last, self._announced, self._expects_first = run, sequence, sequence, False
 
 
-# The keys of a site's sources in Zenoh, and the liveliness tokens that announce them.
+# --- The keys of a site's sources in Zenoh, and the liveliness tokens that announce them ----------------------------
 #
 # ::
 #
@@ -283,15 +283,13 @@ class SequenceCounter:
 #     rmpa/1/<site>/<module>/to/<instance>/<other>/<t or s>/…    token: such a source
 #     rmpa/1/<site>/-gateway/<rank>/<instance>                   token: a gateway; the lowest rank leads
 #
-# Names of sites and modules are ROS base names, so they need no escape, and none is ``-gateway``. In the last
-# chunks of
-# a token ``/`` is ``%``, which no ROS name has. The type of a service that no program has asked for is ``-`` in its
-# token: a ROS master does not know it. Queryables of services have ``*`` in the place of the type.
+# Names of sites and modules are ROS base names, so they need no escape, and none is ``-gateway``. In the last chunks
+# of a token ``/`` is ``%``, which no ROS name has. The type of a service that no program has asked for is ``-`` in
+# its token: a ROS master does not know it. Queryables of services have ``*`` in the place of the type.
 #
 # A source that rules let out to some sites alone, or with other limits to some, is *addressed*: for each site that
-# may
-# have it there are a key and a token, which name that site. A gateway follows the tokens that are for all and those
-# that name its site. Releases without addressed sources ignore their tokens.
+# may have it there are a key and a token, which name that site. A gateway follows the tokens that are for all and
+# those that name its site. Releases without addressed sources ignore their tokens.
 
 
 # The first two chunks of each key; the number is that of the format.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator
 
     from rmpa.gateway.sites.topics import SiteContext
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -46,7 +46,9 @@ _NEEDS: Final = Needs(
 )
 
 
-# Parameters between sites. Without I/O.
+# --- Parameters between sites ---------------------------------------------------------------------------------------
+#
+# Without I/O.
 #
 # ``get`` on ``rmpa/1/<site>/<module>/p/<name>`` brings a parameter, or a namespace as an object, as JSON; with a
 # payload it sets it to that JSON. JSON has neither binary data nor dates, so gateways ask at

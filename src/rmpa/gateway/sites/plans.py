@@ -205,7 +205,7 @@ def _problem(announced: SiteSource) -> str:
     return ""
 
 
-# Which sources of other sites are shown here, and under which names.
+# --- Which sources of other sites are shown here, and under which names ---------------------------------------------
 #
 # A source is known by site, module, kind, node and name; a new run of its module continues it. Of two sources that
 # want one name here with different types (or two services of one name) the first is shown, and one of this site's own

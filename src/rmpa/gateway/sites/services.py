@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.sites.keys import SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
 # Bytes of the description of another site's service: four names.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.zenoh.config import ArrivedQuery
+    from rmpa.gateway.zenoh.queries import ArrivedQuery
     from rmpa.gateway.zenoh.session import Declaration, OpenSession
     from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription

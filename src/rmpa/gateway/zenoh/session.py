@@ -1,8 +1,8 @@
 """The Zenoh session of a gateway: the one place that calls the library ``eclipse-zenoh``.
 
 The event loop never waits for Zenoh. Declarations and their ends go in order to one thread, queries and their answers
-to a second one, and messages to a thread for each priority (``sending``). What Zenoh delivers comes by queues
-(``arrivals``).
+to a second one, and messages to a thread for each priority. What Zenoh delivers comes by queues; both are in
+``threads``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import ArrivedQuery, PendingGet, SerialWorker, SocketTuning, content, session_config
+from rmpa.gateway.zenoh.config import SocketTuning, session_config
+from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, SerialWorker, content
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
     Arrivals,

@@ -1,9 +1,7 @@
 """The way of messages between Zenoh's threads and the event loop, in both directions.
 
-The way of what Zenoh delivers from its threads into the event loop.
-
-Zenoh calls back in threads of its own. Each subscriber has a queue there, and one wake-up of the loop is enough for
-all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.
+Arrivals: Zenoh calls back in threads of its own. Each subscriber has a queue there, and one wake-up of the loop is
+enough for all that came until the loop runs. The queues take turns, so that a flood on one does not delay the others.
 
 The loop and Zenoh's threads share the interpreter's lock. A loop that each message wakes would hand it over for each
 one, which costs 20 µs. So above ``_BUSY_MESSAGES`` in a period the loop is not woken: it looks once a period.
@@ -191,7 +189,7 @@ class ArrivalQueue(BoundedQueue[_T]):
         deliver: Called in the loop with each item.
         messages: Items that wait at most; above it the oldest is dropped.
         size: Bytes that wait at most; one item always fits.
-        discard: Called in the loop with each item that was dropped.
+        discard: Called with each item that was dropped, in the thread that dropped it.
     """
 
     def __init__(
@@ -229,7 +227,8 @@ class ArrivalQueue(BoundedQueue[_T]):
 
     def _give_back(self, items: Sequence[_T]) -> None:
         if self._discard is not None:
-            self._arrivals.discarded.extend((self._discard, item) for item in items)
+            for item in items:
+                self._discard(item)
 
     def reschedule(self) -> None:
         """Queue up for another turn if something waits. The caller has the lock."""
@@ -257,14 +256,12 @@ class Arrivals:
 
     Attributes:
         refused: What was dropped or refused, by its reason; guarded by ``lock``.
-        discarded: What was dropped, with the function that is told; guarded by ``lock``.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self.lock = threading.Lock()
         self.refused: Counter[str] = Counter()
-        self.discarded: deque[tuple[Callable[..., None], object]] = deque()
         self._ready: deque[ArrivalQueue[object]] = deque()
         self._woken = False
         self._closed = False
@@ -337,7 +334,7 @@ class Arrivals:
                 self._loop.call_soon(self._drain)
             elif self._in_window >= _BUSY_MESSAGES:
                 self._loop.call_later(limits.BUSY_PERIOD, self._drain)
-            elif self._ready or self.discarded:
+            elif self._ready:
                 self._loop.call_soon(self._drain)
             else:
                 self._woken = False
@@ -345,11 +342,6 @@ class Arrivals:
     def _deliver(self) -> int:
         """Deliver what waits, but not more than the loop can do without a delay; return the number of messages."""
         messages, size = _DRAIN_MESSAGES, _DRAIN_BYTES
-        with self.lock:
-            discarded = tuple(self.discarded)
-            self.discarded.clear()
-        for discard, item in discarded:
-            discard(item)
         while messages > 0 and size > 0:
             with self.lock:
                 if not self._ready:
@@ -365,15 +357,12 @@ class Arrivals:
         return _DRAIN_MESSAGES - messages
 
 
-# Publishers behind bounded queues, and the threads that put their messages to Zenoh.
+# --- Publishers behind bounded queues, and the threads that put their messages to Zenoh -----------------------------
 #
 # A put of a reliable publisher waits while the transport's queue of its priority is full: Zenoh has one such queue
-# for
-# each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits
-# for
-# a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest
-# messages
-# of each publisher are dropped, and counted.
+# for each priority. So each priority in use has one thread here, and within it the publishers take turns. What waits
+# for a full bulk lane holds no command up, and nothing holds the event loop up. Behind a full transport the oldest
+# messages of each publisher are dropped, and counted.
 
 
 class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):

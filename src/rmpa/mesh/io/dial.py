@@ -61,7 +61,7 @@ _EXPRESS_RTO_MIN_US: Final = 5000
 _EXPRESS_RTO_MAX_MS: Final = 1000
 
 
-# Options and kernel statistics of the connections' sockets.
+# --- Options and kernel statistics of the connections' sockets ------------------------------------------------------
 
 
 _RTO_MIN_US: Final = 45

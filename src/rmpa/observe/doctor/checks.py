@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import psutil
 
 import rmpa
-from rmpa.core.counters import remedy as raise_file_limit
+from rmpa.core.counters import remedy as file_limit_advice
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import AgentInfo, Snapshot, UnreachableInfo
     from rmpa.trust.permissions import TrustStatus
 
+# The counters of what ``[[permission]]`` refused begin so.
 _PERMISSION: Final = "permission."
-"""The counters of what ``[[permission]]`` refused begin so."""
 
 
 def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> Iterator[Check]:
@@ -127,7 +127,7 @@ def _files(agent: AgentInfo) -> Iterator[Check]:
         problem, _, remedy = files.problem.partition("; ")
         text, level = f"{problem}; {files.open} are open", FAIL
     elif files.near:
-        level, remedy = WARN, raise_file_limit(agent.pid)
+        level, remedy = WARN, file_limit_advice(agent.pid)
     yield Check("files", level, text, remedy, where=agent.name)
 
 
@@ -262,6 +262,7 @@ async def _slave_ports(core_uri: str) -> dict[str, int]:
         return found
 
 
+# All checks, in the order of the output; at least one result of each has its name. Each takes 2 s at most.
 CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "settings": lambda given: given.settings_checks,
     "agent": lambda given: judge_agents(given.agents, rmpa.__version__),
@@ -277,7 +278,6 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "realtime": machine.rights,
     "exposed nodes": _exposed_nodes,
 }
-"""All checks, in the order of the output; at least one result of each has its name. Each takes 2 s at most."""
 
 
 def examine(given: DoctorInput) -> Iterator[Check]:

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 # --- what several checks need ---------------------------------------------------------------------------------------
 
+# The name under which a core is asked.
 CALLER: Final = "/rmpa_doctor"
-"""The name under which a core is asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,12 +177,12 @@ def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
 
 # --- clocks ---------------------------------------------------------------------------------------------------------
 
+# STA_UNSYNC of adjtimex(2).
 _UNSYNCHRONISED: Final = 0x40
-"""STA_UNSYNC of adjtimex(2)."""
 
 
+# The beginning of ``struct timex`` (adjtimex(2)): modes, offset, frequency, greatest and estimated error, status.
 _TIMEX: Final = struct.Struct("@I4li")
-"""The beginning of ``struct timex`` (adjtimex(2)): modes, offset, frequency, greatest and estimated error, status."""
 
 
 def clocks(given: DoctorInput) -> Iterable[Check]:

@@ -117,8 +117,8 @@ def _judge_interface(one: NetworkInterface) -> Check:
 
 _PKTINFO: Final = struct.Struct("@i4s4s")
 _IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python
+# Greater than every domain: agents ignore beacons of it without logging.
 _NO_DOMAIN: Final = 0xFFFF
-"""Greater than every domain: agents ignore beacons of it without logging."""
 
 
 @dataclass(slots=True)
@@ -241,13 +241,13 @@ def judge_multicast(echoes: Sequence[MulticastEcho], group: str, port: int, list
 
 _DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
 _ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
+# A rule that drops UDP to and from every port and address, as nft or iptables print it.
 _UDP: Final = re.compile(
     r"(?:meta l4proto|ip protocol|ip6 nexthdr|-A \S+(?: -m comment --comment (?:\"[^\"]*\"|\S+))? -p)"
     r" (?:udp|17|\{ ?[^{}]*\b(?:udp|17)\b[^{}]* ?\})"
     r"(?: counter(?: packets \d+ bytes \d+)?| -m comment --comment (?:\"[^\"]*\"|\S+))*"
     r" (?:-j )?(?:drop|reject|DROP|REJECT)\b"
 )
-"""A rule that drops UDP to and from every port and address, as nft or iptables print it."""
 _HOOK: Final = re.compile(r"type filter hook input .*policy (\w+)")
 _BLOCK: Final = re.compile(r"(table|chain) (.+?) \{")
 _RANGE: Final = re.compile(r"\b(\d{1,5})[-:](\d{1,5})\b")
@@ -366,8 +366,8 @@ def firewall(given: DoctorInput) -> Iterator[Check]:
 
 # --- what the kernel does to packets --------------------------------------------------------------------------------
 
+# The value of rp_filter that drops a packet whose answer would leave by another interface (RFC 3704).
 _STRICT: Final = 1
-"""The value of rp_filter that drops a packet whose answer would leave by another interface (RFC 3704)."""
 
 
 def rp_filter(given: DoctorInput) -> Iterable[Check]:

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
     from rmpa.observe.snapshot import RouteInfo, SubscriberTransport
 
+# The stage of what the publisher's (server's) module lets this one do.
 PERMISSION_THERE: Final = "permission there"
-"""The stage of what the publisher's (server's) module lets this one do."""
+# The stage of what this module lets that of the publisher (server) do.
 PERMISSION_HERE: Final = "permission here"
-"""The stage of what this module lets that of the publisher (server) do."""
 
+# The last stage of a path that nothing uses: no node subscribes, so nothing is sent.
 UNASKED: Final = "demand"
-"""The last stage of a path that nothing uses: no node subscribes, so nothing is sent."""
 
 
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
@@ -190,10 +190,11 @@ class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
 # The transport of routes and of their subscribers in words, for the command line, ``rmpa why`` and health. Pure.
 
 
+# ``Condition.MEASURES``: the subscriber is a tool of RMPA, and relayed on purpose.
 BY_TOOL: Final = "measures"
-"""``Condition.MEASURES``: the subscriber is a tool of RMPA, and relayed on purpose."""
+# ``Condition.TRANSPORT``: the contract of one end says ``relay``.
 BY_RULE: Final = "transport"
-"""``Condition.TRANSPORT``: the contract of one end says ``relay``."""
+# What a user may do about some of the conditions; the others say it themselves, or pass.
 _REMEDIES: Final = {
     "contract": 'take these terms out of [[contract]], or set its transport to "relay"',
     "name": "leave it out of prefix and remap of the [[peer]]",
@@ -204,9 +205,8 @@ _REMEDIES: Final = {
     "latched": "start the subscriber again",
     "trust": "trust.direct = true in both modules allows it, where the network is trusted (docs/permissions.md)",
 }
-"""What a user may do about some of the conditions; the others say it themselves, or pass."""
+# In place of figures.
 UNMEASURED: Final = "not measured: the nodes are connected directly"
-"""In place of figures."""
 _WAITS: Final = {
     "asking": "the peer's agent is asked for a direct connection, and its node is tried",
     "direct": "it may connect directly, and has not asked for the topic yet",

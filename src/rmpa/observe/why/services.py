@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import ServiceInfo, Snapshot
     from rmpa.observe.why.diagnosis import ServiceAtServer
 
+# Percent of a core from which on an agent counts as busy: it has one thread for all messages.
 _BUSY: Final = 90.0
-"""Percent of a core from which on an agent counts as busy: it has one thread for all messages."""
+# Share of its file descriptors from which on an agent is warned of.
 _FILES: Final = 0.9
-"""Share of its file descriptors from which on an agent is warned of."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot import Snapshot
     from rmpa.observe.why.diagnosis import TopicAtPublisher
 
+# Messages sent without one arriving that count as a fault: a single one may still be on its way.
 _SEVERAL: Final = 2
-"""Messages sent without one arriving that count as a fault: a single one may still be on its way."""
 _FLOWING: Final = frozenset({"open", "lingering"})
 
 
@@ -514,10 +514,10 @@ def _reader(way: Way) -> Check:
     return Check("reader", OK, f"{', '.join(dict.fromkeys(node for node, *_ in after.values()))} takes them")
 
 
+# The stages of one publisher, in order. The walk ends at the first that fails.
 STAGES: Final[tuple[Callable[[Way], Check | None], ...]] = (
     *(_policy_there, _permission_there, _reachable, _offer, _limit, _policy_here, _permission_here, _type, _graph),
     *(_subscriber, _md5, _transport, _connection, _route),
 )
-"""The stages of one publisher, in order. The walk ends at the first that fails."""
+# Those that follow where the route is open, and messages pass the agents.
 FLOW_STAGES: Final[tuple[Callable[[Way], Check], ...]] = (_sent, _arrived, _contract, _reader)
-"""Those that follow where the route is open, and messages pass the agents."""

@@ -48,16 +48,16 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
 
 _T = TypeVar("_T")
+# The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``.
 TOPIC: Final = "why.topic"
-"""The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``."""
+# The request to a server's agent: what it knows of a service. Replied by ``ServiceAtServer``.
 SERVICE: Final = "why.service"
-"""The request to a server's agent: what it knows of a service. Replied by ``ServiceAtServer``."""
+# The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list.
 HERE: Final = "why.here"
-"""The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
+# The stages that fail where a peer has no publisher, or does not tell of one: the name may be something else's.
 _NO_PUBLISHER: Final = frozenset({"publisher", PERMISSION_THERE})
-"""The stages that fail where a peer has no publisher, or does not tell of one: the name may be something else's."""
+# States of peers that can be asked.
 _REACHED: Final = frozenset({"linked", "relayed"})
-"""States of peers that can be asked."""
 _MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 

@@ -58,7 +58,9 @@ def local_addresses() -> list[str]:
     return sorted(found, key=lambda address: address.startswith("127."))
 
 
-# Assigns loopback addresses ``127.a.b.c`` to nodes that share one port: the dialled address identifies the node.
+# --- Assigns loopback addresses ``127.a.b.c`` to nodes that share one port ------------------------------------------
+#
+# The dialled address identifies the node.
 
 
 # Values of ``a``, from 1 on: 127.0/16 has localhost, Debian's 127.0.1.1 and the resolvers; 127.255/16 broadcasts.
@@ -131,7 +133,9 @@ class LoopbackAddresses:
             yield f"127.{1 + first}.{second}.{1 + third}"
 
 
-# The listening TCPROS socket of one node: passes each connection to the publication or service of its header.
+# --- The listening TCPROS socket of one node ------------------------------------------------------------------------
+#
+# Passes each connection to the publication or service of its header.
 
 
 _log = logging.getLogger(__name__)
@@ -266,11 +270,12 @@ class TcprosServer:
         self._refusals.refuse(now, f"tcpros.refused.{kind}", connection.peer[0], f"{self._name}: {text}")
 
 
-# Two listening sockets for any number of nodes: each node has a loopback address, all have the same two ports.
+# --- Two listening sockets for any number of nodes ------------------------------------------------------------------
+#
+# Each node has a loopback address, all have the same two ports.
 #
 # A socket that listens at all addresses and is bound to the device ``lo`` accepts connections to any address
-# ``127.a.b.c`` (there are 16 million), and none from the network. The local address of the accepted socket
-# identifies
+# ``127.a.b.c`` (there are 16 million), and none from the network. The local address of the accepted socket identifies
 # the node. A path in the URI could do so too, but roscpp drops it.
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SERVICE_STALL: Final = 30.0
 
 
-# Sends large requests and responses in parts; other pending data is served between two parts.
+# --- Sends large requests and responses in parts; other pending data is served between two parts --------------------
 
 
 # The outbox key of requests and responses.

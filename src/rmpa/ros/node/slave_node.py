@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 
-# The servers of one node, XML-RPC and TCPROS at one address, with its topics and services.
+# --- The servers of one node, XML-RPC and TCPROS at one address, with its topics and services -----------------------
 
 
 _log = logging.getLogger(__name__)

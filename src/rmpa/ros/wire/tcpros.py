@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-# TCPROS: connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
+# --- TCPROS ---------------------------------------------------------------------------------------------------------
+#
+# Connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
 #
 # Pure: bytes in, values out. Each side of a connection sends one header; the publisher alone decides whether they
-# match
-# (``check_subscriber``). After the headers messages follow, each with its length in front. All integers are
+# match (``check_subscriber``). After the headers messages follow, each with its length in front. All integers are
 # little-endian 32-bit.
 #
-# Where the wiki leaves something open, this module does what rospy and roscpp 1.15 both accept. Unlike them it
-# checks
+# Where the wiki leaves something open, this module does what rospy and roscpp 1.15 both accept. Unlike them it checks
 # each length before it stores anything.
 
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import Follower
 
 _SEPARATOR: Final = "=" * 80
+# A type's name, whether it is a service's, and the md5 sum of its version; "" for the one that is known best.
 _TypeKey: TypeAlias = tuple[str, bool, str]
-"""A type's name, whether it is a service's, and the md5 sum of its version; "" for the one that is known best."""
 _Nodes: TypeAlias = "Mapping[str, tuple[str, ...]]"
 
 
@@ -44,8 +44,8 @@ class Channel:
     type: str
     md5sum: str
     schema: str
+    # Whether messages of its version have come.
     delivered: bool = False
-    """Whether messages of its version have come."""
 
     def json(self) -> dict[str, object]:
         """Its part of ``advertise``."""
@@ -94,19 +94,19 @@ class ChannelTable:
         self._follower: Follower | None = None
         self._ids = itertools.count(1)
         self._service_ids = itertools.count(1)
+        # All that were asked for; ``None``: not known yet.
         self._types: dict[_TypeKey, MessageType | ServiceType | None] = {}
-        """All that were asked for; ``None``: not known yet."""
         self._searched: set[str] = set()
         self._versions: dict[tuple[str, str], dict[str, None]] = {}
         self._offered: dict[tuple[str, str, str], Channel] = {}
         self._offered_services: dict[tuple[str, str], FoxgloveService] = {}
         self._warnings: dict[str, str] = {}
+        # As those know it who follow it: publishers, subscribers and providers.
         self._graph: tuple[_Nodes, _Nodes, _Nodes] = ({}, {}, {})
-        """As those know it who follow it: publishers, subscribers and providers."""
+        # What is offered, by id.
         self.channels: dict[int, Channel] = {}
-        """What is offered, by id."""
+        # Likewise.
         self.services: dict[int, FoxgloveService] = {}
-        """Likewise."""
         hub.types.on_learnt = self._learnt
 
     def join(self, session: Session, withdrawn: Callable[[Iterable[int]], None]) -> None:

@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from rmpa.web.gateways.frame_writer import OutFrame
     from rmpa.web.hub.node_link import ParamValue, Payload
 
+# The names of the WebSocket subprotocol, preferred first; the messages here are the same in both.
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""The names of the WebSocket subprotocol, preferred first; the messages here are the same in both."""
+# The encoding of all messages: what crosses TCPROS, undecoded.
 ENCODING: Final = "ros1"
-"""The encoding of all messages: what crosses TCPROS, undecoded."""
+# The encoding of all schemas: a message definition with its dependencies, as in a TCPROS header.
 SCHEMA_ENCODING: Final = "ros1msg"
-"""The encoding of all schemas: a message definition with its dependencies, as in a TCPROS header."""
 WARNING: Final = 1
+# Levels of a status.
 ERROR: Final = 2
-"""Levels of a status."""
 
 
 def choose_subprotocol(offered: Iterable[str]) -> str | None:

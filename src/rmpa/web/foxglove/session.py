@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
+# A WebSocket's close code, RFC 6455, section 7.4.1.
 _POLICY_VIOLATION: Final = 1008
-"""A WebSocket's close code, RFC 6455, section 7.4.1."""
 
 
 class _Subscription(ClientStream):
@@ -108,16 +108,16 @@ class FoxgloveSession(Session):
         super().__init__(hub, rights, priority, address)
         self.table = table
         self._server = server
+        # The time by ``/clock``, where that gives it: it stamps the messages.
         self.time_ns: int | None = None
-        """The time by ``/clock``, where that gives it: it stamps the messages."""
         self._now = 0.0
         self._errors = TokenBucket(limits.FOXGLOVE_STATUS_RATE, limits.FOXGLOVE_STATUS_BURST)
         self._subscriptions: dict[int, _Subscription] = {}
         self._published: dict[int, ClientPublication | None] = {}
+        # Requests of each kind that have no answer yet.
         self._waiting: Counter[str] = Counter()
-        """Requests of each kind that have no answer yet."""
+        # The parameters that are followed, or that are left out where all are followed.
         self._names: set[str] = set()
-        """The parameters that are followed, or that are left out where all are followed."""
         self._all = False
         self._follower: Follower | None = None
 
@@ -420,12 +420,12 @@ def _camel(name: str) -> str:
     return first + "".join(map(str.capitalize, further))
 
 
+# The fields of each JSON message of a client.
 OPS: Final = {
     _camel(name): struct_of(method, tag_field="op", tag=_camel(name), rename=_camel)
     for name, method in vars(FoxgloveSession).items()
     if name.startswith("op_")
 }
-"""The fields of each JSON message of a client."""
 DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
     functools.reduce(operator.or_, OPS.values())
 )

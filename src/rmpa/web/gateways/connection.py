@@ -36,20 +36,20 @@ if TYPE_CHECKING:
     from rmpa.web.hub.topics import ReceivedMessage
 
 _log = logging.getLogger(__name__)
+# Pings without an answer, behind which no further one is sent: they wait as the client's frames do.
 _UNANSWERED_MAX: Final = 8
-"""Pings without an answer, behind which no further one is sent: they wait as the client's frames do."""
+# Bytes of a client's control frame before its payload: two, and the mask.
 _CONTROL_HEADER: Final = 6
-"""Bytes of a client's control frame before its payload: two, and the mask."""
+# Bytes that an entry of the queue takes beside its payload.
 _OVERHEAD: Final = 128
-"""Bytes that an entry of the queue takes beside its payload."""
+# Entries that are written before other tasks have their turn.
 _TURN: Final = 16
-"""Entries that are written before other tasks have their turn."""
+# Looks without a sign of life, each after half of ``limits.PING_INTERVAL``.
 _SILENT_LOOKS: Final = 3
-"""Looks without a sign of life, each after half of ``limits.PING_INTERVAL``."""
+# Makes the frames of an entry of the queue, when they can be written.
 _Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
-"""Makes the frames of an entry of the queue, when they can be written."""
+# Pings within the age that a client's commands may have.
 _AGE_PINGS: Final = 4
-"""Pings within the age that a client's commands may have."""
 
 
 # --- the protocol ----------------------------------------------------------------------------------------------
@@ -81,12 +81,12 @@ class Session(HubClient):
         address: The client's, for logs.
     """
 
+    # The protocol's name, for logs and lists.
     kind = ""
-    """The protocol's name, for logs and lists."""
+    # Whether the protocol itself says how old a command is.
     dates_commands = False
-    """Whether the protocol itself says how old a command is."""
+    # Whether the timer waits while the client takes nothing; else the session itself holds back.
     timer_waits = True
-    """Whether the timer waits while the client takes nothing; else the session itself holds back."""
 
     def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
         super().__init__(hub, f"{self.kind} {address}", rights)
@@ -238,8 +238,8 @@ class ClientConnection:
         self._session = session
         self._priority = priority
         self.queue: FairQueue[_Entry] = FairQueue()
+        # Messages and answers that were written.
         self.sent = 0
-        """Messages and answers that were written."""
         self._heard = 0
         self._received: Callable[[], int] = int
         self._arrival = MessageArrival()

@@ -47,8 +47,8 @@ class Opcode(IntEnum):
     PONG = 10
 
 
+# A frame for the client: its kind, and its payload in pieces.
 OutFrame: TypeAlias = tuple[Opcode, Sequence["Payload"]]
-"""A frame for the client: its kind, and its payload in pieces."""
 
 
 class MaskCheck:
@@ -56,8 +56,8 @@ class MaskCheck:
 
     def __init__(self) -> None:
         self._header = bytearray()
+        # Bytes of the frame's payload that are still to come, its mask included.
         self._payload = 0
-        """Bytes of the frame's payload that are still to come, its mask included."""
 
     def passes(self, data: bytes) -> bool:
         """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
@@ -118,14 +118,14 @@ class FairQueue(Generic[_T]):
         self._total = total_bytes
         self._each = subscription_bytes
         self._urgent: _Queue[_T] = _Queue(None, 0)
+        # The subscriptions that have entries, in the order of their turns.
         self._queues: dict[object, _Queue[_T]] = {}
-        """The subscriptions that have entries, in the order of their turns."""
+        # Bytes that wait.
         self.bytes = 0
-        """Bytes that wait."""
+        # Messages dropped so far, by subscription, of the present ones.
         self.dropped: Counter[Any] = Counter()
-        """Messages dropped so far, by subscription, of the present ones."""
+        # Messages dropped so far, those of ended subscriptions included.
         self.dropped_total = 0
-        """Messages dropped so far, those of ended subscriptions included."""
 
     @property
     def overflow(self) -> bool:
@@ -210,17 +210,17 @@ def _priority(queue: _Queue[Any]) -> int:
 
 
 _log = logging.getLogger(__name__)
+# Buffers of one system call.
 _BUFFERS: Final = 64
-"""Buffers of one system call."""
+# System calls for one frame before others have their turn: a fast reader often makes room at once.
 _TRIES: Final = 4
-"""System calls for one frame before others have their turn: a fast reader often makes room at once."""
 
 
 class FrameSocket(web.WebSocketResponse):
     """A WebSocket whose close frame, which aiohttp writes, comes behind the frames of a ``FrameWriter``."""
 
+    # Called before the close frame is written; see ``FrameWriter.hand_over``.
     before_close: Callable[[], None] | None = None
-    """Called before the close frame is written; see ``FrameWriter.hand_over``."""
 
     async def close(self, *, code: int = WSCloseCode.OK, message: bytes = b"", drain: bool = True) -> bool:
         """Close the WebSocket."""
@@ -241,9 +241,9 @@ class FrameWriter:
         self._transport = transport
         self._drain = drain
         self._loop = asyncio.get_running_loop()
+        # A descriptor of our own, as asyncio does not let others wait for the transport's; ``None``: the transport
+        # writes.
         self._socket = _socket_of(transport)
-        """A descriptor of our own, as asyncio does not let others wait for the transport's; ``None``: the transport
-        writes."""
         self._waiting: deque[memoryview] = deque()
         self._waiting_bytes = 0
         self._room: asyncio.Future[None] | None = None

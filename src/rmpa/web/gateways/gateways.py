@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
+# The gateways, as ``ClientConnection.kind`` names them.
 PROTOCOLS: Final = ("foxglove", "monitor", "rosbridge")
-"""The gateways, as ``ClientConnection.kind`` names them."""
+# Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
+# protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many
+# in a second.
 REASONS: Final = ("handshake", "clients", "message", "message_size", "message_rate")
-"""Why WebSocket clients are refused or disconnected, as counted: a handshake that is malformed or asks for another
-protocol; too many clients; a malformed frame or message, or one that does not end; one that is too long; too many in
-a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +87,12 @@ class Gateways:
         priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
     ) -> None:
+        # Clients that were refused or disconnected, by the words of ``REASONS``.
         self.counters = Counters()
-        """Clients that were refused or disconnected, by the words of ``REASONS``."""
         self._refusals = RefusalLog(_log, self.counters)
+        # Called when the handshake of a WebSocket is done, with what is to be called if a frame of the client is not
+        # masked; returns a counter of the bytes that its client has sent, which is 0 where they are not counted.
         self.upgraded: Callable[[web.Request, Callable[[], None]], Callable[[], int]] = lambda *_: int
-        """Called when the handshake of a WebSocket is done, with what is to be called if a frame of the client is not
-        masked; returns a counter of the bytes that its client has sent, which is 0 where they are not counted."""
         self._monitor = monitor
         self._hub = hub
         self._server = name, secrets.token_hex(8)

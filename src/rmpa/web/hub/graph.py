@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
+# Types where the master has none: clients tell ROS 1 by that of ``/rosout``.
 _KNOWN_TYPES: Final = {"/rosout": ("rosgraph_msgs/Log",), "/rosout_agg": ("rosgraph_msgs/Log",)}
-"""Types where the master has none: clients tell ROS 1 by that of ``/rosout``."""
 
 
 class GraphTopic(msgspec.Struct, frozen=True):
@@ -74,10 +74,10 @@ class GraphTable:
         self._rows: dict[str, TopicRow] = {}
         self._seen: dict[str, dict[str, None]] = {}
         self._nodes: Sequence[str] | None = None
+        # By name, in order of names; replaced by each change, so that it may be kept.
         self.topics: Mapping[str, GraphTopic] = {}
-        """By name, in order of names; replaced by each change, so that it may be kept."""
+        # Likewise.
         self.services: Mapping[str, GraphService] = {}
-        """Likewise."""
 
     @property
     def nodes(self) -> Sequence[str]:
@@ -208,8 +208,8 @@ class TypeLibrary:
         # Of types in this machine's packages, on the event loop, ten a second in the long run: first all types of a
         # large robot at once, each searched for once.
         self._searches = TokenBucket(10.0, 500.0)
+        # Called with each message type that becomes known.
         self.on_learnt: Callable[[MessageType], None] = lambda _: None
-        """Called with each message type that becomes known."""
 
     def message(self, name: str) -> MessageType:
         """A message type that is known or on this machine; its first search reads files.
@@ -374,16 +374,16 @@ class GraphWatch(GraphTable):
         self._task: asyncio.Task[None] | None = None
         self._look = asyncio.Event()
         self._documents: tuple[bytes, bytes] = (b"", b"")
+        # Set once the graph is known.
         self.loaded = asyncio.Event()
-        """Set once the graph is known."""
+        # Whether there are clients, for which it is read more often.
         self.active = False
-        """Whether there are clients, for which it is read more often."""
+        # Whether each change is told by ``look`` or ``take``, so that it need not be searched for.
         self.told = False
-        """Whether each change is told by ``look`` or ``take``, so that it need not be searched for."""
+        # Whether ``take`` has given the graph, and tells its changes: then the master is not asked for it.
         self.taken = False
-        """Whether ``take`` has given the graph, and tells its changes: then the master is not asked for it."""
+        # How often it was read from the master.
         self.reads = 0
-        """How often it was read from the master."""
 
     def start(self) -> None:
         """Begin, in a task."""

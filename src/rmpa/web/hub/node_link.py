@@ -25,15 +25,18 @@ _log = logging.getLogger(__name__)
 ParamValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, list["ParamValue"], dict[str, "ParamValue"], None
 ]
+# A ROS 1 serialized message, without its length prefix.
 Payload: TypeAlias = bytes | bytearray | memoryview
-"""A ROS 1 serialized message, without its length prefix."""
 
-# What clients may do: kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``.
+
+# --- What clients may do --------------------------------------------------------------------------------------------
+#
+# Kinds of acts by ``[web]``, and names by the rules of ``[[permission]]``.
 
 
 _WHO: Final = "the web server"
+# The name of ``rmpa web`` for the rules.
 _NODE: Final = "web"
-"""The name of ``rmpa web`` for the rules."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +152,12 @@ def _bad_key(value: ParamValue) -> str | None:
 
 EVERYTHING = NodeRules()
 READ_ONLY = Rights()
+# Everything but ``drive``, which has a setting of its own.
 FULL = Rights(view=True, control=True)
-"""Everything but ``drive``, which has a setting of its own."""
+# For clients that want to change something.
 CONTROL_REMEDY = "start rmpa web with --control, and give its token"
-"""For clients that want to change something."""
+# For clients that want to read what only clients with the token may.
 READ_REMEDY = "send the token of rmpa web; where it has none, start it with --token-file FILE or --control"
-"""For clients that want to read what only clients with the token may."""
 
 
 class Follower:
@@ -172,10 +175,10 @@ class Follower:
         self._followers.pop(self, None)
 
 
+# Makes a node that is not started: ``(master URI, on_param_update)``.
 MakeNode: TypeAlias = "Callable[[str, Callable[[str, XmlRpcValue], None]], Node]"
-"""Makes a node that is not started: ``(master URI, on_param_update)``."""
+# Finds the master's URI; raises ``RmpaError`` while there is none.
 Where: TypeAlias = "Callable[[], Awaitable[str]]"
-"""Finds the master's URI; raises ``RmpaError`` while there is none."""
 _T = TypeVar("_T", bound="Subscriber | Publisher | Service")
 _U = TypeVar("_U")
 
@@ -195,18 +198,18 @@ class NodeLink:
         self._make = make
         self._task: asyncio.Task[None] | None = None
         self._ready: asyncio.Event = asyncio.Event()
+        # The node, while the master knows it.
         self.node: Node | None = None
-        """The node, while the master knows it."""
+        # Why there is no node; empty while there is one.
         self.problem = "the ROS master was not asked yet"
-        """Why there is no node; empty while there is one."""
+        # What is being withdrawn, by kind and name.
         self.ending: dict[tuple[str, str], Registration[Any]] = {}
-        """What is being withdrawn, by kind and name."""
+        # Called with each new node.
         self.on_node: Callable[[Node], None] = lambda _: None
-        """Called with each new node."""
+        # Called when something was registered or withdrawn.
         self.on_registration: Callable[[], None] = lambda: None
-        """Called when something was registered or withdrawn."""
+        # ``(key, value)``: a parameter has changed that the node follows.
         self.on_param_update: Callable[[str, XmlRpcValue], None] = lambda *_: None
-        """``(key, value)``: a parameter has changed that the node follows."""
 
     def start(self) -> None:
         """Begin, in a task."""
@@ -301,8 +304,8 @@ class Registration(Generic[_T]):
         self._on_failed = on_failed
         self._wanted = True
         self._resting: asyncio.Future[Any] | None = None
+        # What ``register`` returned, while it is registered.
         self.value: _T | None = None
-        """What ``register`` returned, while it is registered."""
         work = self._run(link.ending.get(self._key))
         self._task = asyncio.get_running_loop().create_task(work, name=f"register {kind} {name}")
 

@@ -42,10 +42,10 @@ class ParamMirror:
         self._loading: asyncio.Task[None] | None = None
         self._meanwhile: list[tuple[str, XmlRpcValue]] | None = None
         self._told = 0
+        # Set once the parameters are known.
         self.loaded = asyncio.Event()
-        """Set once the parameters are known."""
+        # How often they have changed.
         self.changes = 0
-        """How often they have changed."""
         link.on_node = self._load_from
         link.on_param_update = self.updated
 

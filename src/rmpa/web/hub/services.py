@@ -256,8 +256,8 @@ class ServiceCalls:
         self._servers: defaultdict[tuple[str, str], _Server] = defaultdict(_Server)
         self._finding: SharedTasks[str, tuple[str, str]] = SharedTasks()
         self._probes = asyncio.Semaphore(8)  # servers that are asked for their service's type at one time
+        # The types and URIs that servers have told, by the service's name.
         self.found: dict[str, tuple[str, str]] = {}
-        """The types and URIs that servers have told, by the service's name."""
 
     async def call(self, service: str, md5sum: str, request: Payload, timeout: float | None) -> Payload:  # noqa: ASYNC109
         """Call a service.

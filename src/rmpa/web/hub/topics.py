@@ -44,10 +44,10 @@ class PayloadBuffers:
 
     def __init__(self, kept_bytes: int = 16 * MIB) -> None:  # what waits for one slow client
         self._limit = kept_bytes
+        # Those used last are at the right.
         self._kept: deque[bytearray] = deque()
-        """Those used last are at the right."""
+        # Bytes of the buffers that are kept.
         self.bytes = 0
-        """Bytes of the buffers that are kept."""
 
     def copy(self, data: memoryview) -> memoryview:
         """A read-only copy, which stays as it is while there is a view of it."""
@@ -93,8 +93,8 @@ def _has_views(buffer: bytearray) -> bool:
 
 
 _log = logging.getLogger(__name__)
+# The source of what clients of this hub publish: the node has no connection to itself.
 OWN: Final = ""
-"""The source of what clients of this hub publish: the node has no connection to itself."""
 
 
 class ReceivedMessage(msgspec.Struct, frozen=True):
@@ -125,8 +125,8 @@ class ClientSubscription:
     receive: Callable[[ReceivedMessage], None]
     failed: Callable[[RmpaError], None]
     differs: Callable[[str], None]
+    # Other types that ``differs`` was called for.
     told: set[str] = field(default_factory=set)
-    """Other types that ``differs`` was called for."""
 
     def close(self) -> None:
         """End it; the last one's topic lingers for ``limits.SUBSCRIPTION_LINGER``."""
@@ -147,11 +147,11 @@ class _Topic:
     name: str
     registration: Registration[Subscriber] = field(init=False)
     subscriptions: dict[ClientSubscription, None] = field(default_factory=dict)
+    # The type that it is registered with; ``None``: any.
     kind: MessageType | None = None
-    """The type that it is registered with; ``None``: any."""
     linger: asyncio.TimerHandle | None = None
+    # The last header of each publisher, by its name.
     headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
-    """The last header of each publisher, by its name."""
 
 
 class HubTopics:
@@ -170,8 +170,8 @@ class HubTopics:
         self._graph = graph
         self._now_ns = now_ns
         self._topics: dict[str, _Topic] = {}
+        # The last messages of latching sources, by topic and source, the oldest first.
         self._latched: OrderedDict[tuple[str, str], _Latched] = OrderedDict()
-        """The last messages of latching sources, by topic and source, the oldest first."""
         self._buffers = PayloadBuffers()
         self.publishers = Publishers(link, types, self, now_ns)
         graph.follow(self._graph_changed)
@@ -385,12 +385,12 @@ class _Publisher:
     type: str
     latch: bool
     users: set[ClientPublication]
+    # Numbers its messages; ``None`` while its type is not known.
     numbers: HeaderNumbers | None = None
-    """Numbers its messages; ``None`` while its type is not known."""
     registration: Registration[Publisher] = field(init=False)
     linger: asyncio.TimerHandle | None = None
+    # What was published before subscribers were connected; ``None`` from then on.
     early: deque[tuple[float, Payload]] | None = field(default_factory=deque)
-    """What was published before subscribers were connected; ``None`` from then on."""
     early_bytes: int = 0
     latched: ReceivedMessage | None = None
 

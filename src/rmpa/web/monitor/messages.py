@@ -33,10 +33,10 @@ Value: TypeAlias = Union[  # noqa: UP007 - | does not take the forward reference
 ]
 Tree: TypeAlias = dict[str, Value]
 VERSION: Final = 1
+# The WebSocket subprotocol; a version that older pages cannot read has another one.
 SUBPROTOCOL: Final = "rmpa.monitor.v1"
-"""The WebSocket subprotocol; a version that older pages cannot read has another one."""
+# The messages of all nodes, from one publisher: ``/rosout`` would be a connection to each node.
 LOG_TOPIC: Final = "/rosout_agg"
-"""The messages of all nodes, from one publisher: ``/rosout`` would be a connection to each node."""
 
 
 def difference(old: Mapping[str, Value], new: Mapping[str, Value]) -> Tree:
@@ -74,16 +74,16 @@ def without_nulls(value: object) -> Value:
 
 # --- live messages ---------------------------------------------------------------------------------------------
 
+# Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC): in front of an image's bytes.
 IMAGE_HEADER: Final = struct.Struct("<BBHHHIQ")
-"""Kind 1, format, width, height, spare, watch, nanoseconds since the epoch (UTC): in front of an image's bytes."""
 IMAGE: Final = 1
+# Formats of an image's bytes; rgb8 and mono8 are rows of pixels without padding.
 FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4}
-"""Formats of an image's bytes; rgb8 and mono8 are rows of pixels without padding."""
 _CHANNELS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+# Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are.
 _DEPTHS: Final = {"16UC1": ("H", 2), "mono16": ("H", 2), "32FC1": ("f", 4)}
-"""Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are."""
+# The largest integer that a browser's numbers hold exactly; a larger one is sent as text.
 _EXACT: Final = 2**53
-"""The largest integer that a browser's numbers hold exactly; a larger one is sent as text."""
 _INDEX: Final = re.compile(r"\[(\d+)\]")
 
 
@@ -239,8 +239,8 @@ def _shades(lines: Iterable[Iterable[float]]) -> bytes:
 
 # --- watches ------------------------------------------------------------------------------------------------------
 
+# A moment in seconds since the epoch, and a value for each line; ``None`` where there is none.
 Sample: TypeAlias = tuple[float, list[float | None]]
-"""A moment in seconds since the epoch, and a value for each line; ``None`` where there is none."""
 
 
 class SampleBuffer:

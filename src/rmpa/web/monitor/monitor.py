@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from rmpa.web.server.agent_watch import AgentWatch, Reading
 
 
-# The state of the mesh for all pages: snapshots of the agent are read while one is open.
+# --- The state of the mesh for all pages ----------------------------------------------------------------------------
+#
+# Snapshots of the agent are read while one is open.
 
 
 _log = logging.getLogger(__name__)
@@ -145,13 +147,15 @@ class MeshFeed:
             show(self._state)
 
 
-# The log of this module's nodes, ``/rosout_agg``: its last lines are kept for pages that open it.
+# --- The log of this module's nodes, ``/rosout_agg`` ----------------------------------------------------------------
+#
+# Its last lines are kept for pages that open it.
 
 
 _TYPE: Final = "rosgraph_msgs/Log"
 _LEVELS: Final = {1: "DEBUG", 2: "INFO", 4: "WARN", 8: "ERROR", 16: "FATAL"}
+# Seconds in which lines are gathered into one message to a page.
 _GATHER: Final = 0.1
-"""Seconds in which lines are gathered into one message to a page."""
 
 
 class LogFeed:
@@ -171,8 +175,8 @@ class LogFeed:
         self._timer: asyncio.TimerHandle | None = None
         self._count = 0
         self._subscription: ClientSubscription | None = None
+        # Why there is no log to show.
         self.refused: RmpaError | None = None
-        """Why there is no log to show."""
 
     def start(self) -> None:
         """Begin to keep lines."""

@@ -43,15 +43,15 @@ def shown_node(own: str) -> str:
 
 Args: TypeAlias = dict[str, Any]  # the edge: each question has its own
 _Answer: TypeAlias = "Callable[[Answers, Args], Awaitable[Any]]"
+# All questions: the right (``Rights``) that a page needs for each, and what answers it.
 QUESTIONS: Final[dict[str, tuple[str, _Answer]]] = {}
-"""All questions: the right (``Rights``) that a page needs for each, and what answers it."""
 _CALL_TIMEOUT: Final = 30.0
 _READ_TIMEOUT: Final = 5.0
 _KINDS: Final = ("topic", "service", "module")
+# The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure).
 _SET_PARAMETERS: Final = "set_parameters"
-"""The service of a resource that takes another configuration (wiki.ros.org/dynamic_reconfigure)."""
+# The lists of a ``dynamic_reconfigure/Config`` by the types of parameters.
 _LISTS: Final = {"bool": "bools", "int": "ints", "double": "doubles", "str": "strs"}
-"""The lists of a ``dynamic_reconfigure/Config`` by the types of parameters."""
 
 
 def question(what: str, *, needs: str = "") -> Callable[[_Answer], _Answer]:

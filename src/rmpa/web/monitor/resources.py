@@ -13,9 +13,9 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.core.limits import KIB, MIB
+from rmpa.resource.adapter import LEVEL_FOR
 from rmpa.resource.descriptor import TOPIC as DESCRIPTOR
 from rmpa.resource.descriptor import Descriptor
-from rmpa.resource.loop import LEVEL_FOR
 from rmpa.resource.reconfigure import CONFIG_TYPE
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
@@ -139,10 +139,10 @@ def resource_flows(facts: Sequence[ResourceFacts], own: str) -> dict[str, Tree]:
     return {key: flow for key, flow in found.items() if own not in key.split(">")}
 
 
+# Bytes of the messages whose values are kept for further pages; values take some ten times as much.
 _KEPT: Final = 4 * MIB
-"""Bytes of the messages whose values are kept for further pages; values take some ten times as much."""
+# Bytes that an entry counts beside its payload, so that small messages do not gather.
 _OVERHEAD: Final = 64 * KIB
-"""Bytes that an entry counts beside its payload, so that small messages do not gather."""
 
 
 class MessageValues:
@@ -174,8 +174,9 @@ class MessageValues:
 
 
 _TEXT: Final = "std_msgs/String"
+# When a topic of a resource is followed: always, while pages are open, while a page shows the resource.
 _ALWAYS, _SHOWN, _LOOKED_AT = range(3)
-"""When a topic of a resource is followed: always, while pages are open, while a page shows the resource."""
+# The topics below each resource, with their types.
 _TOPICS: Final = {
     DESCRIPTOR: (_TEXT, _ALWAYS),
     "state": (_TEXT, _SHOWN),
@@ -186,7 +187,6 @@ _TOPICS: Final = {
     "responses": (ARRAY_TYPE, _LOOKED_AT),
     "parameter_updates": (CONFIG_TYPE, _LOOKED_AT),
 }
-"""The topics below each resource, with their types."""
 
 
 @dataclass(slots=True, eq=False)
@@ -194,14 +194,14 @@ class _Path:
     """What is followed below one path; several modules may have a resource of that path, by their names."""
 
     name: str
+    # By the last part of the topic's name; ``None``: the rules deny it.
     subscriptions: dict[str, ClientSubscription | None] = field(default_factory=dict)
-    """By the last part of the topic's name; ``None``: the rules deny it."""
+    # The nodes that publish the descriptor.
     publishers: frozenset[str] = frozenset()
-    """The nodes that publish the descriptor."""
+    # Those included whose descriptor has not come yet.
     heard: dict[str | None, ResourceFacts] = field(default_factory=dict)
-    """Those included whose descriptor has not come yet."""
+    # Since when each resource has its level: as it says itself, or else since it was heard with it.
     since: dict[str | None, float] = field(default_factory=dict)
-    """Since when each resource has its level: as it says itself, or else since it was heard with it."""
     looked: float = -1e9
 
     def unsubscribe(self, topics: Iterable[str]) -> None:

@@ -36,18 +36,18 @@ _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
 Kind: TypeAlias = Literal["module", "topic", "service", "node", "resource", "counters"]
 How: TypeAlias = Literal["value", "plot", "image", "scan"]
+# Of a joystick: a share of the fastest that is allowed.
 Tilt: TypeAlias = Annotated[float, Meta(ge=-1, le=1)]
-"""Of a joystick: a share of the fastest that is allowed."""
+# What a page may have, as ``hello`` lists it.
 RIGHTS: Final = ("view", "control", "drive")
-"""What a page may have, as ``hello`` lists it."""
 _NO_TOKEN: Final = (
     "this page may not read parameters",
     "open it with a token: rmpa web --token-file FILE, or --control",
 )
 _NO_CONTROL: Final = "this page may only look", "start rmpa web with --control"
 _TWIST: Final = "geometry_msgs/Twist"
+# A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s.
 _SPEEDS: Final = struct.Struct("<6d")
-"""A geometry_msgs/Twist: linear x, y, z in m/s, then angular x, y, z in rad/s."""
 
 
 class Joystick:
@@ -70,8 +70,8 @@ class Joystick:
         self._released = 0
         self._until = 0.0
         self._told_late = False
+        # The topic that is driven; empty while the robot is stopped.
         self.topic = ""
-        """The topic that is driven; empty while the robot is stopped."""
 
     @property
     def due(self) -> float | None:
@@ -480,12 +480,12 @@ def _check_topic(topic: str) -> None:
         raise RemoteProtocolError(f"{topic[:80]!a} is not a topic's name; write it as /name")
 
 
+# The members of each message of a page (docs/design/monitor-protocol.md).
 OPS: Final = {
     name.removeprefix("op_"): struct_of(method, tag_field="op", tag=name.removeprefix("op_"))
     for name, method in vars(MonitorSession).items()
     if name.startswith("op_")
 }
-"""The members of each message of a page (docs/design/monitor-protocol.md)."""
 DECODER: Final[msgspec.json.Decoder[msgspec.Struct]] = msgspec.json.Decoder(
     functools.reduce(operator.or_, OPS.values())
 )

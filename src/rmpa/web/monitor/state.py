@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _SMALL: Final = 0.03
+# Figures by their member's name: a change is shown that is larger than this share of what is shown, and than this
+# amount, so that noise moves nothing.
 _STEADY: Final[Mapping[str, tuple[float, float]]] = {
     "since": (0.0, 0.5),
     "cpu": (0.15, 1.0),
@@ -42,10 +44,8 @@ _STEADY: Final[Mapping[str, tuple[float, float]]] = {
     "bytes_in": (0.1, 20.0),
     "bytes_out": (0.1, 20.0),
 }
-"""Figures by their member's name: a change is shown that is larger than this share of what is shown, and than this
-amount, so that noise moves nothing."""
+# Is computed from a moving age: seconds since the epoch, of which three digits would say nothing.
 _MOMENT: Final = "since"
-"""Is computed from a moving age: seconds since the epoch, of which three digits would say nothing."""
 _AGENT: Final = (
     "name",
     "guid",
@@ -63,8 +63,8 @@ _AGENT: Final = (
     "core_memory",
 )
 _GONE: Final = "has left the roster: no beacon and no link"
+# States of a module of which nothing comes any more.
 _LOST: Final = frozenset({"linking", "refused", "away"})
-"""States of a module of which nothing comes any more."""
 
 
 def steady_entry(before: Mapping[str, Any] | None, entry: Tree) -> Tree:
@@ -89,14 +89,14 @@ class StateBuilder:
     """
 
     def __init__(self, own: str) -> None:
+        # The name of the agent's module.
         self.own = own
-        """The name of the agent's module."""
+        # When each module was in the roster last, those included that have left it.
         self._seen: dict[str, float] = {}
-        """When each module was in the roster last, those included that have left it."""
+        # The last counts of each link, and its bytes a second in and out.
         self._links: dict[str, tuple[tuple[float, int, int], list[float]]] = {}
-        """The last counts of each link, and its bytes a second in and out."""
+        # By section and key, the entries that are shown, with what they were made of.
         self._entries: dict[str, dict[str, tuple[object, Tree]]] = {}
-        """By section and key, the entries that are shown, with what they were made of."""
         self._state: Tree = {"agent": {"name": own}, "modules": {}, "topics": {}}
 
     def build(

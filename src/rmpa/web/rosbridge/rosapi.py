@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import ParamValue
 
 Values: TypeAlias = dict[str, Any]
+# The response's fields; or what takes time and returns them, or None where there are none.
 Answer: TypeAlias = "Values | Coroutine[Any, Any, Values | None]"
-"""The response's fields; or what takes time and returns them, or None where there are none."""
 NAMESPACE: Final = "/rosapi/"
 _TIMES: Final = ("time", "duration")
 _EXAMPLES: Final = {"string": "", "bool": "False", "float32": "0.0", "float64": "0.0", "time": "{}", "duration": "{}"}
 _ACTION_TOPICS: Final = ("cancel", "feedback", "goal", "result", "status")
+# Those that an action's server publishes.
 _SERVER_TOPICS: Final = ("feedback", "result", "status")
-"""Those that an action's server publishes."""
 _STATUS_TYPE: Final = "actionlib_msgs/GoalStatusArray"
 
 
@@ -311,11 +311,11 @@ class Rosapi:
 
 
 _TYPE_NAMES: Final = {"action_servers": "GetActionServers"}
+# The type of each service by its global name.
 SERVICES: Final = {
     f"{NAMESPACE}{name}": f"rosapi/{_TYPE_NAMES.get(name) or ''.join(map(str.capitalize, name.split('_')))}"
     for name in (each.removeprefix("_answer_") for each in vars(Rosapi) if each.startswith("_answer_"))
 }
-"""The type of each service by its global name."""
 
 
 def _first_type(topic: GraphTopic) -> str:

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.services import ServedService
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
+# Each includes those before it.
 LEVELS: Final = ("none", "error", "warning", "info")
-"""Each includes those before it."""
 
 
 class _Topic(ClientStream):
@@ -69,10 +69,10 @@ class _Topic(ClientStream):
         self.topic = topic
         self.type = kind
         self.throttle = Throttle(session.queued)
+        # What each id asked for: interval, queue, fragment size and compression.
         self.wishes: dict[Id, tuple[float, int, int | None, Compression]] = {}
-        """What each id asked for: interval, queue, fragment size and compression."""
+        # When it fails, if the topic is not there by then.
         self.judged_at: float | None = None
-        """When it fails, if the topic is not there by then."""
         self._compression = Compression.NONE
         self._fragment_size: int | None = None
         self._codecs: dict[tuple[str, str], MessageCodec] = {}
@@ -144,8 +144,8 @@ class _Served:
     request: MessageCodec
     response: MessageCodec
     service: ServedService = field(init=False)
+    # The response of each call that is open, by the id that the client got.
     calls: dict[str, asyncio.Future[Payload]] = field(default_factory=dict)
-    """The response of each call that is open, by the id that the client got."""
 
 
 class RosbridgeSession(Session):
@@ -583,9 +583,9 @@ def _fragment_size(size: float | None) -> int | None:
     return None if size is None else whole(size, "fragment_size", 1)
 
 
+# The fields of each op.
 OPS: Final = {
     name.removeprefix("op_"): struct_of(method, rename=lambda field: field.removesuffix("_"))
     for name, method in vars(RosbridgeSession).items()
     if name.startswith("op_")
 }
-"""The fields of each op."""

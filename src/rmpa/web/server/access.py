@@ -87,9 +87,9 @@ class AccessRefused(NamedTuple):
     detail: str
 
 
+# ``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
+# browser is told what pages of a listed site may send.
 Verdict: TypeAlias = AccessRefused | Literal["granted", "move token", "preflight"]
-"""``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
-browser is told what pages of a listed site may send."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +218,9 @@ def _short(text: str) -> str:
     return ascii(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…")
 
 
-# The file of the token that clients need: made once, readable by its owner alone.
+# --- The file of the token that clients need ------------------------------------------------------------------------
+#
+# Made once, readable by its owner alone.
 
 
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~+/=-]+")  # RFC 6750, section 2.1
@@ -276,10 +278,10 @@ class ConnectionTable:
     def __init__(self, make_protocol: Callable[[], asyncio.Protocol], counters: Counters) -> None:
         self._make_protocol = make_protocol
         self.refusals = RefusalLog(_log, counters)
+        # The connections, the idlest first.
         self.open: dict[GuardedConnection, None] = {}
-        """The connections, the idlest first."""
+        # Connections so far.
         self.accepted = 0
-        """Connections so far."""
 
     def make(self) -> GuardedConnection:
         """The protocol of a new connection, for ``loop.create_server``."""
@@ -331,8 +333,8 @@ class GuardedConnection(asyncio.Protocol):
         self._mask = MaskCheck()
         self._on_unmasked: Callable[[], None] | None = None
         self.phase = ConnectionPhase.IDLE
+        # Bytes of the client so far.
         self.received = 0
-        """Bytes of the client so far."""
 
     # --- what aiohttp's handlers tell ---
 

@@ -65,10 +65,10 @@ class AgentWatch:
         self._thread = ThreadPoolExecutor(1, "rmpa-agent-watch")
         self._last: dict[bool, Reading] = {}
         self._pending: dict[bool, asyncio.Task[Reading]] = {}
+        # Questions to the agent so far.
         self.reads = 0
-        """Questions to the agent so far."""
+        # Seconds that they took in total.
         self.seconds = 0.0
-        """Seconds that they took in total."""
 
     async def reading(self, *, whole: bool = False) -> Reading:
         """The newest reading, at most ``limits.WEB_SNAPSHOT_AGE`` old when this was called.
@@ -203,8 +203,8 @@ class AgentFollower:
         self._fits = fits
         self._loop = asyncio.get_running_loop()
         self._task: asyncio.Task[None] | None = None
+        # Set once an agent answers that this server may not speak to: the server is to be made anew.
         self.misfit = asyncio.Event()
-        """Set once an agent answers that this server may not speak to: the server is to be made anew."""
 
     def start(self, graph: GraphWatch) -> None:
         """Begin, in a task; ``graph`` takes the changes."""

@@ -49,8 +49,8 @@ _TYPES: Final = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
 }
+# Is served at ``/``, all others below ``/static/``; files of other kinds, as licences, are not served.
 _FIRST: Final = "index.html"
-"""Is served at ``/``, all others below ``/static/``; files of other kinds, as licences, are not served."""
 
 
 def _pages(folder: Traversable, path: str) -> Iterator[tuple[str, tuple[bytes, str]]]:
@@ -64,18 +64,19 @@ def _pages(folder: Traversable, path: str) -> Iterator[tuple[str, tuple[bytes, s
 
 
 _log = logging.getLogger(__name__)
+# What aiohttp says of broken requests; they are counted and logged by us, without tracebacks.
 _AIOHTTP: Final = logging.getLogger("rmpa.web.server.aiohttp")
-"""What aiohttp says of broken requests; they are counted and logged by us, without tracebacks."""
 _AIOHTTP.setLevel(logging.CRITICAL)
+# Needs no token: it tells only whether the agent answers.
 _HEALTH: Final = "/healthz"
-"""Needs no token: it tells only whether the agent answers."""
+# Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway.
 WEBSOCKET_PATHS: Final = ("/", "/rosbridge", "/foxglove", MONITOR_PATH)
-"""Where WebSocket clients connect. The pages have their own path; else the subprotocol chooses the gateway."""
 _METHODS: Final = ("GET", "HEAD")
+# Characters of a faulty header that are told.
 _SHOWN: Final = 120
-"""Characters of a faulty header that are told."""
+# Marks requests that reached the middleware; aiohttp answers malformed ones before.
 _JUDGED: Final = web.RequestKey("rmpa.judged", bool)
-"""Marks requests that reached the middleware; aiohttp answers malformed ones before."""
+# Of every response.
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'; object-src 'none'",
@@ -87,27 +88,26 @@ HEADERS: Final = {
     "Cache-Control": "no-store",
     "Server": "rmpa",
 }
-"""Of every response."""
+# Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error.
 OPENER_POLICY: Final = ("Cross-Origin-Opener-Policy", "same-origin")
-"""Of responses to loopback: in plain HTTP browsers ignore it from elsewhere, and report that as an error."""
+# Without a style: the server's files need the token, too.
 _REFUSED_PAGE: Final = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <meta name="color-scheme" content="light dark"><title>RMPA: refused</title>
 <h1>RMPA does not show this page</h1><p>{text}.</p>{help}
 """
-"""Without a style: the server's files need the token, too."""
 _SIGN_IN: Final = (
     "<p>Open the address that <code>rmpa web</code> printed when it made the token, once: it ends with "
     "<code>/?token=…</code>, and this browser keeps it from then on. The token is in the file <code>web-token</code> "
     "of the module's state directory; <code>rmpa web</code> says at its start where that is.</p>"
 )
+# Of the response to a browser's question what a page of a listed site may send (Fetch standard, "CORS protocol").
+# Cookies are not allowed: such a page sends the token itself.
 PREFLIGHT: Final = {
     "Access-Control-Allow-Methods": ", ".join(_METHODS),
     "Access-Control-Allow-Headers": "Authorization",
     "Access-Control-Max-Age": "600",
 }
-"""Of the response to a browser's question what a page of a listed site may send (Fetch standard, "CORS protocol").
-Cookies are not allowed: such a page sends the token itself."""
 
 
 class WebServer:
@@ -137,15 +137,15 @@ class WebServer:
         self._addresses = [(host, port) for port in dict.fromkeys((policy.port, *ports))]
         self._gateways = gateways
         self._tls = tls
+        # Refusals, by reason; those of connections too.
         self.counters = Counters()
-        """Refusals, by reason; those of connections too."""
         self._refusals = RefusalLog(_log, self.counters)
+        # By status.
         self._responses = Counters()
-        """By status."""
         self._pages = dict(_pages(files("rmpa.web") / "static", "/static/"))
         self._encoding = asyncio.Lock()
+        # ``/metrics`` by its content type, with the number of the reading.
         self._encoded: dict[str, tuple[int, bytes]] = {}
-        """``/metrics`` by its content type, with the number of the reading."""
         self._runner: web.AppRunner | None = None
         self._table: ConnectionTable | None = None
         self._servers: list[asyncio.Server] = []

@@ -75,7 +75,9 @@ def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:
     return priority
 
 
-# HTTPS: the server's certificate, from the user's files or the module's own, and its renewal at run time.
+# --- HTTPS ----------------------------------------------------------------------------------------------------------
+#
+# The server's certificate, from the user's files or the module's own, and its renewal at run time.
 
 
 _log = logging.getLogger(__name__)
@@ -209,7 +211,9 @@ def _no_password() -> str:
     raise ValueError("the key is encrypted")
 
 
-# The process ``rmpa web``: makes the server of the settings, says where it is, and runs it until a signal.
+# --- The process ``rmpa web`` ---------------------------------------------------------------------------------------
+#
+# Makes the server of the settings, says where it is, and runs it until a signal.
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,10 @@ import pytest
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
+from rmpa.resource.adapter import HungError, Preconditions, alarm_values, answer_to, health
 from rmpa.resource.client import ResourceClient
 from rmpa.resource.decision import Alarm, AlarmKind, Decider, Shortfall
 from rmpa.resource.declare import AdaptationSettings, Context, Profile
-from rmpa.resource.loop import HungError, Preconditions, alarm_values, answer_to, health
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Bound, Requirement, at_least, at_most
 from rmpa.resource.resource import Resource
@@ -106,7 +106,7 @@ def test_answer_to_a_client() -> None:
 
 def excluded(member: ResourceNode) -> str:
     """Why the first profile is excluded."""
-    return member.adapter.loop.explain(asyncio.get_running_loop().time())[0].excluded
+    return member.adapter.adaptation.explain(asyncio.get_running_loop().time())[0].excluded
 
 
 class Sonar:
@@ -225,8 +225,8 @@ async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
         responses = await node.subscribe("/sonar/responses", ARRAY)
         await ask(node, noise="<= 5 cm")
         await status(responses, lambda s: s.name == "/mortal" and s.level == OK)
-        assert sonar.adapter.loop.requirements.keys() == {"/mortal"}
-    await until(lambda: not sonar.adapter.loop.requirements and sonar.current == "coarse")
+        assert sonar.adapter.adaptation.requirements.keys() == {"/mortal"}
+    await until(lambda: not sonar.adapter.adaptation.requirements and sonar.current == "coarse")
 
 
 async def test_resource_client_requests_and_answers(sonar: Sonar, node: Node) -> None:
@@ -249,7 +249,7 @@ async def test_resource_client_requests_and_answers(sonar: Sonar, node: Node) ->
         assert "non-adaptable" in answer.message
         answer = await one.require(words__rate=at_least("1 Hz"), timeout=30)
         assert answer.values.keys() == {"words.rate"}
-    await until(lambda: not sonar.adapter.loop.requirements)
+    await until(lambda: not sonar.adapter.adaptation.requirements)
 
 
 async def test_missing_resource_is_unreachable(node: Node) -> None:
@@ -282,7 +282,7 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
 
     member = ResourceNode(declared(needs), core.uri)
     await member.start()
-    loop = member.adapter.loop
+    loop = member.adapter.adaptation
     windows: list[None] = []
     watcher = RuntimePart()
     watcher.window_ended = lambda *_: windows.append(None)  # type: ignore[method-assign]
@@ -301,7 +301,7 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
 async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     applied: list[str] = []
     watcher = RuntimePart()
-    watcher.changed = lambda: applied.extend(filter(None, [member.adapter.loop.applying]))  # type: ignore[method-assign]
+    watcher.changed = lambda: applied.extend(filter(None, [member.adapter.adaptation.applying]))  # type: ignore[method-assign]
     member = ResourceNode(declared(lambda: "the lid is shut"), core.uri)
     member.parts.append(watcher)
     await member.start()

@@ -39,19 +39,21 @@ if TYPE_CHECKING:
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
 
 _log = logging.getLogger(__name__)
+# The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ.
 LEVEL_FOR: Final = "level_for"
-"""The value of ``quality`` that has how long its level has stood: an age, since the clocks of modules differ."""
+# The longest time in seconds between two looks whether a profile has been applied.
 _WAIT: Final = 0.25
-"""The longest time in seconds between two looks whether a profile has been applied."""
+# Seconds between checks whether clients are still connected.
 _CLIENTS_INTERVAL: Final = 0.25
-"""Seconds between checks whether clients are still connected."""
+# Priority of a context's requirement; above that of every client.
 _CONTEXT_PRIORITY: Final = 1 << 30
-"""Priority of a context's requirement; above that of every client."""
+# Prefix of the client name under which a context's requirement is kept.
 _CONTEXT_CLIENT: Final = "context "
-"""Prefix of the client name under which a context's requirement is kept."""
 
 
-# Calls of the user's functions: those of profiles and contexts, and preconditions.
+# --- Calls of the user's functions ----------------------------------------------------------------------------------
+#
+# Those of profiles and contexts, and preconditions.
 
 
 class HungError(RmpaError):
@@ -104,8 +106,8 @@ class Preconditions:
 
     def __init__(self, profiles: Mapping[str, Profile]) -> None:
         self._needs = {name: one.needs for name, one in profiles.items() if one.needs is not None}
+        # The call under way, by profile.
         self._calls: dict[str, asyncio.Task[str | bool | None]] = {}
-        """The call under way, by profile."""
 
     async def check(self) -> dict[str, str]:
         """Call all preconditions, except those whose last call has not returned; at most one check at a time.
@@ -139,7 +141,9 @@ class Preconditions:
         await asyncio.gather(*self._calls.values(), return_exceptions=True)
 
 
-# Texts and values of a resource's reports: alarms, health, responses (``docs/smart-resources.md``).
+# --- Texts and values of a resource's reports -----------------------------------------------------------------------
+#
+# Alarms, health, responses (``docs/smart-resources.md``).
 
 
 def alarm_values(
@@ -224,19 +228,19 @@ class Adapter(RuntimePart):
         self._attributes = resource.attributes
         self._settings = resource.settings
         decider = Decider(resource.name, self._attributes, list(resource.profiles.values()))
-        self.loop = Adaptation(self._attributes, decider, self._settings, self)
+        self.adaptation = Adaptation(self._attributes, decider, self._settings, self)
         self.clients = Clients(resource.name, self._attributes)
+        # The state that was saved before a restart.
         self.saved = SavedState()
-        """The state that was saved before a restart."""
+        # The profile chosen by hand before ``start``; empty: the loop decides.
         self.preset = ""
-        """The profile chosen by hand before ``start``; empty: the loop decides."""
+        # Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first.
         self.reaction: float | None = None
-        """Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first."""
+        # The function for which the resource ends; ``None``: none hangs.
         self.hung: HungError | None = None
-        """The function for which the resource ends; ``None``: none hangs."""
         self.observed = ObservedQualities(self._attributes, resource.name, 3 * self._settings.window)
+        # ``None`` before the start.
         self._measuring: QualityMeasurement | None = None
-        """``None`` before the start."""
         self._measured: dict[str, Value] = {}
         self._missing: dict[str, int] = {}
         self._preconditions = Preconditions(resource.profiles)
@@ -247,12 +251,12 @@ class Adapter(RuntimePart):
         self._requirements: Subscriber | None = None
         self.publishers: dict[str, Publisher] = {}
         self._responses: list[bytes] | None = None
+        # The level of ``quality``, and since when, in monotonic seconds.
         self._level: tuple[DiagnosticLevel, float] | None = None
-        """The level of ``quality``, and since when, in monotonic seconds."""
         self._window_end: float | None = None
         self._clients_check: float | None = None
         self._timers = (
-            MachineTimer(self.loop.next_timer, self._handle_timer),
+            MachineTimer(self.adaptation.next_timer, self._handle_timer),
             MachineTimer(lambda: self._window_end, self._end_window),
             MachineTimer(lambda: self._clients_check, self._check_clients),
         )
@@ -274,14 +278,14 @@ class Adapter(RuntimePart):
         requirements = self.clients.restore(self.saved.requirements, now, now_ns)
         left = {name: one.left(now, now_ns) for name, one in self.saved.cool_downs.items()}
         cool_downs = {name: one for name, one in left.items() if one is not None}
-        self.loop.restore(requirements, self.saved.last, cool_downs, now)
+        self.adaptation.restore(requirements, self.saved.last, cool_downs, now)
         self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
         await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
-        self.loop.block(self._blocked_by_needs, now)
+        self.adaptation.block(self._blocked_by_needs, now)
         if self.preset:
-            self.loop.pin(self.preset, now, restored=True)
+            self.adaptation.pin(self.preset, now, restored=True)
         else:
-            self.loop.reconsider("the resource starts", now)
+            self.adaptation.reconsider("the resource starts", now)
         self._window_end, self._clients_check = now + self._settings.window, now + _CLIENTS_INTERVAL
         self._tell()
 
@@ -313,7 +317,7 @@ class Adapter(RuntimePart):
         # Counted from the due time, not from now, so that lateness does not add up.
         self._window_end = max((self._window_end or now) + self._settings.window, now)
         measured = self._measuring.window(now) if self._measuring is not None else {}
-        self._measured = self.observed.worst(measured, self.loop.requirements, now)
+        self._measured = self.observed.worst(measured, self.adaptation.requirements, now)
         for text, missing in count_missing(self._missing, self._runtime.problems()[0]):
             message = text if missing else f"over: {text}"
             self._log_change(message, over=not missing)
@@ -321,7 +325,7 @@ class Adapter(RuntimePart):
             self._report("alarms", level, message, {"cleared": str(not missing).lower()})
         if self._checking is None or self._checking.done():
             self._checking = self._loop.create_task(self._check_preconditions(), name="check preconditions")
-        self.loop.window(self._measured, now)
+        self.adaptation.window(self._measured, now)
         for part in self._runtime.parts:
             part.window_ended(self._measured)
         self._report_quality(now)
@@ -334,7 +338,7 @@ class Adapter(RuntimePart):
 
     def _update_blocked(self) -> None:
         """Block the profiles whose preconditions do not hold, and those that the context excludes."""
-        self.loop.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
+        self.adaptation.block(self._blocked_by_needs | self._blocked_by_context, self._loop.time())
 
     # --- clients ------------------------------------------------------------------------------------------------
 
@@ -355,9 +359,9 @@ class Adapter(RuntimePart):
             self.refuse(client, str(error))
             return
         if requirement is not None and requirement.bounds:
-            self.loop.require(requirement, now)
+            self.adaptation.require(requirement, now)
         elif requirement is not None:
-            self.loop.release(client, now)
+            self.adaptation.release(client, now)
         self._tell()
 
     def refuse(self, client: str, text: str) -> None:
@@ -370,9 +374,9 @@ class Adapter(RuntimePart):
         self._clients_check = now + _CLIENTS_INTERVAL
         connected = self._requirements.callers if self._requirements is not None else set()
         for client in self.clients.remove_absent(connected, now):
-            if client in self.loop.requirements:
+            if client in self.adaptation.requirements:
                 _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
-            self.loop.release(client, now)
+            self.adaptation.release(client, now)
             self._tell()
 
     # --- choices ------------------------------------------------------------------------------------------------
@@ -384,16 +388,16 @@ class Adapter(RuntimePart):
             context: The context; one without a name: no context.
         """
         now, name = self._loop.time(), f"{_CONTEXT_CLIENT}{context.name}"
-        before = [client for client in self.loop.requirements if client.startswith(_CONTEXT_CLIENT)]
+        before = [client for client in self.adaptation.requirements if client.startswith(_CONTEXT_CLIENT)]
         barred = set(self._runtime.resource.profiles).difference(context.profiles) if context.profiles else set()
         self._blocked_by_context = dict.fromkeys(barred, f"not in context {context.name}")
         self._update_blocked()
         if bounds := {key: request.bound(self._attributes[key]) for key, request in context.requires.items()}:
-            self.loop.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)
+            self.adaptation.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)
         for client in before:
             if client != name or not bounds:
-                self.loop.release(client, now)
-        self.loop.reconsider(f"context {context.name}" if context.name else "no context any more", now)
+                self.adaptation.release(client, now)
+        self.adaptation.reconsider(f"context {context.name}" if context.name else "no context any more", now)
         self._tell()
 
     def pin(self, profile: str) -> None:
@@ -402,12 +406,12 @@ class Adapter(RuntimePart):
         Raises:
             ConfigError: The resource has no profile of this name.
         """
-        self.loop.pin(profile, self._loop.time())
+        self.adaptation.pin(profile, self._loop.time())
         self._tell()
 
     async def settled(self) -> None:
         """Wait until no profile is being applied, or the resource ends."""
-        while self.loop.applying and self._applying is not None and not self._closed and self.hung is None:
+        while self.adaptation.applying and self._applying is not None and not self._closed and self.hung is None:
             await asyncio.wait([self._applying], timeout=_WAIT)
 
     # --- what the loop has decided ------------------------------------------------------------------------------
@@ -426,7 +430,7 @@ class Adapter(RuntimePart):
             await call_function(function, "profile", profile, limit, remedy)
         except HungError as error:
             self._runtime.release(drop=True)
-            self.loop.begin_cool_down(profile, f"not applied within {limit:g} s", self._loop.time())
+            self.adaptation.begin_cool_down(profile, f"not applied within {limit:g} s", self._loop.time())
             self.end(error)
             return
         except Exception as error:  # noqa: BLE001 - the top of the user's code
@@ -436,9 +440,9 @@ class Adapter(RuntimePart):
         self._tasks.resume()
         self.observed.clear()
         if why:
-            self.loop.failed(profile, why, self._loop.time())
+            self.adaptation.failed(profile, why, self._loop.time())
         else:
-            self.loop.applied(profile, self._loop.time())
+            self.adaptation.applied(profile, self._loop.time())
         self._tell()
 
     def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
@@ -467,12 +471,12 @@ class Adapter(RuntimePart):
         """Raise an alarm about a function that has exceeded its time-out, and let the resource end."""
         _log.error("! %s: %s", self._name, hung)
         self.hung = hung
-        values = {"before": self.loop.profile, "after": "", "cleared": "false"}
+        values = {"before": self.adaptation.profile, "after": "", "cleared": "false"}
         self._report("alarms", DiagnosticLevel.ERROR, str(hung), values)
         self._stop.set()
 
     def _handle_timer(self, now: float) -> None:
-        self.loop.handle_timer(now)
+        self.adaptation.handle_timer(now)
         self._tell()
 
     # --- reports ------------------------------------------------------------------------------------------------
@@ -481,11 +485,11 @@ class Adapter(RuntimePart):
         """Publish what may have changed: profile, decision and responses; and move the timers."""
         if self._closed:
             return
-        self._runtime.publish_text("profile", self.loop.profile)
+        self._runtime.publish_text("profile", self.adaptation.profile)
         self._runtime.publish_text("decision", msgspec.json.encode(self.decision()).decode())
         self._runtime.changed()
         refused = [name for name, client in self.clients.known.items() if client.refusal]
-        statuses = [self._response(name) for name in dict.fromkeys((*self.loop.requirements, *refused))]
+        statuses = [self._response(name) for name in dict.fromkeys((*self.adaptation.requirements, *refused))]
         serialized = [status.serialize() for status in statuses]
         if serialized != self._responses:
             self._responses = serialized
@@ -495,19 +499,19 @@ class Adapter(RuntimePart):
 
     def _response(self, name: str) -> DiagnosticStatus:
         """The response for a client; it repeats the mark of the request, by which the client recognises it."""
-        client, requirement = self.clients[name], self.loop.requirements.get(name)
+        client, requirement = self.clients[name], self.adaptation.requirements.get(name)
         level, message, values = DiagnosticLevel.ERROR, client.refusal, dict[str, str]()
         if requirement is not None:
             reports = {key: self.observed.observed(name, key) for key in requirement.bounds}
             offered = self._measured | {key: value for key, value in reports.items() if value is not None}
-            level, message, values = answer_to(requirement, self.loop, self._attributes, offered)
+            level, message, values = answer_to(requirement, self.adaptation, self._attributes, offered)
             if client.refusal:
                 level, message = DiagnosticLevel.ERROR, f"{client.refusal}; what was asked before stays"
         return DiagnosticStatus(level, name, message, client.mark or self._runtime.resource.name, values)
 
     def decision(self) -> dict[str, Any]:
         """The present decision with each profile's score and terms, as plain values for ``rmpa profile explain``."""
-        loop = self.loop
+        loop = self.adaptation
         return {
             "profile": loop.profile,
             "applying": loop.applying,
@@ -523,7 +527,7 @@ class Adapter(RuntimePart):
 
     def health(self) -> tuple[DiagnosticLevel, str]:
         """The present level and message of the resource's ``quality`` topic."""
-        return health(self.loop, *self._runtime.problems())
+        return health(self.adaptation, *self._runtime.problems())
 
     def _report_quality(self, now: float) -> None:
         """Publish the quality of a window, also on ``/diagnostics``, with how long it has had this level."""
@@ -531,7 +535,7 @@ class Adapter(RuntimePart):
         if self._level is None or self._level[0] != level:
             self._level = level, now
         values = self._measuring.format(self._measured) if self._measuring is not None else {}
-        values |= {"profile": self.loop.profile, LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
+        values |= {"profile": self.adaptation.profile, LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
         if self.reaction is not None:
             values["reaction"] = f"{self.reaction:.6g} s"
         for topic in ("quality", "diagnostics"):
