@@ -52,8 +52,9 @@ ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root a
 tests: $(STAMP)  ## all tests, several files at a time; some of them: make tests ARGS="tests/core -k names"
 	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),scripts/run-tests $(BIN)/python)
 
-test-long: $(STAMP)  ## the simulated networks and fuzz targets with more seeds than `make tests` has
+test-long: $(STAMP)  ## more seeds of the simulated networks and fuzz targets than `make tests` has, and tests marked `long`
 	RMPA_SIMULATION_SEEDS=8 FUZZ_MUTATIONS=20000 $(BIN)/python -m pytest -n auto --timeout 3600 tests/simulation tests/fuzz
+	$(BIN)/python -m pytest -m long --timeout 3600
 
 style: $(STAMP)  ## ruff, and for the pages prettier and eslint where npm is: lint and format
 	$(BIN)/ruff check .

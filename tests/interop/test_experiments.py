@@ -20,6 +20,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(300)]
 ROOT: Final = Path(__file__).parents[2]
 _ONLY: Final = {"control": ("mode=event",), "scaling": ("modules=2",)}
 """What is enough to see that it works, where the short form has more."""
+_SHORT: Final = ("control", "failure")
+"""Those of the suite; the others are of the same shape."""
 _ROWS: Final = {
     "failure": ("flows", "moments"),
     "scaling": ("joins", "processes", "traffic", "arrivals", "sent"),
@@ -47,7 +49,9 @@ def run(*words: str | Path) -> None:
     assert f"rmpa-{command.pid}-" not in left
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize(
+    "name", [name if name in _SHORT else pytest.param(name, marks=pytest.mark.long) for name in EXPERIMENTS]
+)
 def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     only = [word for setting in _ONLY.get(name, ()) for word in ("--only", setting)]
