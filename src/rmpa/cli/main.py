@@ -363,7 +363,7 @@ def cli() -> None:
 
     Examples:
       rmpa up --name base            the agent of this machine
-      rmpa peer list                 who is there
+      rmpa peer list                 the modules that are linked
       rmpa topic list                what they have to say
       rmpa topic echo joystick:/cmd  one peer's messages
       rmpa why joystick:/cmd         why they do not come

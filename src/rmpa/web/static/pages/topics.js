@@ -140,7 +140,7 @@ export function TopicPage({ name, state, connection }) {
   return html`<${Page} title=${name} kind=${`Topic · ${topic.type || "type not known"}`}
     ><div class="grid">
       ${topic.problem && html`<${Panel} title="What is wrong" wide><p class="failure">${topic.problem}</p><//>`}
-      <${Panel} title="Who sends it, who gets it"
+      <${Panel} title="Publishers and subscribers"
         ><${Facts}
           rows=${[
             ["Published in", (topic.from || []).join(", ")],
