@@ -15,7 +15,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from rmpa import __version__
+import rmpa
 from rmpa.cli import agent
 from rmpa.cli.main import MEANT, REMOVED_VERBS, LazyGroup, cli, main
 from tests.cli.conftest import DEADLINE, with_core
@@ -108,8 +108,10 @@ def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFix
     assert capsys.readouterr().out == ""
 
 
-def test_version() -> None:
-    assert CliRunner().invoke(cli, ["--version"]).output == f"rmpa {__version__}\n"
+def test_version_of_a_build_comes_with_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"VERSION": "0.2.0", "COMMIT": "1a2b3c4d5e", "DATE": "2026-11-26"}.items():
+        monkeypatch.setattr(rmpa, name, value)
+    assert CliRunner().invoke(cli, ["--version"]).output == "rmpa 0.2.0 (1a2b3c4d5e, 2026-11-26)\n"
 
 
 @pytest.mark.parametrize(("words", "remedy"), REMOVED_VERBS.items())

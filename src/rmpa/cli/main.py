@@ -14,11 +14,12 @@ import inspect
 import os
 import sys
 from itertools import takewhile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa import __version__
+import rmpa
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError
 
@@ -354,8 +355,37 @@ def config() -> None:
     """
 
 
+def _show_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    """Print the version, with the commit that it was built of or that a clone has."""
+    if wanted:
+        click.echo(f"rmpa {_long_version()}")
+        ctx.exit()
+
+
+def _long_version() -> str:
+    """The version with the commit: what the build wrote down, else what git says of the clone."""
+    if rmpa.COMMIT:
+        return f"{rmpa.VERSION} ({rmpa.COMMIT}, {rmpa.DATE})"
+    source = Path(rmpa.__file__).parents[1]
+    script = source.with_name("scripts") / "version"
+    if source.name != "src" or not script.exists():
+        return rmpa.__version__
+    import runpy
+
+    names = runpy.run_path(str(script))
+    return str(names["long"](*names["build"]()))
+
+
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(__version__, "--version", "-V", message="rmpa %(version)s")
+@click.option(
+    "-V",
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_version,
+    help="Show the version.",
+)
 def cli() -> None:
     """ROS 1 modules with a core of their own that share topics, with no master between them.
 
