@@ -44,6 +44,7 @@ def talk(): words.publish(data=str(volume.value))
     [
         ("import rmpa.resource\nnose = Resource(\n", 2, "SyntaxError"),
         ("\n\nimport rmpa.resourse\n", 3, "ModuleNotFoundError: No module named 'rmpa.resourse'"),
+        ("import os\nimport nose_msgs.msg\n", 2, "No module named 'nose_msgs'; a resource needs no module of ROS"),
         ("def deeper():\n    return 1 / 0\n\ndeeper()\n", 2, "ZeroDivisionError"),
         ("import sys\nsys.exit('no sonar is plugged in')\n", 2, "no sonar is plugged in"),
         ("print('hello')\n", None, "it declares no resource"),

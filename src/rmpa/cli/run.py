@@ -41,6 +41,18 @@ _ENDS: Final = 10.0
 # Seconds that a user's function may go on after its resource has ended.
 _THREADS: Final = 1.0
 _PR_SET_PDEATHSIG: Final = 1
+# Modules of ROS that users import, beside those of messages.
+_ROS_MODULES: Final = {
+    "actionlib",
+    "cv_bridge",
+    "genpy",
+    "message_filters",
+    "rosgraph",
+    "roslib",
+    "rospkg",
+    "rospy",
+    "tf",
+}
 
 
 @verb(
@@ -161,7 +173,8 @@ def load(path: Path) -> list[Resource]:
         raise ConfigError(cause.source, cause.problem, cause.remedy, path, _line_in(path, error)) from error
     except (Exception, SystemExit) as error:
         what = f"{type(error).__name__}: {error}"
-        raise ConfigError("the file", f"it cannot be run: {what}", "", path, _line_in(path, error)) from error
+        remedy = _instead_of_ros(error)
+        raise ConfigError("the file", f"it cannot be run: {what}", remedy, path, _line_in(path, error)) from error
     found: list[Resource] = []
     for value in names.values():
         if isinstance(value, Resource) and value not in found:
@@ -179,6 +192,17 @@ def load(path: Path) -> list[Resource]:
             remedy = "declare one: @NAME.profile(offers={…})"
             raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy, path)
     return found
+
+
+def _instead_of_ros(error: BaseException) -> str:
+    """What to do where a module of ROS was not found, which the system's Python alone has; else nothing."""
+    missing = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if missing not in _ROS_MODULES and not missing.endswith(("_msgs", "_srvs")):
+        return ""
+    return (
+        "a resource needs no module of ROS: it names types as text, 'std_msgs/String'. A node that does runs beside "
+        f"rmpa up, by the system's Python (python3 FILE); this is {sys.executable}"
+    )
 
 
 def _line_in(path: Path, error: BaseException) -> int | None:
